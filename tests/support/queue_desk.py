@@ -76,6 +76,7 @@ SQUARE = KindDeclaration(
     outputs={"squares": Kind.CHARACTER},
     fan_out="things",
     batch_size=2,
+    refusing_all_fails=True,
 )
 SURVEY = KindDeclaration(
     name="survey",

@@ -78,8 +78,9 @@ class EditPreviewKeywords(TypedDict, total=False):
 class SearchKeywords(TypedDict, total=False):
     """Fields of `SearchRequest`."""
 
-    likelihood_weight: float
-    """Weight of the motion's likelihood; smaller values bring the motion closer to the targets."""
+    likelihood_weight: float | None
+    """Weight of the motion's likelihood; smaller values bring the motion closer to the targets. Absent: 0.01, or 0 if
+    the errors would otherwise become larger than before the refinement."""
     iterations: int
     """Greatest number of iterations of the optimisation."""
     steps: Sequence[SearchStep | Mapping[str, Any]]

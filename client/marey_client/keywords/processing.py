@@ -65,8 +65,9 @@ class AlignKeywords(TypedDict, total=False):
     """Number of frames in the window around a pose, an odd number. Two poses are compared by all frames of their
     windows; 1: by the poses alone."""
     reference: str
-    """Clip whose time is the canonical time. medoid: the clip nearest to all others; nearest_mean_length: the clip
-    whose length is nearest to the mean; or the id of a clip."""
+    """Clip whose time is the canonical time. medoid: the clip nearest to all others (of more than 200 clips, the clip
+    of a random sample of 200 that is nearest to all others of the sample); nearest_mean_length: the clip whose length
+    is nearest to the mean; or the id of a clip."""
     rate_hz: float | None
     """Rate of the canonical frames, in hertz; absent: the frame rate of the reference if a clip is given as reference,
     else the most common frame rate of the clips."""
@@ -150,18 +151,27 @@ class ModelKeywords(TypedDict, total=False):
 
     tags: list[str] | tuple[str, ...]
     """Tags that the results get."""
-    criterion: Literal["bic", "aic"]
-    """Criterion that selects the number of mixture components."""
+    criterion: Literal["held_out", "bic", "aic"]
+    """Criterion that selects the mixture. held_out: the likelihood of examples of takes that were left out of the fit;
+    bic, aic: an information criterion, among the mixtures that make left-out examples more likely than one normal
+    distribution. Without cross-validation, held_out is replaced by bic."""
+    covariance: Literal["full", "tied", "diagonal"] | None
+    """Kind of covariance. full: one for each component, shrunk towards its diagonal; tied: one for all components;
+    diagonal: one variance for each component and dimension; absent: the criterion selects it."""
     most_mixture_components: int
-    """Greatest number of mixture components to try; n examples in d dimensions allow at most n / 2d."""
+    """Greatest number of mixture components to try; n examples allow at most n / 5."""
     mixture_components: int | None
     """Exact number of mixture components; absent: the criterion selects it."""
     regularisation: float
     """Regularisation added to variances, as a share of the mean variance."""
+    widening: float | None
+    """Factor of the covariances for likelihoods, not for samples; absent: the least factor, 1 to 4, with which about 5%
+    of left-out examples are less likely than 95% of the widened mixture."""
     starts: int
     """Number of starts of expectation maximisation; the best result is used."""
     folds: int
-    """Number of folds of the cross-validation of likelihoods; 0: no cross-validation."""
+    """Number of folds of the cross-validation of likelihoods; all examples of a take are in the same fold. 0: no
+    cross-validation."""
     scaling: Literal["jacobian", "root_max", "sfpca", "none"]
     """Weights of the channels. jacobian: by their effect on the body; sfpca: optimised for the positions of joints;
     root_max: root axes scaled to a maximum of 1; none: equal weights."""

@@ -21,6 +21,7 @@ from marey_motion.editing.inverse_kinematics.solving import measure_residuals, s
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     LookAtTarget,
+    Neighbours,
     OrientationTarget,
     PositionTarget,
     SolverOptions,
@@ -38,6 +39,8 @@ SETTLED = 1e-3
 _PER_FRAME = 40_000
 """Work per frame, in nanoseconds, of preparing the arrays, measuring the errors and evaluating closed forms."""
 _LIMIT_PASSES = 4
+FLIP_SHARE = 0.25
+"""Share of a range of frames over which a limb that would flip is turned over, if this is longer than the blend."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +86,7 @@ def constrain_motion(
     solver: Solver = "auto",
     options: SolverOptions | None = None,
     budget: ComputeBudget | None = None,
+    damping_zone_rad: float = 0.0,
 ) -> ConstrainedMotion:
     """Meet constraints in their frames and blend the change in and out before and after them.
 
@@ -98,6 +102,8 @@ def constrain_motion(
         squares for everything else
     options : SolverOptions, optional    tolerances and iterations
     budget : ComputeBudget, optional    remaining work; reduced by the work of this call
+    damping_zone_rad : float    angle before full extension at which the damping of a stretching limb begins (two-bone
+        solver only); 0 for none
 
     Returns
     -------
@@ -113,7 +119,9 @@ def constrain_motion(
     before = tuple(_residuals(skeleton, motion, constraint) for constraint in constraints)
     changed = motion
     for cluster in _clusters(skeleton, constraints, freedom.root_moves):
-        solving = _Cluster(skeleton, cluster, freedom, solver, options or SolverOptions(), budget or ComputeBudget())
+        solving = _Cluster(
+            skeleton, cluster, freedom, solver, options or SolverOptions(), budget or ComputeBudget(), damping_zone_rad
+        )
         changed = solving.constrained(changed, blend_frames)
     after = tuple(_residuals(skeleton, changed, constraint) for constraint in constraints)
     return ConstrainedMotion(changed, before, after)
@@ -192,6 +200,7 @@ class _Cluster:
     solver: Solver
     options: SolverOptions
     budget: ComputeBudget
+    damping_zone_rad: float
 
     def constrained(self, motion: Motion, blend_frames: int) -> Motion:
         """Solve the constraints and blend the motion in and out of the solution.
@@ -220,16 +229,18 @@ class _Cluster:
         for number, chosen in enumerate(sets.T):
             here = np.flatnonzero(which.reshape(-1) == number)
             asked = [one for one, counts in zip(constraints, chosen, strict=True) if counts]
-            solved = self._solve(given.at_frames(here), frames[here], asked)
+            solved = self._solve(given.at_frames(here), frames[here], asked, blend_frames)
             rotations[here], roots[here] = solved.rotations, solved.root_translations
         changed = given._replace(rotations=rotations, root_translations=roots)
         return displace(motion, frames, changed, windows_around(frames, blend_frames, motion.frame_count))
 
-    def _solve(self, given: Motion, frames: Ints, constraints: Sequence[Constraint]) -> Motion:
+    def _solve(self, given: Motion, frames: Ints, constraints: Sequence[Constraint], blend_frames: int) -> Motion:
         """Solve frames that all have the same constraints; return only these frames.
 
-        `given` is the motion in these frames, and `frames` are their numbers.
+        `given` is the motion in these frames, and `frames` are their numbers. A limb that would flip is turned over
+        about `blend_frames` instead, or over a share of a long range.
         """
+        reach = max(blend_frames, FLIP_SHARE * len(frames), 1.0)
         limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
         joints = tuple(sorted({joint for one in constraints for joint in one.joints}))
         self.budget.spend(self._work(len(frames), constraints, limb, joints))
@@ -241,6 +252,8 @@ class _Cluster:
             limb=limb,
             solver=self.solver,
             options=self.options,
+            neighbours=Neighbours(frames, reach),
+            damping_zone_rad=self.damping_zone_rad,
         ).motion
 
     def _work(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from math import radians
 from typing import Any
 
@@ -12,9 +13,9 @@ from numpy.typing import NDArray
 
 from marey_motion.editing.compute_budget import PER_NUMBER, PER_PLANTED_NUMBER, PER_RIG
 from marey_motion.editing.constraining import Constraint, constrain_motion, current_values
-from marey_motion.editing.foot_plants import Foot, FootContacts, find_contacts
+from marey_motion.editing.foot_plants import Foot, FootContacts, find_contacts, find_feet
 from marey_motion.editing.foot_plants import plant_feet as plant
-from marey_motion.editing.inverse_kinematics.limbs import limb_ending_at
+from marey_motion.editing.inverse_kinematics.limbs import limb_ending_at, straight_hinge
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     JointLimit,
@@ -71,7 +72,7 @@ def constrain(take: Take, command: Constrain) -> Take:
     )
     made = constrain_motion(
         take.skeleton, take.motion, wanted, blend_frames=take.count_frames(command.blend_s), freedom=freedom,
-        solver=command.solver, budget=take.budget,
+        solver=command.solver, budget=take.budget, damping_zone_rad=radians(command.stretch_damping_deg),
     )  # fmt: skip
     found = [
         _finding(asked, constraint, before, after)
@@ -79,7 +80,36 @@ def constrain(take: Take, command: Constrain) -> Take:
             command.constraints, wanted, made.residuals_before, made.residuals_after, strict=True
         )
     ]
-    return take.moved(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
+    take = take.moved(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
+    for warning in _contradictions(wanted):
+        take = take.warned("constrain", warning)
+    if take.count_frames(command.blend_s) > take.frame_count:
+        take = take.warned("constrain", f"the blend of {command.blend_s:g} s is longer than the clip")
+    return take
+
+
+def _contradictions(constraints: Sequence[Constraint]) -> list[str]:
+    """Name pairs of constraints that want a joint in two places, or in two orientations, in the same frames."""
+    told = []
+    for (first, a), (second, b) in combinations(enumerate(constraints), 2):
+        start, stop = max(a.start, b.start), min(a.stop, b.stop)
+        if start < stop and a.target.joint == b.target.joint and _apart(a.target, b.target):
+            told.append(
+                f"constraints[{first}] and constraints[{second}] contradict each other in the frames {start}:{stop}; "
+                "the result is between them, by their weights"
+            )
+    return told
+
+
+def _apart(a: Target, b: Target) -> bool:
+    """Return whether two targets of one joint cannot both be met, judging by their first values."""
+    if isinstance(a, PositionTarget) and isinstance(b, PositionTarget):
+        axes = ["xyz".index(axis) for axis in a.axes if axis in b.axes]
+        same_point = np.allclose(a.offset, b.offset)
+        return bool(same_point and np.abs(a.values[0] - b.values[0])[axes].max(initial=0.0) > _OPTIONS.tolerance_m)
+    if isinstance(a, OrientationTarget) and isinstance(b, OrientationTarget):
+        return bool(abs(float(a.values[0] @ b.values[0])) < np.cos(0.5 * _OPTIONS.tolerance_rad))
+    return False
 
 
 def plant_feet(take: Take, command: PlantFeet) -> Take:
@@ -101,7 +131,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
     """
     take.budget.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
     rig = _Rig(take)
-    feet = [_foot(rig, side) for side in ("left", "right")]
+    feet = find_feet(take.skeleton, take.body.mapping, rig.axes_if_known())
     given = None if command.contacts is None else _given_contacts(take, feet, command)
     made = plant(take.skeleton, take.motion, take.frame_rate_hz, feet, contacts=given, options=command)
     values = {
@@ -187,7 +217,9 @@ def _target(rig: _Rig, joint: int, asked: AnyConstraint, start: int, stop: int) 
         if asked.rotation is not None:
             return target
         return replace(target, rotation=current_values(skeleton, part.at_frames(np.arange(1)), target)[0])
-    place = PositionTarget(joint, asked.point_m or (0.0, 0.0, 0.0), asked.axes, asked.offset_m, asked.weight)
+    place = PositionTarget(
+        joint, asked.point_m or (0.0, 0.0, 0.0), asked.axes, asked.offset_m, asked.weight, asked.pole_m
+    )
     if asked.point_m is not None:
         return place
     now = current_values(skeleton, part, place)
@@ -214,7 +246,8 @@ def _limit(rig: _Rig, asked: AnyLimit) -> JointLimit:
     axes, rest = rig.axes_of(joint), rig.take.skeleton.rest_rotations[joint]
     if isinstance(asked, HingeLimit):
         least, greatest = asked.angle_deg
-        return JointLimit.hinge(axes, radians(least), radians(greatest), rest)
+        axes, straight = straight_hinge(rig.take.skeleton, rig.take.body.mapping, joint, axes)
+        return JointLimit.hinge(axes, radians(least), radians(greatest), straight)
     (about, across), (least, greatest) = asked.swing_deg, asked.twist_deg
     return JointLimit.cone(axes, (radians(about), radians(across)), (radians(least), radians(greatest)), rest)
 
@@ -236,18 +269,6 @@ def _finding(asked: AnyConstraint, constraint: Constraint, before: Any, after: A
         "frames": len(after),
         "frames_reached": int((after <= 1.01 * tolerance).sum()),
     }
-
-
-def _foot(rig: _Rig, side: str) -> Foot:
-    mapping, skeleton = rig.take.body.mapping, rig.take.skeleton
-    *_, ankle = mapping.indices(skeleton, (f"{side}_hip", f"{side}_knee", f"{side}_ankle"))
-    leg = limb_ending_at(skeleton, mapping, ankle, rig.axes_if_known())
-    if leg is None:
-        raise MappingError(
-            "the mapped hip, knee and ankle are not one chain of joints; correct the mapping", where=f"{side}_ankle"
-        )
-    toe = f"{side}_toe"
-    return Foot(leg, mapping.indices(skeleton, (toe,))[0] if toe in mapping.joints else ankle)
 
 
 def _given_contacts(take: Take, feet: Sequence[Foot], command: PlantFeet) -> tuple[FootContacts, ...]:

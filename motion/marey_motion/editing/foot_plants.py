@@ -9,7 +9,7 @@ and Gleicher 2002, Footskate cleanup for motion capture editing).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -20,17 +20,22 @@ from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Flags, Floats
 from marey_motion.editing.annotations.contacts import runs, without_short
 from marey_motion.editing.displacement import spread_displacements, windows_around
-from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb
+from marey_motion.editing.ground import heights_of_soles
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_ending_at
 from marey_motion.editing.inverse_kinematics.solving import solve_two_bone
 from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget
-from marey_motion.errors import EditError
+from marey_motion.errors import EditError, MappingError
 from marey_motion.motion import Motion
+from marey_motion.rigs import JointAxes, JointMapping
+from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.constraints import PlantOptions
 
 MOST_LOWERING_M = 0.1
 SHORTEST_CONTACT_S = 0.06
 """Duration, in seconds, below which a contact counts as noise."""
+MOST_SUNK_M = 0.005
+"""Depth below the floor, in metres, to which the roll of a planted foot may move its sole."""
 # Less than this is rounding.
 SHORTEST_LOWERING_M = 1e-9
 
@@ -41,6 +46,36 @@ class Foot:
 
     leg: TwoBoneLimb
     toe: int
+
+
+def find_feet(skeleton: Skeleton, mapping: JointMapping, axes: Mapping[str, JointAxes] | None) -> tuple[Foot, ...]:
+    """Find the left and the right foot of a skeleton.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    mapping : JointMapping    its standard joints
+    axes : mapping of str to JointAxes or None    axes by joint name (`rigs.guess_axes`); None if they are not known
+
+    Returns
+    -------
+    tuple of Foot    left and right
+
+    Raises
+    ------
+    MappingError    if the mapping does not define both legs
+    """
+    feet = []
+    for side in SIDES:
+        *_, ankle = mapping.indices(skeleton, (f"{side}_hip", f"{side}_knee", f"{side}_ankle"))
+        leg = limb_ending_at(skeleton, mapping, ankle, axes)
+        if leg is None:
+            raise MappingError(
+                "the mapped hip, knee and ankle are not one chain of joints; correct the mapping", where=f"{side}_ankle"
+            )
+        toe = f"{side}_toe"
+        feet.append(Foot(leg, mapping.indices(skeleton, (toe,))[0] if toe in mapping.joints else ankle))
+    return tuple(feet)
 
 
 class FootContacts(NamedTuple):
@@ -129,11 +164,32 @@ def plant_feet(
     ]
     zone = math.radians(options.knee_damping_deg)
     lowering = _lowering(positions, feet, plans, zone, blend)
-    planted = motion._replace(root_translations=motion.root_translations - lowering[:, None] * (0.0, 1.0, 0.0))
+    lowered = motion._replace(root_translations=motion.root_translations - lowering[:, None] * (0.0, 1.0, 0.0))
+    planted = lowered
     for foot, plan in zip(feet, plans, strict=True):
         planted = _with_leg(skeleton, planted, motion, foot, plan, lowering, zone)
+    sunk = _sunk_m(skeleton, motion, planted, feet, blend)
+    if sunk.any():
+        planted = lowered
+        for number, (foot, plan) in enumerate(zip(feet, plans, strict=True)):
+            lift = _enveloped(sunk[:, number], max(1, blend // 2))
+            lifted = plan._replace(ankle=plan.ankle + lift[:, None] * (0.0, 1.0, 0.0))
+            planted = _with_leg(skeleton, planted, motion, foot, lifted, lowering, zone)
     before, after = (_slide(points, feet, contacts) for points in (positions, planted.positions(skeleton)))
     return PlantedMotion(planted, tuple(contacts), before, after, float(lowering.max(initial=0.0)))
+
+
+def _sunk_m(skeleton: Skeleton, motion: Motion, planted: Motion, feet: Sequence[Foot], blend: int) -> Floats:
+    """Compute how far (F, n), in metres, planting moved soles more than `MOST_SUNK_M` below their floor.
+
+    The floor of a frame is the lowest height of the sole within `blend` frames before planting.
+    """
+    from scipy.ndimage import minimum_filter1d
+
+    ankles = [foot.leg.end for foot in feet]
+    before, after = (heights_of_soles(skeleton, one, ankles) for one in (motion, planted))
+    floors = minimum_filter1d(before, 2 * blend + 1, axis=0, mode="nearest")
+    return np.asarray(np.maximum(floors - after - MOST_SUNK_M, 0.0), dtype=np.float64)
 
 
 def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: PlantOptions) -> FootContacts:

@@ -13,6 +13,8 @@ from marey_motion.editing.placement import shifted
 from marey_motion.editing.take import EditFinding, Take
 from marey_motion.importing.tracks import sole_points
 from marey_motion.kinematics import forward_kinematics
+from marey_motion.matching.body import MatchingBody
+from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.commands import FindContacts, FindGround, MoveToGround
 from marey_schemas.options.annotations import ContactOptions
@@ -20,6 +22,11 @@ from marey_schemas.options.annotations import ContactOptions
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05
 """Quantile of the heights of the lower sole that counts as the ground if the lower foot is never in stance."""
+
+SOLE_SHARE = 0.05
+"""Height of the joints and tips of a standing foot in a shoe, as a share of the length of the leg."""
+STANDING_SHARE = 0.9
+"""Height of the hip above the ankle, as a share of the leg's length, above which a rest pose stands."""
 
 
 class Ground(NamedTuple):
@@ -30,10 +37,12 @@ class Ground(NamedTuple):
     height_m : height of the ground, metres
     standing_frames : number of frames in which the lower foot is in stance; the height is estimated from these frames
         or, if there are none, from the frames with the lowest feet
+    sole_m : distance from the lowest joint or tip of a foot down to its sole, metres
     """
 
     height_m: float
     standing_frames: int
+    sole_m: float = 0.0
 
 
 def move_to_ground(take: Take, command: MoveToGround) -> Take:
@@ -52,20 +61,20 @@ def move_to_ground(take: Take, command: MoveToGround) -> Take:
     ------
     MappingError    if the feet are not known
     """
-    ground = estimate_ground(take) if command.height_m is None else Ground(command.height_m, 0)
+    ground = estimate_ground(take, command.sole_m) if command.height_m is None else Ground(command.height_m, 0)
     moved = take.moved(shifted(take.motion, np.array((0.0, -ground.height_m, 0.0))))
     if command.height_m is not None:
         return moved
     return moved.with_finding(EditFinding("move_to_ground", ground._asdict()))
 
 
-def find_ground(take: Take, _command: FindGround) -> Take:
+def find_ground(take: Take, command: FindGround) -> Take:
     """Find the height of the ground and record it; the motion stays as it is.
 
     Parameters
     ----------
     take : Take    F frames
-    _command : FindGround    has no parameters
+    command : FindGround    the thickness of the soles; if None, it is estimated
 
     Returns
     -------
@@ -75,7 +84,7 @@ def find_ground(take: Take, _command: FindGround) -> Take:
     ------
     MappingError    if the feet are not known
     """
-    return take.with_finding(EditFinding("find_ground", estimate_ground(take)._asdict()))
+    return take.with_finding(EditFinding("find_ground", estimate_ground(take, command.sole_m)._asdict()))
 
 
 def find_contacts(take: Take, command: FindContacts) -> Take:
@@ -112,7 +121,7 @@ def find_contacts(take: Take, command: FindContacts) -> Take:
     return take.with_finding(EditFinding("find_contacts", values))
 
 
-def estimate_ground(take: Take) -> Ground:
+def estimate_ground(take: Take, sole_m: float | None = None) -> Ground:
     """Estimate the height of the ground: the median height of the lower sole while the foot of that sole is in stance.
 
     The median is robust against a foot that is below the floor for some frames and against a kick that is held.
@@ -120,6 +129,8 @@ def estimate_ground(take: Take) -> Ground:
     Parameters
     ----------
     take : Take    F frames
+    sole_m : float, optional    distance from the lowest joint or tip of a foot down to its sole, metres; None to
+        estimate it
 
     Returns
     -------
@@ -129,7 +140,36 @@ def estimate_ground(take: Take) -> Ground:
     ------
     MappingError    if the feet are not known
     """
-    return _ground_of(_soles_of(take), _stances(take, ContactOptions()))
+    ground = _ground_of(_soles_of(take), _stances(take, ContactOptions()))
+    sole = estimate_sole(take.skeleton, take.body.matching) if sole_m is None else sole_m
+    return ground._replace(height_m=ground.height_m - sole, sole_m=sole)
+
+
+def estimate_sole(skeleton: Skeleton, body: MatchingBody) -> float:
+    """Estimate the distance from the lowest joint or tip of a foot down to its sole.
+
+    Skeletons end at joints inside the foot, and the ball of a foot in a shoe is about `SOLE_SHARE` of the leg's length
+    above the floor. Tips that hang below the joint of the toes in the rest pose are nearer to the sole by that much.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    body : MatchingBody    its feet
+
+    Returns
+    -------
+    float    metres, at least 0
+    """
+    rest = Motion(np.zeros((1, 3)), skeleton.rest_rotations[None], np.zeros((1, 0, 3)), ())
+    heights = forward_kinematics(skeleton, rest.poses, end_sites=True)[0, :, 1]
+    depths = []
+    for ankle, toe, hip in zip(body.feet, body.toes, (body.lefts[0], body.rights[0]), strict=True):
+        path = skeleton.path_to_root(ankle)
+        leg = sum(float(np.linalg.norm(skeleton.offsets[joint])) for joint in path if joint > hip)
+        stands = heights[hip] - heights[ankle] > STANDING_SHARE * leg
+        hanging = float(heights[toe] - heights[sole_points(skeleton, ankle)].min()) if stands else 0.0
+        depths.append(max(SOLE_SHARE * leg - hanging, 0.0))
+    return float(np.mean(depths))
 
 
 def sole_heights(points: AnyFloats, skeleton: Skeleton, ankles: Sequence[int]) -> Floats:
@@ -170,6 +210,29 @@ def lower_soles_in_stance(heights: Floats, stances: Sequence[Sequence[Stance]]) 
     return standing & lower
 
 
+def heights_of_soles(skeleton: Skeleton, motion: Motion, ankles: Sequence[int]) -> Floats:
+    """Compute the height of the lowest point of each foot, from the ankle down.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    ankles : sequence of int    n joints
+
+    Returns
+    -------
+    (F, n) float64    metres
+    """
+    positions = forward_kinematics(
+        skeleton,
+        motion.poses,
+        translations=motion.translations,
+        translated_joints=motion.translated_joints,
+        end_sites=True,
+    )
+    return sole_heights(positions, skeleton, ankles)
+
+
 def _stances(take: Take, options: ContactOptions) -> tuple[list[Stance], ...]:
     clip = take.motion.as_clip(take.skeleton, take.frame_rate_hz)
     return find_stances(clip, take.body.matching, options)
@@ -183,12 +246,4 @@ def _ground_of(heights: Floats, stances: tuple[list[Stance], ...]) -> Ground:
 
 
 def _soles_of(take: Take) -> Floats:
-    motion, skeleton = take.motion, take.skeleton
-    points = forward_kinematics(
-        skeleton,
-        motion.poses,
-        translations=motion.translations,
-        translated_joints=motion.translated_joints,
-        end_sites=True,
-    )
-    return sole_heights(points, skeleton, take.body.matching.feet)
+    return heights_of_soles(take.skeleton, take.motion, take.body.matching.feet)

@@ -17,8 +17,9 @@ import numpy as np
 from marey_motion.clip import Clip
 from marey_motion.editing.compute_budget import PER_COMMAND, PER_NUMBER, ComputeBudget
 from marey_motion.editing.constraint_commands import constrain, plant_feet
-from marey_motion.editing.frames import concatenate, resample, retime, split, trim
+from marey_motion.editing.frames import resample, retime, split, trim
 from marey_motion.editing.ground import find_contacts, find_ground, move_to_ground
+from marey_motion.editing.joining import concatenate
 from marey_motion.editing.joints import paste, rotate_joint
 from marey_motion.editing.loops import close_loop, cut_loop
 from marey_motion.editing.placement import face, fix_drift, flip_axes, mirror, move_to_origin, rotate, scale, translate

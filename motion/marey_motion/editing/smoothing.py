@@ -10,8 +10,11 @@ from marey_motion import quaternions
 from marey_motion.arrays import Floats
 from marey_motion.editing.borders import blended, range_weights
 from marey_motion.editing.compute_budget import MOST_OF_TAPS, PER_TAP
+from marey_motion.editing.ground import heights_of_soles
+from marey_motion.editing.kept_feet import feet_as_motion, feet_of, with_feet
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
+from marey_motion.motion import Motion
 from marey_schemas.editing.commands import Smooth
 
 LONG_WINDOW = 512
@@ -57,6 +60,10 @@ def smooth(take: Take, command: Smooth) -> Take:
     chosen = list(every) if command.joints is None else sorted({take.joint(one) for one in command.joints})
     columns = slice(None) if command.joints is None else chosen
     weights = _weights(take, command)
+    if command.window_s * take.frame_rate_hz > 2.0 * take.frame_count:
+        take = take.warned(
+            "smooth", f"the window of {command.window_s:g} s is longer than the clip, so it was shortened"
+        )
     take.budget.spend(take.size * min(PER_TAP * len(weights), MOST_OF_TAPS))
     root, rotations, translations = motion.root_translations.copy(), motion.rotations.copy(), motion.translations.copy()
     if command.root_translation:
@@ -67,7 +74,29 @@ def smooth(take: Take, command: Smooth) -> Take:
     moved = [command.root_translation if joint in carriers else joint in chosen for joint in motion.translated_joints]
     steps = _smooth_positions(translations[:, moved], weights) - translations[:, moved]
     translations[span, moved] += shares[:, None, None] * steps[span]
-    return take.moved(motion._replace(root_translations=root, rotations=rotations, translations=translations))
+    made = motion._replace(root_translations=root, rotations=rotations, translations=translations)
+    return take.moved(_with_kept_feet(take, made, weights, span, shares) if command.keep_feet else made)
+
+
+def _with_kept_feet(take: Take, smoothed: Motion, weights: Floats, span: slice, shares: Floats) -> Motion:
+    """Smooth the feet as points of the world, and keep them above the lowest place that they have in the window."""
+    from scipy.ndimage import minimum_filter1d
+
+    feet = feet_of(take)
+    if not feet:
+        return smoothed
+    ankles = [foot.leg.end for foot in feet]
+    moved = (smoothed.rotations != take.motion.rotations).any(axis=(0, 2))
+    roots = (smoothed.root_translations != take.motion.root_translations).any()
+    if not roots and not any(moved[list(take.skeleton.path_to_root(ankle))].any() for ankle in ankles):
+        return smoothed
+    given = feet_as_motion(take.skeleton, take.motion, feet)
+    places, spins = given.translations.copy(), given.rotations.copy()
+    places[span] += shares[:, None, None] * (_smooth_positions(places, weights) - places)[span]
+    spins[span] = blended(spins[span], _smooth_rotations(take, spins, weights, ankles)[span], shares)
+    soles = heights_of_soles(take.skeleton, take.motion, ankles)
+    floors = minimum_filter1d(soles, len(weights), axis=0, mode="nearest")
+    return with_feet(take, smoothed, feet, given._replace(translations=places, rotations=spins), floors, span)
 
 
 def _weights(take: Take, command: Smooth) -> Floats:

@@ -151,6 +151,20 @@ class Take:
         """
         return replace(self, findings=(*self.findings, finding))
 
+    def warned(self, command: str, warning: str) -> Take:
+        """Add a finding that warns of a parameter that does not fit the motion.
+
+        Parameters
+        ----------
+        command : str    name of the command
+        warning : str    what does not fit, as a sentence without a full stop
+
+        Returns
+        -------
+        Take    the take with one more finding
+        """
+        return self.with_finding(EditFinding(command, {"warning": warning}))
+
     def source(self, name: str) -> Clip:
         """Look up another clip, by the name that a command uses.
 

@@ -68,6 +68,8 @@ SKATE_HEIGHT_M = 0.025
 SKATE_SPEED_M_S = 0.6
 IN_PLACE_FOOT_SPEED_M_S = 0.4
 TELEPORT_SPEED_M_S = 15.0
+REST_JUMP_M_S = 8.0
+"""Speed at which a point of the body leaves a rest pose that is no part of the motion."""
 JUMP_RAD = np.radians(60.0)
 # Cosine of half an angle a little smaller, beyond any rounding of the one that is compared.
 _SURELY_NO_JUMP = np.cos(JUMP_RAD / 2) + 1e-3
@@ -208,6 +210,31 @@ def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
     if start == count:
         return count, 0
     return start, _leading(resting(block)[::-1] for block in reversed(blocks))
+
+
+def rest_pose_jumps(clip: Clip) -> tuple[int, int]:
+    """Count the frames of a rest pose at either end that are no part of the motion: the body jumps out of them.
+
+    A motion that begins in a rest pose and moves on from there does not jump.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+
+    Returns
+    -------
+    (int, int)    frames at the start and at the end; 0 if there is no such pose, or nothing else
+    """
+    tracks = track(clip)
+    start, end = _rest_pose_frames(clip, tracks)
+    if start == clip.frame_count:
+        return 0, 0
+    steps = np.linalg.norm(np.diff(tracks.positions, axis=0), axis=-1).max(axis=1) * clip.frame_rate_hz
+
+    def jumps(step: int) -> bool:
+        return bool(steps[step] > REST_JUMP_M_S)
+
+    return start if start and jumps(start - 1) else 0, end if end and jumps(len(steps) - end) else 0
 
 
 def _leading(blocks: Iterable[NDArray[np.bool_]]) -> int:

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
-from marey_motion.editing.annotations.contacts import foot_speed, stances_of
-from marey_schemas.options.annotations import ContactOptions
+from marey_motion.editing.annotations.contacts import contact_labels
 from marey_schemas.options.quality import QualityOptions
 
 PLANTED_PERCENTILE = 5.0
@@ -77,26 +76,6 @@ class Feet:
 
 
 _TOES = slice(2, 4)
-
-
-def contact_labels(points: Floats, rate_hz: float) -> Mask:
-    """Label the frames in which points of feet stand, by their speeds, as the proposals of steps do.
-
-    Parameters
-    ----------
-    points : (F, k, 3) float64    metres
-    rate_hz : float    frames per second
-
-    Returns
-    -------
-    (F, k) bool    True in the stances of each point
-    """
-    labels = np.zeros(points.shape[:2], dtype=np.bool_)
-    options = ContactOptions()
-    for point in range(points.shape[1]):
-        for stance in stances_of(foot_speed(points[:, point : point + 1], rate_hz), rate_hz, options):
-            labels[stance.start : stance.end, point] = True
-    return labels
 
 
 def weighted_skate(feet: Feet, options: QualityOptions) -> float:

@@ -122,6 +122,11 @@ class Concatenate(NamedCommand):
         "frames overlap.",
     )
     blend_s: Seconds = Field(0.3, description="Duration of the blend in seconds; 0: a hard cut.")
+    keep_feet: bool = Field(
+        True,
+        description="Keep feet that stand on both sides of the seam in place, and all feet above their floors; false: "
+        "only rotations and the path of the root are blended.",
+    )
 
 
 class Resample(NamedCommand):
@@ -265,6 +270,12 @@ class FixDrift(NamedCommand):
 
 # The ground
 
+Sole = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+SOLE = (
+    "Distance from the lowest joint or tip of a foot down to its sole, in metres; absent: estimated from the length of "
+    "the leg."
+)
+
 
 class MoveToGround(NamedCommand):
     """Shift the whole motion vertically so that the ground is at height zero."""
@@ -275,6 +286,7 @@ class MoveToGround(NamedCommand):
         None,
         description="Height of the ground before the command, in metres; absent: estimated from feet in contact.",
     )
+    sole_m: Sole | None = Field(None, description=SOLE)
 
 
 class FindGround(NamedCommand):
@@ -282,6 +294,7 @@ class FindGround(NamedCommand):
 
     examples: ClassVar[Examples] = ({},)
     command: Literal["find_ground"] = "find_ground"
+    sole_m: Sole | None = Field(None, description=SOLE)
 
 
 class FindContacts(NamedCommand, ContactOptions):
@@ -329,6 +342,11 @@ class Smooth(NamedCommand):
     order: int = Field(3, ge=0, le=9, description="Degree of the polynomials of the filter savitzky_golay.")
     joints: Joints | None = Field(None, description="Joints to smooth; absent: all.")
     root_translation: bool = Field(True, description="Also smooth the path of the root.")
+    keep_feet: bool = Field(
+        True,
+        description="Smooth the paths of the feet, so that contacts are kept and no foot sinks into its floor; false: "
+        "feet go where the smoothed rotations lead them.",
+    )
     frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
     border_s: Seconds = Field(
         0.2, description="Seconds at either end of the range in which the change is blended in and out."

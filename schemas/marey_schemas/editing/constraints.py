@@ -6,6 +6,7 @@ quaternions w, x, y, z) are in the world; offsets and axes are in the joint's ow
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -81,6 +82,11 @@ class PositionConstraint(_Constraint):
     offset_m: Shift = Field(
         (0.0, 0.0, 0.0), description="Offset of the constrained point from the joint, in the joint's frame."
     )
+    pole_m: Shift | None = Field(
+        None,
+        description="Point in the world, in metres, to which the elbow or knee is directed; absent: elbow and knee "
+        "stay near their side in the source pose. Only for a wrist or ankle that is constrained in all axes.",
+    )
 
     @model_validator(mode="after")
     def _check_place(self) -> Self:
@@ -125,7 +131,10 @@ class HingeLimit(_Limit):
 
     kind: Literal["hinge"] = "hinge"
     joint: JointName
-    angle_deg: AngleRange = Field(description="Least and greatest angle from the rest pose, in degrees.")
+    angle_deg: AngleRange = Field(
+        description="Least and greatest angle in degrees: for knees and elbows the bend, which is 0 in a straight limb "
+        "and positive in its natural direction on every skeleton; for other joints the angle from the rest pose."
+    )
 
 
 class ConeLimit(_Limit):
@@ -155,6 +164,15 @@ class Constrain(NamedCommand):
     )
     blend_s: Seconds = Field(
         0.3, description="Seconds before and after the range in which the motion is blended; 0: none."
+    )
+    stretch_damping_deg: float = Field(
+        40.0,
+        ge=0,
+        le=90,
+        allow_inf_nan=False,
+        description="Angle before full extension, and before a full fold, at which the damping of an elbow or knee "
+        "begins, in degrees (closed form only). Targets near full reach are missed by a few millimetres, targets close "
+        "to the shoulder or hip by up to a few centimetres; 0: none, limbs may snap straight.",
     )
     root_moves: bool = Field(False, description="Also shift the root (least squares only).")
     limits: tuple[AnyLimit, ...] = Field((), max_length=MOST_CONSTRAINTS, description="Limits of the joints' angles.")
@@ -203,8 +221,23 @@ class PlantFeet(NamedCommand, PlantOptions):
     examples: ClassVar[Examples] = ({},)
     command: Literal["plant_feet"] = "plant_feet"
     contacts: tuple[FootContact, ...] | None = Field(
-        None, max_length=100_000, description="Contacts of the feet; absent: detected by the speed of the feet."
+        None,
+        max_length=100_000,
+        description="Contacts of the feet; absent: detected by the speed of the feet. Contacts of one foot do not "
+        "overlap.",
     )
+
+    @model_validator(mode="after")
+    def _check_contacts(self) -> Self:
+        for foot in ("left", "right"):
+            ranges = sorted((one.frames for one in self.contacts or () if one.foot == foot), key=lambda each: each[0])
+            for (start, stop), (then, _) in pairwise(ranges):
+                if stop is None or then < stop:
+                    raise ValueError(
+                        f"contacts: two contacts of the {foot} foot overlap at frame {then}, the first begins at "
+                        f"frame {start}; join them, or end the first one earlier"
+                    )
+        return self
 
 
 ConstraintCommand = Constrain | PlantFeet

@@ -90,7 +90,7 @@ EDIT = KindDeclaration(
     description="Applies the commands of an edit to clips: trims, joins, smooths, places and repairs them.",
     params=job_params.EditParams,
     implementation="marey_worker.kinds.edit:run",
-    version=3,
+    version=4,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to edit."),
         "edit": InputSpec(
@@ -109,6 +109,7 @@ EDIT = KindDeclaration(
     place_counts=True,
     in_place="in_place",
     named_after="clips",
+    refusing_all_fails=True,
     unclear_place=job_params.EditParams.unclear_place,
 )
 

@@ -43,6 +43,10 @@ class FailureReason(StrEnum):
     DEPENDENCY_FAILED = "dependency_failed"
 
 
+NOTHING_DONE = "nothing-done"
+"""Code of the failure of a job that refused all of its inputs."""
+
+
 class InputSpec(Answer):
     """Declaration of a named input of a job kind."""
 

@@ -38,6 +38,8 @@ class KindDeclaration:
     * `place_counts`: whether the path of the collection that receives the results must be the same.
     * `newest_of`: parameters that contain the id of an item, or null; the item must have the same newest revision.
 
+    A job that refuses some of its inputs succeeds. With `refusing_all_fails`, it fails if it refused all of them.
+
     Some jobs never reuse results. A kind declares them with these fields:
 
     * `never_cached_for`: function of the parameters, which returns whether the job looks up names while it runs.
@@ -76,6 +78,7 @@ class KindDeclaration:
     never_cached_without: tuple[str, ...] = ()
     never_cached_for: Callable[[Mapping[str, Any]], bool] | None = None
     named_after: str | None = None
+    refusing_all_fails: bool = False
     unclear_place: Callable[[Any, str], str | None] | None = None
     exports: str | None = None
 

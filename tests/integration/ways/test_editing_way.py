@@ -166,10 +166,11 @@ def test_where_results_should_go_must_be_clear(marey: Marey, lab: ProjectHandle)
         lab.edit("walks", [{"command": "mirror"}], in_place=True, into="elsewhere")
     (first, *_) = clips_of(lab, "walks").values()
     ended(marey, lab.edit(first, [{"command": "trim", "start": 10}], in_place=True))
-    stale = ended(marey, lab.edit(first, [{"command": "trim", "start": 20}], in_place=True))
-    assert stale.result is not None
-    (refusal,) = stale.result["refused"]
-    assert refusal["code"] == "clip-changed"
+    stale = marey.jobs.wait(lab.edit(first, [{"command": "trim", "start": 20}], in_place=True).id)
+    assert stale.failure is not None
+    assert (stale.state, stale.failure.code) == ("failed", "nothing-done")
+    assert "walk -30" in stale.failure.detail
+    assert "submit the edit again" in stale.failure.detail
     assert lab.clips.get(first.id).item.revision == 2
 
 
@@ -199,6 +200,11 @@ def test_a_clip_that_cannot_be_edited_is_refused_and_the_others_are_made(marey: 
     assert "commands[0] (trim)" in refusal["detail"]
     assert clips_of(lab, "clean").keys() == {"walk 0", "walk 30"}
 
+    nothing = marey.jobs.wait(lab.edit("walks", [{"command": "trim", "start": 100_000}], into="none").id)
+    assert nothing.failure is not None
+    assert (nothing.state, nothing.failure.code) == ("failed", "nothing-done")
+    assert "none of 3 clips can be edited; walks/" in nothing.failure.detail
+
 
 def test_a_preview_shows_what_the_job_makes_and_stores_nothing(marey: Marey, lab: ProjectHandle) -> None:
     walk = clips_of(lab, "walks")["walk 30"]
@@ -222,7 +228,7 @@ def test_an_animator_edits_from_the_command_line(lab: ProjectHandle, run: Comman
     walk = "lab/walks/walk 0"
     told = run("edit", "preview", walk, "--do", "trim start=10 stop=100", "--do", "find_ground").stdout
     assert "0:90 of 90" in told
-    assert "find_ground: height_m 0.02" in told
+    assert "find_ground: height_m -0.02" in told
     shown = json.loads(run("edit", "preview", walk, "--do", "mirror", "--frames", "5:7", "--json").stdout)
     assert (shown["frames"], len(shown["motion"]["poses"]["data"])) == ([5, 7], 2)
 

@@ -256,6 +256,25 @@ def test_a_fan_out_of_which_a_task_fails_commits_nothing_and_its_retry_everythin
     assert [one.job for one in gaits.log()] == [again]
 
 
+@pytest.mark.parametrize("made", [(), ("a",)])
+def test_a_fan_out_that_refused_all_inputs_has_failed(gaits: CommittingDesk, made: tuple[str, ...]) -> None:
+    things = gaits.desk.things(4)
+    job = gaits.submit("square", into="made", inputs={"things": tuple(ItemInput(item=one) for one in things)})
+    for number, lease in enumerate(gaits.desk.claim_many()):
+        if number == 1 and made:
+            gaits.desk.stage(lease, *made)
+        refused = [{"name": f"thing {number}", "detail": "it has no feet"}]
+        gaits.desk.complete(lease, result={"refused": refused})
+    ended = gaits.job(job)
+    if made:
+        assert ended.state == "succeeded"
+    else:
+        assert ended.failure is not None
+        assert (ended.state, ended.failure.code) == ("failed", "nothing-done")
+        assert "all inputs were refused; the first, thing " in ended.failure.detail
+        assert gaits.head() is None
+
+
 def test_a_job_whose_tasks_are_gathered_commits_what_it_gathered(gaits: CommittingDesk) -> None:
     things = gaits.desk.things(1)
     made = gaits.submit("survey", into="made", params={"number": 2}, inputs={"things": (ItemInput(item=things[0]),)})

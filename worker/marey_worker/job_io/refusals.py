@@ -7,8 +7,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from marey_motion.errors import MotionError
+from marey_schemas.queue.jobs import NOTHING_DONE
 from marey_schemas.queue.worker_protocol import PinnedInput
-from marey_worker.context import Context, NoSuchThing, Unreadable
+from marey_schemas.wording import counted
+from marey_worker.context import Context, JobRefused, NoSuchThing, Unreadable
 
 UNUSABLE = (MotionError, ValidationError, Unreadable)
 """Errors that concern a single input; the job processes its other inputs."""
@@ -39,6 +41,15 @@ class Refusals:
         code = "bad-document" if isinstance(error, ValidationError) else error.code
         self._context.log(f"{shown}: {error}")
         self.entries.append({"name": shown, "item": pin.item, "code": code, "detail": str(error)})
+
+    def require_some(self, made: int, count: int, done: str) -> None:
+        """Raise `JobRefused` if the job refused all of its `count` inputs and made nothing of them (`made` is 0).
+
+        `done` is what the job does, such as "edited". Tasks of a job that is split do not fail, because another task
+        may succeed; the server ends the whole job.
+        """
+        if self.entries and not made and self._context.task.size == 1:
+            raise JobRefused(NOTHING_DONE, f"none of {counted(count, 'clip')} can be {done}{self.first}")
 
     @property
     def first(self) -> str:

@@ -31,8 +31,8 @@ from marey_worker.job_io.staged_results import StagedResults
 def run(context: Context, params: EditParams) -> dict[str, Any]:
     """Apply the commands to every clip of the job.
 
-    A clip that cannot be edited is listed as a refusal in the result, with code and reason. Raises `JobRefused` if the
-    commands, or the places of the results, are missing or ambiguous. Also raises `JobRefused` if a clip to which a
+    A clip that cannot be edited is listed as a refusal in the result, with code and reason. Raises `JobRefused` if no
+    clip can be edited, if the commands, or the places of the results, are missing or ambiguous, or if a clip to which a
     command refers cannot be used.
     """
     return _Editing(context, params).run()
@@ -71,6 +71,7 @@ class _Editing:
                 continue
             for output in outputs:
                 self._results.add(output)
+        self._refusals.require_some(self._results.count, len(pins), "edited")
         self._results.flush()
         return {
             "clips": self._results.count,

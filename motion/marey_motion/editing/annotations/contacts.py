@@ -85,6 +85,26 @@ def stances_of(speed: Floats, frame_rate_hz: float, options: ContactOptions) -> 
     return [Stance(*one) for one in runs(without_short(standing, options.shortest_stance_s * frame_rate_hz))]
 
 
+def contact_labels(points: Floats, rate_hz: float) -> NDArray[np.bool_]:
+    """Label the frames in which points of feet stand, by their speeds, as the proposals of steps do.
+
+    Parameters
+    ----------
+    points : (F, k, 3) float64    metres
+    rate_hz : float    frames per second
+
+    Returns
+    -------
+    (F, k) bool    True in the stances of each point
+    """
+    labels = np.zeros(points.shape[:2], dtype=np.bool_)
+    options = ContactOptions()
+    for point in range(points.shape[1]):
+        for stance in stances_of(foot_speed(points[:, point : point + 1], rate_hz), rate_hz, options):
+            labels[stance.start : stance.end, point] = True
+    return labels
+
+
 def _with_hysteresis(values: Floats, low: float, high: float) -> NDArray[np.bool_]:
     """Compute a mask (F,) that is true from where the values fall below `low` until they rise above `high`."""
     decided = (values < low) | (values > high)

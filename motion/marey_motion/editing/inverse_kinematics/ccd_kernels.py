@@ -11,6 +11,7 @@ from marey_motion.editing.inverse_kinematics.pose_kernels import (
     POSITION,
     SWING_RANGE,
     TWIST_RANGE,
+    carry_change,
     measure,
     store_residuals,
     within_limits,
@@ -250,39 +251,65 @@ def _sweep(body, targets, frame, local, work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def descend(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
-    """Solve each frame independently; change `rotations` (F, K, 4) in place, and fill the `SolverResult` `found`.
+def _descend_frame(  # type: ignore[no-untyped-def]
+    body, targets, frame, offsets, ends, carried, local, root, best, work, before, after
+):
+    """Solve one frame: change the pose `local` (K, 4) in place.
 
-    `ends` holds the three stopping criteria: the maximum number of sweeps, and the tolerances in metres and in radians.
+    `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `descend`. If `carried`, the
+    solver starts with the pose `best` (K, 4), which is overwritten. Returns the number of sweeps, and whether all
+    targets are reached.
     """
     most_sweeps, tolerance_m, tolerance_rad = ends
+    cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
+    store_residuals(work.errors, before)
+    changed = carried
+    for k in range(local.shape[0]):
+        if carried:
+            put_rotation(local, k, rotation_at(best, k))
+        elif body.limited[k] and body.movable[k]:
+            put_rotation(local, k, within_limits(body.limits[k], rotation_at(local, k)))
+            changed = True
+    if changed:
+        cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
+    best[:] = local
+    least, stalled, sweeps, arrived = cost, 0, 0, reached
+    store_residuals(work.errors, after)
+    while not reached and sweeps < most_sweeps and stalled < STALLED_SWEEPS:
+        _sweep(body, targets, frame, local, work)
+        cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
+        sweeps += 1
+        stalled = 0 if cost < (1.0 - STALLED_SHARE) * least else stalled + 1
+        if cost < least:
+            least, arrived = cost, reached
+            best[:] = local
+            store_residuals(work.errors, after)
+    local[:] = best
+    return sweeps, arrived
+
+
+@compiled
+def descend(  # type: ignore[no-untyped-def]
+    body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found
+):
+    """Solve the frames `order` (n,) in this order; change `rotations` (F, K, 4) and fill the `SolverResult` `found`.
+
+    `given_rotations` and `given_roots` are the poses of all frames before they were solved; `carried` is as in
+    `least_squares_kernels.solve_frames`. `ends` holds the three stopping criteria: the maximum number of sweeps, and
+    the tolerances in metres and in radians.
+    """
     best = np.empty(rotations.shape[1:])
-    for f in range(rotations.shape[0]):
-        local, root = rotations[f], roots[f]
+    for n in range(order.shape[0]):
+        f, other = order[n], carried[n]
         frame = min(f, targets.values.shape[0] - 1)
         offsets = body.offsets[min(f, body.offsets.shape[0] - 1)]
-        cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
-        store_residuals(work.errors, found.before[f])
-        clamped = False
-        for k in range(local.shape[0]):
-            if body.limited[k] and body.movable[k]:
-                put_rotation(local, k, within_limits(body.limits[k], rotation_at(local, k)))
-                clamped = True
-        if clamped:
-            cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
-        best[:] = local
-        least, stalled, sweeps = cost, 0, 0
-        found.reached[f] = reached
-        store_residuals(work.errors, found.after[f])
-        while not reached and sweeps < most_sweeps and stalled < STALLED_SWEEPS:
-            _sweep(body, targets, frame, local, work)
-            cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
-            sweeps += 1
-            stalled = 0 if cost < (1.0 - STALLED_SHARE) * least else stalled + 1
-            if cost < least:
-                least = cost
-                best[:] = local
-                store_residuals(work.errors, found.after[f])
-                found.reached[f] = reached
-        local[:] = best
+        if other >= 0:
+            carry_change(body, given_rotations, rotations, f, other, best)
+        rotations[f] = given_rotations[f]
+        roots[f] = given_roots[f]
+        sweeps, reached = _descend_frame(
+            body, targets, frame, offsets, ends, other >= 0, rotations[f], roots[f], best, work,
+            found.before[f], found.after[f],
+        )  # fmt: skip
         found.iterations[f] = sweeps
+        found.reached[f] = reached

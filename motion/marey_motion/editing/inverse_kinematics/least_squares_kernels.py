@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 
+from marey_motion.editing.inverse_kinematics.jacobian_kernels import fill_jacobian
 from marey_motion.editing.inverse_kinematics.pose_kernels import (
-    ORIENTATION,
-    POSITION,
+    carry_change,
     measure,
     store_residuals,
     within_limits,
@@ -24,12 +24,8 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     exponential,
     length,
     logarithm,
-    minus,
-    plus,
     put_vector,
-    rotated,
     rotation_at,
-    scaled,
     unit,
     vector_at,
 )
@@ -44,90 +40,6 @@ CONVERGED_SHARE, SETTLED_SHARE = 1e-13, 1e-3
 # Passes in which joints at a limit are found, for each step.
 LIMIT_PASSES = 6
 LIMIT_REACHED_RAD = 1e-9
-
-
-@compiled
-def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-untyped-def]
-    """Compute the change of an angular error if the joint turns by `turn` and the target direction by `drift`.
-
-    `turn` and `drift` are small rotation vectors; `gaze` and `wished` are the unit directions of the look-at axis and
-    of its target.
-    """
-    if kind == ORIENTATION:
-        # The inverse left Jacobian of the rotation group at `error`.
-        angle = length(error)
-        half = 0.5 * angle
-        share = (1.0 - half / math.tan(half)) / (angle * angle) if angle > 1e-4 else 1.0 / 12.0
-        twice = cross(error, cross(error, turn))
-        return plus(minus(turn, scaled(cross(error, turn), 0.5)), scaled(twice, share))
-    return plus(cross(drift, error), _look_change(gaze, wished, minus(turn, drift)))
-
-
-@compiled
-def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
-    """Compute the change of `look_error(gaze, wished)` if the gaze turns by the small rotation vector `turn`."""
-    across = cross(wished, gaze)
-    sine, cosine = length(across), dot(wished, gaze)
-    if sine < 1e-9:
-        return minus(turn, scaled(gaze, dot(gaze, turn)))
-    axis = scaled(across, 1.0 / sine)
-    moved = minus(scaled(turn, cosine), scaled(gaze, dot(wished, turn)))
-    moved = minus(moved, scaled(axis, dot(axis, moved)))
-    return plus(scaled(axis, dot(axis, turn)), scaled(moved, math.atan2(sine, cosine) / sine))
-
-
-@compiled
-def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, column):  # type: ignore[no-untyped-def]
-    """Fill a column of the Jacobian: the derivatives of the error of target `c` with respect to one unknown.
-
-    `tip` and `turn` are position and rotation of the target's point; `error` is the error of the target. A unit change
-    of the unknown moves the point by `move` and turns it by `spin`.
-    """
-    if targets.kinds[c] == POSITION:
-        axes = targets.axes
-        change = (move[0] * axes[c, 0], move[1] * axes[c, 1], move[2] * axes[c, 2])
-    elif targets.kinds[c] == ORIENTATION:
-        change = _turned_error(ORIENTATION, error, error, error, spin, spin)
-    else:
-        way = minus(vector_at(targets.values[frame], c), tip)
-        far = length(way)
-        wished = direction(way)
-        drift = scaled(cross(move, wished), 1.0 / max(far, TINY))  # the eye moves, the point does not
-        gaze = rotated(turn, vector_at(targets.directions, c))
-        change = _turned_error(targets.kinds[c], error, gaze, wished, spin, drift)
-    for i in range(3):
-        jacobian[3 * c + i, column] = targets.scales[c] * change[i]
-
-
-@compiled
-def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-untyped-def]
-    """Fill `jacobian` (3·C, 3·V + 3): the derivatives of the scaled errors of C targets.
-
-    The unknowns are the displacements of the V movable joints and of the root.
-    """
-    jacobian[:] = 0.0
-    columns = 0
-    for k in range(body.parents.shape[0]):
-        if not body.movable[k]:
-            continue
-        place, spin = vector_at(work.places, k), rotation_at(work.spins, k)
-        for axis in range(3):
-            own = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0)
-            turn = rotated(spin, own)
-            for c in range(targets.kinds.shape[0]):
-                if body.carries[k, c]:
-                    tip = vector_at(work.tips, c)
-                    move = cross(turn, minus(tip, place))
-                    error, spun = vector_at(work.errors, c), rotation_at(work.turns, c)
-                    _fill_column(targets, frame, c, error, tip, spun, move, turn, jacobian, columns)
-            columns += 1
-    if body.root_moves:
-        for axis in range(3):
-            move = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0)
-            for c in range(targets.kinds.shape[0]):
-                error, spun = vector_at(work.errors, c), rotation_at(work.turns, c)
-                tip, still = vector_at(work.tips, c), (0.0, 0.0, 0.0)
-                _fill_column(targets, frame, c, error, tip, spun, move, still, jacobian, columns + axis)
 
 
 @compiled
@@ -330,10 +242,13 @@ def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before, after):  # type: ignore[no-untyped-def]
+def _solve_frame(  # type: ignore[no-untyped-def]
+    body, targets, frame, offsets, ends, carried, local, root, work, before, after
+):
     """Solve one frame: change the pose `local` (K, 4) and `root` (3,) in place.
 
-    `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `solve_frames`. Returns the
+    `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `solve_frames`. If `carried`,
+    the solver starts with the pose `work.trial` and `work.trial_root`, and changes it as little as it can. Returns the
     number of steps tried, and whether all targets are reached.
     """
     most_steps, tolerance_m, tolerance_rad = ends
@@ -341,12 +256,16 @@ def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before,
     work.first_root[:] = root
     cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
     store_residuals(work.errors, before)
-    clamped = False
+    changed = carried
+    if carried:
+        local[:] = work.trial
+        root[:] = work.trial_root
+        work.first_root[:] = root
     for k in range(local.shape[0]):
         if body.limited[k] and body.movable[k]:
             put_rotation(local, k, within_limits(body.limits[k], rotation_at(local, k)))
-            clamped = True
-    if clamped:
+            changed = True
+    if changed:
         work.first[:] = local
         cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
     store_residuals(work.errors, after)
@@ -382,18 +301,30 @@ def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before,
 
 
 @compiled
-def solve_frames(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
-    """Solve each frame independently; change `roots` (F, 3) and `rotations` (F, K, 4) in place.
+def solve_frames(  # type: ignore[no-untyped-def]
+    body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found
+):
+    """Solve the frames `order` (n,) in this order; change `roots` (F, 3) and `rotations` (F, K, 4) in place.
 
-    Also fills the `SolverResult` `found`. `ends` holds the three stopping criteria: the maximum number of steps, and
-    the tolerances in metres and in radians.
+    `given_rotations` and `given_roots` are the poses of all frames before they were solved. Where `carried` (n,) is at
+    least 0, the solver starts with the change that the frame of this number got; otherwise each frame is solved
+    independently. Also fills the `SolverResult` `found`. `ends` holds the three stopping criteria: the maximum number
+    of steps, and the tolerances in metres and in radians.
     """
-    for f in range(rotations.shape[0]):
+    for n in range(order.shape[0]):
+        f, other = order[n], carried[n]
         frame = min(f, targets.values.shape[0] - 1)
         offsets = body.offsets[min(f, body.offsets.shape[0] - 1)]
+        if other >= 0:
+            carry_change(body, given_rotations, rotations, f, other, work.trial)
+            for i in range(3):
+                work.trial_root[i] = given_roots[f, i] + roots[other, i] - given_roots[other, i]
+        rotations[f] = given_rotations[f]
+        roots[f] = given_roots[f]
         steps, reached = _solve_frame(
-            body, targets, frame, offsets, ends, rotations[f], roots[f], work, found.before[f], found.after[f]
-        )
+            body, targets, frame, offsets, ends, other >= 0, rotations[f], roots[f], work, found.before[f],
+            found.after[f],
+        )  # fmt: skip
         found.iterations[f] = steps
         found.reached[f] = reached
 

@@ -5,9 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
 from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget, Target
 from marey_motion.rigs import JointAxes, JointMapping
+from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import Skeleton
+
+LIMBS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
+"""Standard joints of limbs with two bones, from top to end, without the side."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +58,8 @@ def limb_ending_at(
     -------
     TwoBoneLimb or None    None if the joint is neither a wrist nor an ankle
     """
-    for side in ("left", "right"):
-        for root, middle, end in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
+    for side in SIDES:
+        for root, middle, end in LIMBS:
             names = [mapping.joints.get(f"{side}_{part}") for part in (root, middle, end)]
             if None in names or skeleton.joint_names[joint] != names[2]:
                 continue
@@ -61,6 +69,44 @@ def limb_ending_at(
             hinge = swing if swing is None or middle == "elbow" else (-swing[0], -swing[1], -swing[2])
             return TwoBoneLimb(top, mid, joint, hinge)
     return None
+
+
+def straight_hinge(
+    skeleton: Skeleton, mapping: JointMapping, joint: int, axes: JointAxes
+) -> tuple[JointAxes, NDArray[np.float64]]:
+    """Find the rotation of a hinge at angle 0, and the axis about which its angle is positive.
+
+    The angle of a knee or an elbow is its bend on every skeleton: 0 in a straight limb, whether or not the limb is
+    straight in the rest pose, and positive in the natural direction. Other joints are at 0 in the rest pose.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    mapping : JointMapping    its standard joints
+    joint : int    index of the hinge
+    axes : JointAxes    axes of the hinge, as of `rigs.guess_axes`
+
+    Returns
+    -------
+    axes : JointAxes    axes whose swing axis bends a limb
+    reference : (4,) float64    local rotation at angle 0
+    """
+    rest = skeleton.rest_rotations[joint].astype(np.float64)
+    for side in SIDES:
+        for start, middle, end in LIMBS:
+            names = [mapping.joints.get(f"{side}_{part}") for part in (start, middle, end)]
+            if None in names or skeleton.joint_names[joint] != names[1]:
+                continue
+            bend = np.array(axes.swing if middle == "knee" else np.negative(axes.swing))
+            first, last = (skeleton.index_of(str(names[end])) for end in (0, 2))
+            places = skeleton.rest_global_positions.astype(np.float64)
+            upper, lower = places[joint] - places[first], places[last] - places[joint]
+            hinge = quaternions.rotate_vectors(skeleton.rest_global_rotations[joint].astype(np.float64), bend)
+            angle = np.arctan2(np.cross(upper, lower) @ hinge, upper @ lower)
+            x, y, z = (float(component) for component in bend)
+            straight = quaternions.multiply(rest, quaternions.from_rotation_vector(-angle * bend))
+            return JointAxes(axes.twist, (x, y, z)), np.asarray(straight, dtype=np.float64)
+    return axes, rest
 
 
 def limb_targets(

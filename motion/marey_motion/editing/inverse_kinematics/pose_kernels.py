@@ -126,6 +126,22 @@ def store_residuals(errors, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def carry_change(body, given, solved, f, other, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (K, 4) with the given pose of frame `f`, changed as the frame `other` was changed.
+
+    `given` and `solved` (F, K, 4) are the local rotations before and after; joints with limits stay within them.
+    """
+    for k in range(out.shape[0]):
+        rotation = rotation_at(given[f], k)
+        if body.movable[k]:
+            change = product(inverse(rotation_at(given[other], k)), rotation_at(solved[other], k))
+            rotation = unit(product(rotation, change))
+            if body.limited[k]:
+                rotation = within_limits(body.limits[k], rotation)
+        put_rotation(out, k, rotation)
+
+
+@compiled
 def nearest_in_range(angle, low, high):  # type: ignore[no-untyped-def]
     """Find the angle (radians, on the circle) in [low, high] that is nearest to `angle`."""
     if low <= angle <= high:

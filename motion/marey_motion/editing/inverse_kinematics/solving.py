@@ -1,15 +1,17 @@
 """Inverse kinematics: joint rotations that bring points, orientations and look-at axes to their targets.
 
-There are three solvers. Each solves frames independently: the result for a frame does not depend on other frames. No
-solver returns a pose with a larger error than the given pose. The error is the weighted sum of the squared errors of
-all targets; an angle counts as `ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, the pose is
-brought within the limits before the comparison.
+There are three solvers. Without `Neighbours`, each solves frames independently: the result for a frame does not depend
+on other frames. With them, joints move smoothly from frame to frame where the targets leave a choice. No solver returns
+a pose with a larger error than the given pose. The error is the weighted sum of the squared errors of all targets; an
+angle counts as `ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, the pose is brought within the
+limits before the comparison.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -17,9 +19,12 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import Floats
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_targets
+from marey_motion.editing.inverse_kinematics.neighbouring import solve_in_order
 from marey_motion.editing.inverse_kinematics.problem import IkProblem, SolverResult, pose_problem
+from marey_motion.editing.inverse_kinematics.swivels import swivel_coherently
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
+    Neighbours,
     OrientationTarget,
     PositionTarget,
     SolverOptions,
@@ -77,6 +82,8 @@ def solve(
     limb: TwoBoneLimb | None = None,
     solver: Solver = "auto",
     options: SolverOptions = _OPTIONS,
+    neighbours: Neighbours | None = None,
+    damping_zone_rad: float = 0.0,
 ) -> SolvedPoses:
     """Solve inverse kinematics with a given solver, or with the solver that suits the targets.
 
@@ -94,6 +101,8 @@ def solve(
         this end turns first. Other joints turn, too, only in frames in which the end alone cannot reach the targets,
         for example because of its limits.
     options : SolverOptions    tolerances and iterations
+    neighbours : Neighbours, optional    order of the frames in time; None solves each frame alone
+    damping_zone_rad : float    damping of stretching limbs, as in `solve_two_bone`
 
     Returns
     -------
@@ -115,11 +124,15 @@ def solve(
                 where="solver",
             )
         position, orientation = asked
-        exact = solve_two_bone(skeleton, motion, limb, position, orientation=orientation, options=options)
+        exact = solve_two_bone(
+            skeleton, motion, limb, position, orientation=orientation, options=options, neighbours=neighbours,
+            damping_zone_rad=damping_zone_rad,
+        )  # fmt: skip
         others = set(freedom.joints or ()) - set(limb.joints)
         if solver == "two_bone" or exact.reached.all() or not (others or freedom.root_moves):
             return exact
-    chosen = solve_ccd if solver == "ccd" else solve_least_squares
+    _refuse_poles(targets)
+    chosen = partial(solve_ccd if solver == "ccd" else solve_least_squares, neighbours=neighbours)
     if limb is not None:
         freedom = replace(freedom, joints=limb.joints if freedom.joints is None else freedom.joints)
         if all(isinstance(one, OrientationTarget) and one.joint == limb.end for one in targets):
@@ -133,6 +146,19 @@ def solve(
     return chosen(skeleton, motion, targets, freedom=freedom, options=options)
 
 
+def _refuse_poles(targets: Sequence[Target]) -> None:
+    """Raise `EditError` if a target has a pole, which only the closed form for limbs can follow."""
+    for number, target in enumerate(targets):
+        if isinstance(target, PositionTarget) and target.pole is not None:
+            raise EditError(
+                "a pole needs the two-bone solver: a wrist or ankle whose position is constrained in all axes, no "
+                "limits, no joint above the limb that turns, and no other constraint in the same frames but an "
+                "orientation of the same joint",
+                code="solver-unfit",
+                where=f"targets[{number}].pole",
+            )
+
+
 def solve_ccd(
     skeleton: Skeleton,
     motion: Motion,
@@ -140,6 +166,7 @@ def solve_ccd(
     *,
     freedom: Freedom = _ANYWHERE,
     options: SolverOptions = _OPTIONS,
+    neighbours: Neighbours | None = None,
 ) -> SolvedPoses:
     """Solve by cyclic coordinate descent: each joint in turn, from the targets to the root, gets its best rotation.
 
@@ -154,6 +181,7 @@ def solve_ccd(
     targets : sequence of targets    C targets
     freedom : Freedom    joints that may turn
     options : SolverOptions    tolerances and iterations
+    neighbours : Neighbours, optional    order of the frames in time; None solves each frame alone
 
     Returns
     -------
@@ -172,9 +200,8 @@ def solve_ccd(
             where="root_moves",
         )
     problem = pose_problem(skeleton, motion, targets, freedom)
-    found = problem.found
-    ends = (int(options.most_iterations), float(options.tolerance_m), float(options.tolerance_rad))
-    ccd_kernels.descend(problem.body, problem.targets, ends, problem.roots, problem.rotations, problem.placing, found)
+    found, room = problem.found, problem.placing
+    solve_in_order(ccd_kernels.descend, problem, options, room, found, neighbours)
     return _solved(motion, problem, found)
 
 
@@ -185,6 +212,7 @@ def solve_least_squares(
     *,
     freedom: Freedom = _ANYWHERE,
     options: SolverOptions = _OPTIONS,
+    neighbours: Neighbours | None = None,
 ) -> SolvedPoses:
     """Solve by damped least squares over all targets, with the analytic Jacobian of rotation-vector displacements.
 
@@ -198,6 +226,7 @@ def solve_least_squares(
     targets : sequence of targets    C targets
     freedom : Freedom    joints that may turn
     options : SolverOptions    tolerances and iterations
+    neighbours : Neighbours, optional    order of the frames in time; None solves each frame alone
 
     Returns
     -------
@@ -211,10 +240,7 @@ def solve_least_squares(
 
     problem = pose_problem(skeleton, motion, targets, freedom)
     found, room = problem.found, problem.stepping(options.regularisation_m)
-    ends = (int(options.most_iterations), float(options.tolerance_m), float(options.tolerance_rad))
-    least_squares_kernels.solve_frames(
-        problem.body, problem.targets, ends, problem.roots, problem.rotations, room, found
-    )
+    solve_in_order(least_squares_kernels.solve_frames, problem, options, room, found, neighbours)
     return _solved(motion, problem, found)
 
 
@@ -228,6 +254,7 @@ def solve_two_bone(
     ending: Ending = "carried",
     damping_zone_rad: float = 0.0,
     options: SolverOptions = _OPTIONS,
+    neighbours: Neighbours | None = None,
 ) -> SolvedPoses:
     """Bring a limb's end to a position in closed form; a limb that is too short is straightened towards the position.
 
@@ -246,6 +273,7 @@ def solve_two_bone(
         damped, so that the joint does not snap (Kovar, Schreiner and Gleicher 2002); targets that need such angles are
         missed slightly
     options : SolverOptions    tolerances
+    neighbours : Neighbours, optional    order of the frames in time; None solves each frame alone
 
     Returns
     -------
@@ -285,6 +313,9 @@ def solve_two_bone(
         problem.rotations,
         problem.placing,
     )
+    if neighbours is not None:
+        pole = None if position.pole is None else np.asarray(position.pole, dtype=np.float64)
+        swivel_coherently(kernel_limb, problem, before, neighbours, pole)
     _measure(problem, options, found.after, found)
     _keep_better(problem, before, found)
     return _solved(motion, problem, found)

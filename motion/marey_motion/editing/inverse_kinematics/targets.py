@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from marey_motion import quaternions
-from marey_motion.arrays import Floats
+from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import EditError
 from marey_motion.rigs import JointAxes
 from marey_motion.skeleton import Skeleton
@@ -34,6 +35,8 @@ class PositionTarget:
     axes : coordinates that must match, such as "xz"; the others are free
     offset : (3,) metres in the joint's frame, from the joint to the point, such as the tip of a tool
     weight : weight of the squared distance
+    pole : (3,) metres, world; point to which the elbow or knee of the limb that ends at the joint is directed (two-bone
+        solver only, and only with `Neighbours`)
     """
 
     joint: int
@@ -41,6 +44,7 @@ class PositionTarget:
     axes: Axes = "xyz"
     offset: ArrayLike = (0.0, 0.0, 0.0)
     weight: float = 1.0
+    pole: ArrayLike | None = None
 
     @property
     def values(self) -> Floats:
@@ -229,6 +233,26 @@ class Freedom:
                 raise EditError(
                     f"stiffness must be at least 0 and below 1, not {stiffness}", where=f"stiffness of joint {joint}"
                 )
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Order in time of the frames of a solver, which lets joints move smoothly from frame to frame.
+
+    Parameters
+    ----------
+    frames : (F,) int    numbers of the frames, increasing; successive numbers are neighbours
+    reach : float    number of frames over which a flip of a limb is spread
+    """
+
+    frames: Ints
+    reach: float
+
+    @property
+    def runs(self) -> tuple[tuple[int, int], ...]:
+        """Ranges [start, stop) of rows whose frames follow on each other."""
+        borders = [0, *(np.flatnonzero(np.diff(self.frames) != 1) + 1).tolist(), len(self.frames)]
+        return tuple(pairwise(borders))
 
 
 def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:

@@ -48,12 +48,15 @@ def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def damped_bend(angle, wished, zone):  # type: ignore[no-untyped-def]
-    """Damp the change of the angle between the bones, from `angle` to `wished`, near a straight limb.
+    """Damp the change of the angle between the bones, from `angle` to `wished`, near a straight or folded limb.
 
     Kovar et al. (2002), section 5.2; all angles are in radians.
 
-    In the last `zone` radians before the limb is straight, the change is weighted by a cubic that falls from 1 to 0.
+    In the last `zone` radians before the limb is straight, the change is weighted by a cubic that falls from 1 to 0; so
+    it is in the last `zone` radians before the limb is folded.
     """
+    if wished < angle and wished < zone:
+        return math.pi - damped_bend(math.pi - angle, math.pi - wished, zone)
     if wished <= angle or zone <= 0.0:
         return wished
     return angle + _weighed(wished, zone) - _weighed(angle, zone)

@@ -11,7 +11,8 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, and_, delete, not_, select, update
 
-from marey_schemas.queue.jobs import FailureReason
+from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
+from marey_schemas.queue.jobs import NOTHING_DONE, FailureReason
 from marey_server.store.jobs import commits
 from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
 from marey_server.store.jobs.events import wake_workers
@@ -40,9 +41,10 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
     """End a parent job whose tasks have all ended; return the jobs that ended.
 
     If a task failed, the parent job fails. If no task failed, but some did not succeed, the parent job is cancelled. If
-    all tasks succeeded, there are three cases:
+    all tasks succeeded, there are four cases:
 
     * If a worker must combine the results of the tasks, the parent job is queued. The returned list is empty.
+    * If the tasks refused all inputs, and the kind declares that this is a failure, the parent job fails.
     * If the outputs are too many to be committed in this transaction, the module `finishing` commits them later. The
       returned list is empty.
     * Otherwise, the parent job succeeds, or fails if its outputs cannot be committed.
@@ -75,6 +77,11 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
         return []
     if not succeeded or head.gathers:
         return end_jobs(tx, running, "cancelled", result=result)
+    if _refused_all(head.kind, result):
+        first = result["refused"][0]
+        detail = f"all inputs were refused; the first, {first['name']}: {first['detail']}"
+        failure = failure_document(FailureReason.ERROR, NOTHING_DONE, detail)
+        return end_jobs(tx, running, "failed", failure=failure, result=result)
     if _is_large(tx, head, result):
         _defer(tx, running, result)
         return []
@@ -82,6 +89,15 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
     if made.failure is not None:
         return end_jobs(tx, running, "failed", failure=made.failure, result=result)
     return end_jobs(tx, running, "succeeded", result=result, **made.columns)
+
+
+def _refused_all(kind_name: str, result: Mapping[str, Any]) -> bool:
+    """Return whether the tasks of a job refused all inputs, and the kind of the job declares that this is a failure."""
+    try:
+        fails = find_kind(kind_name).refusing_all_fails
+    except UnknownKindError:
+        return False
+    return fails and bool(result.get("refused")) and not result.get("outputs")
 
 
 def _is_large(tx: Transaction, head: Any, result: Mapping[str, Any]) -> bool:

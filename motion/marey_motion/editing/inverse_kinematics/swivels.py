@@ -1,0 +1,111 @@
+"""Coherent swivels: the middle joint of a limb, such as an elbow, moves smoothly from frame to frame.
+
+The closed form for two bones turns a limb from its given direction to the direction of the target, on the shortest way.
+If the two directions are nearly opposite, the shortest way leads to one side in one frame and to the other side in the
+next frame, and the middle joint flips although the end of the limb stays where it is. Here the middle joint gets a
+swivel that is near the shortest way where this way is clear, and changes slowly everywhere.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from marey_motion.arrays import Floats
+from marey_motion.editing.inverse_kinematics.problem import IkProblem
+from marey_motion.editing.inverse_kinematics.targets import Neighbours
+
+COHERENT_RAD = 0.05
+"""Change of the swivel from one frame to the next up to which all frames of a run stay as they are."""
+LEAST_CLARITY = 1e-4
+POLE_FRAMES = 2.0
+"""Number of frames over which swivels towards a pole are evened out."""
+
+
+def swivel_coherently(
+    limb: Any, problem: IkProblem, before: Floats, neighbours: Neighbours, pole: Floats | None
+) -> None:
+    """Swivel a solved limb so that its middle joint moves smoothly; changes the rotations of `problem`.
+
+    A run of frames in which this would not slow down the fastest moves of the limb stays as it is.
+
+    Parameters
+    ----------
+    limb : named tuple    the limb, as the two-bone kernels read it
+    problem : IkProblem    F solved frames
+    before : (F, K, 4) float64    local rotations before they were solved
+    neighbours : Neighbours    order of the frames in time
+    pole : (3,) float64, optional    point in the world, in metres, to which the middle joint is directed
+    """
+    from marey_motion.editing.inverse_kinematics import swivel_kernels
+
+    count, work, reach = len(neighbours.frames), problem.placing, neighbours.reach
+    lines, jumps, turns = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
+    posed = limb, problem.body, problem.roots
+    swivel_kernels.measure_swivels(*posed, before, problem.rotations, work, lines, jumps, turns)
+    wished, clear = np.zeros(count), (0.5 + 0.5 * np.cos(turns)) ** 2
+    if pole is not None:
+        swivel_kernels.pole_swivels(*posed, problem.rotations, pole, work, wished, clear)
+        reach = POLE_FRAMES
+    angles = np.zeros(count)
+    for start, stop in neighbours.runs:
+        part = slice(start, stop)
+        jumps[start] = 0.0
+        if pole is not None or np.abs(jumps[part]).max() > COHERENT_RAD:
+            angles[part] = _even_swivels(wished[part], jumps[part], clear[part], reach)
+    if not angles.any():
+        return
+    alone = problem.rotations.copy()
+    swivel_kernels.swivel_frames(*posed, angles, lines, problem.rotations, work)
+    if pole is None:
+        steps = [_restlessness(limb, problem, rotations) for rotations in (alone, problem.rotations)]
+        for start, stop in neighbours.runs:
+            part = slice(start, stop - 1)
+            worst = [sum(float(one[part].max(initial=0.0)) for one in both) for both in steps]
+            if worst[1] >= worst[0]:
+                problem.rotations[start:stop] = alone[start:stop]
+
+
+def _restlessness(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floats, Floats]:
+    """Compute how far, in radians per frame (F - 1,), the upper bone moves in the world, and its joint turns.
+
+    The first does not see a twist of a straight limb, the second does not see a turn of the body.
+    """
+    from marey_motion.editing.inverse_kinematics import swivel_kernels
+
+    bones = np.zeros((len(rotations), 3))
+    swivel_kernels.fill_upper_bones(limb, problem.body, problem.roots, rotations, problem.placing, bones)
+    turns = np.sum(rotations[1:, limb.start] * rotations[:-1, limb.start], axis=-1)
+    moved = np.linalg.norm(np.diff(bones, axis=0), axis=-1)
+    return np.asarray(moved), np.asarray(2.0 * np.arccos(np.minimum(np.abs(turns), 1.0)))
+
+
+def _even_swivels(wished: Floats, jumps: Floats, clear: Floats, reach: float) -> Floats:
+    """Compute swivels (n,) near the wished ones, with which the change of the limb varies slowly.
+
+    Minimises Σ c (a - w)² + reach² Σ (Δa + jump)² over the swivels a; the wished swivels w are angles on a circle, and
+    c is how clear they are. Everything is in radians.
+    """
+    from scipy.linalg import solveh_banded
+
+    carried = np.cumsum(jumps)  # what the swivels add up to if none is corrected
+    data = _unwrapped(wished + carried, clear)
+    weights = np.maximum(clear, LEAST_CLARITY)
+    stiff = reach**2
+    bands = np.zeros((2, len(data)))
+    bands[0] = weights
+    bands[0, 1:] += stiff
+    bands[0, :-1] += stiff
+    bands[1, :-1] = -stiff
+    smooth = solveh_banded(bands, weights * data, lower=True, check_finite=False)
+    return np.asarray(smooth - carried, dtype=np.float64)
+
+
+def _unwrapped(angles: Floats, clear: Floats) -> Floats:
+    """Add full turns to angles (n,), so that each clear angle is within half a turn of the clear angle before it."""
+    told = np.flatnonzero(clear >= min(0.05, float(clear.max())))
+    turns = np.round(np.diff(angles[told]) / (2.0 * np.pi))
+    full = np.zeros(len(angles))
+    full[told[1:]] = turns
+    return angles - 2.0 * np.pi * np.cumsum(full)
