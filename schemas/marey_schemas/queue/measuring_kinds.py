@@ -35,7 +35,7 @@ EVALUATE = KindDeclaration(
     implementation="marey_worker.kinds.evaluate:run",
     gathering="marey_worker.kinds.evaluate:gather",
     task_count=job_params.count_evaluation_tasks,
-    version=4,
+    version=5,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
         "rig": RIG,

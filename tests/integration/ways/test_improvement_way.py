@@ -21,7 +21,7 @@ pytestmark = pytest.mark.timeout(300)
 
 SMALL: dict[str, Any] = {
     "speeds_m_s": (1.0, 1.5), "turn_rates_deg_s": (-50.0, 0.0, 50.0), "families": ("circle",), "duration_s": 6.0,
-    "baseline": False, "report": False,
+    "baseline": False, "report": False, "replicates": 1,
 }  # fmt: skip
 
 

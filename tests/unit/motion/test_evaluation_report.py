@@ -195,7 +195,9 @@ def test_reports_are_made_of_little(name: str, result: EvaluationResult) -> None
 
 @pytest.mark.slow
 def test_a_real_evaluation_is_reported() -> None:
-    options = EvaluationOptions(speeds_m_s=(1.25, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0)
+    options = EvaluationOptions(
+        speeds_m_s=(1.25, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0, replicates=1
+    )
     clips = [
         SourceClip(f"gait{index}", f"gait {index}", generate_gait(speed, turn_rate, 4.0))
         for index, (speed, turn_rate) in enumerate(((1.25, 0.0), (1.25, 0.9), (2.0, 0.0)))

@@ -26,8 +26,8 @@ from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.selection import joined
 from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree, suggestions_to_tree
+from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.evaluation.similarity import accepted_distance
-from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_motion.formats import read_motion
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
@@ -166,7 +166,7 @@ def test_progress_only_rises_and_the_work_can_be_stopped(database: MatchingDatab
         suggest(database, result, options=options, cancelled=lambda: True)
 
 
-REAL = EvaluationOptions(duration_s=15.0, families=("circle",))
+REAL = EvaluationOptions(duration_s=15.0, families=("circle",), replicates=1)
 
 
 @pytest.fixture(scope="module")

@@ -33,8 +33,8 @@ from marey_motion.evaluation.perceived import PerceivedRows, indistinguishable
 from marey_motion.evaluation.provenance import provenance_of
 from marey_motion.evaluation.relevance import sum_by_source
 from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.running import CancelCallback
 from marey_motion.evaluation.similarity import PoseSimilarity, accepted_distance, measure_similarity
-from marey_motion.evaluation.suite import CancelCallback
 from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.documents.metrics import MetricDocument
 from marey_schemas.options.improvement import SuggestionOptions
