@@ -56,7 +56,7 @@ COMPARE = KindDeclaration(
     description="Compares two evaluations trial by trial, with confidence intervals of the changes.",
     params=job_params.CompareParams,
     implementation="marey_worker.kinds.compare:run",
-    version=2,
+    version=3,
     inputs={
         "before": InputSpec(kind=Kind.EVALUATION, description="The evaluation before the change."),
         "after": InputSpec(
@@ -126,7 +126,7 @@ SUGGEST = KindDeclaration(
     "coverage.",
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
-    version=3,
+    version=4,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": METRIC},
     outputs={"document": "file"},
     facets=REMOVAL_FACETS,

@@ -121,7 +121,9 @@ def suggest(
         database, result.options, trials=trials, records=records, threads=threads, cancelled=cancelled
     )
     seen = None if metric is None else PerceivedRows(database, metric)
-    unused = find_unused(database, trials, records, result.options, index=simulation.index)
+    # The records are those of the first replicates only; the usage is that of all.
+    shown = np.concatenate([use.popularity > 0 for use in result.usage])
+    unused = find_unused(database, trials, records, result.options, index=simulation.index, shown=shown)
     duplicates = find_near_duplicates(
         database, threshold_cm=how.duplicate_cm, seen=seen, threads=threads, **stages.watch("duplicates")
     )
