@@ -45,7 +45,7 @@ LESS_IS_BETTER = (
     "foot_depth_p95",
     "treading_per_s",
 )
-"""Metrics for which a lower value is better: one family. All others are another family, whose changes have no direction."""
+"""Metrics for which a lower value is better: one family. All others are another family, without directions."""
 
 
 @dataclass(frozen=True)
