@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.material import real_folder
 from marey_motion.clip import Clip
+from marey_motion.evaluation.replicates import run_replicates
 from marey_motion.evaluation.suite import assemble, run_suite
 from marey_motion.formats import read_motion
 from marey_motion.gait import generate_dataset
@@ -46,7 +47,8 @@ def main(row_count: int, threads: int) -> dict[str, float | str]:
         "clips": len(sources),
         "material": "real takes" if real_folder() else "generated takes",
         "trials": len(ran),
-        "simulated_s": len(ran) * (options.approach_s + options.duration_s),
+        "replicates": options.replicates,
+        "simulated_s": options.replicates * len(ran) * (options.approach_s + options.duration_s),
         "build_s": built - started,
         "evaluate_s": ended - built,
         "peak_mb": _peak_mb(),
@@ -69,7 +71,8 @@ def _evaluate(database: MatchingDatabase, options: EvaluationOptions, threads: i
 
     trials = suite_trials(options)
     records = run_suite(database, options, threads=threads)
-    return assemble(database, options, trials, records).trials
+    replicates = run_replicates(database, options, trials, threads=threads)
+    return assemble(database, options, trials, records, replicates=replicates).trials
 
 
 def _sources(row_count: int) -> Iterator[SourceClip]:

@@ -19,7 +19,7 @@ from marey_schemas.options.evaluation import EvaluationOptions
 
 RATE_HZ = 60.0
 SMALL = EvaluationOptions(
-    speeds_m_s=(1.0, 2.0, 3.0), turn_rates_deg_s=(-100.0, -50.0, 0.0, 50.0, 100.0), duration_s=12.0
+    speeds_m_s=(1.0, 2.0, 3.0), turn_rates_deg_s=(-100.0, -50.0, 0.0, 50.0, 100.0), duration_s=12.0, replicates=1
 )
 
 

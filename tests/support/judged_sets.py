@@ -20,7 +20,7 @@ from marey_motion.rigs import map_joints
 from marey_schemas.options.evaluation import EvaluationOptions
 
 FEW = EvaluationOptions(
-    speeds_m_s=(1.5, 2.0), turn_rates_deg_s=(-75.0, 0.0, 50.0), duration_s=6.0, families=("circle",)
+    speeds_m_s=(1.5, 2.0), turn_rates_deg_s=(-75.0, 0.0, 50.0), duration_s=6.0, families=("circle",), replicates=1
 )
 """Options of six trials: straight lines, gentle turns and sharp turns."""
 

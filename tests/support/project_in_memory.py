@@ -18,7 +18,12 @@ from marey_worker.context import Context, NoSuchThing, Task, encode_outputs
 
 NOW = "2026-01-01T00:00:00Z"
 PARAMS = EvaluateParams(
-    speeds_m_s=(1.0, 1.5), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=4.0, baseline=False, report=False
+    speeds_m_s=(1.0, 1.5),
+    turn_rates_deg_s=(-50.0, 0.0, 50.0),
+    duration_s=4.0,
+    replicates=1,
+    baseline=False,
+    report=False,
 )
 
 

@@ -20,6 +20,7 @@ OPTIONS = EvaluationOptions(
     turn_rates_deg_s=(-50.0, 0.0, 50.0),
     approach_s=2.0,
     duration_s=6.0,
+    replicates=1,
     families=("circle",),
     # A frame that is barred near the current one could be chosen in a copy of its clip.
     controller=ControllerOptions(reselect_window_s=0.0),

@@ -215,7 +215,7 @@ def _print_comparison(document: Mapping[str, Any]) -> None:
     metrics = {one["metric"]: one for one in document["metrics"]}
     rows = [
         (label, f"{one['before']:.4f}", f"{one['after']:.4f}", f"{one['change']:+.4f}",
-         f"{one['low']:+.4f} to {one['high']:+.4f}", one["verdict"])
+         "" if one["low"] is None else f"{one['low']:+.4f} to {one['high']:+.4f}", one["verdict"])
         for name, label in PRINTED_METRICS if (one := metrics.get(name)) is not None
     ]  # fmt: skip
     columns = ("metric", "before", "after", "change", "95 % interval", "verdict")

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from marey_client.errors import CannotBisect, Invalid, JobUnsuccessful
 from marey_client.handles.bisections import Bisection, VersionRange, VersionTest, bisect
-from marey_client.handles.evaluations import EvaluationHandle, trial_rows
+from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.versions import DatasetHandle
 from marey_client.jobs import Jobs, OnProgress
 from marey_client.project_items import ProjectItems
 from marey_client.requests import evaluate_request
 from marey_schemas.datasets.commits import Commit
-from marey_schemas.documents.evaluations import CONFIDENCE, HEADLINE_METRICS, RESAMPLES
+from marey_schemas.documents.evaluations import HEADLINE_METRICS
+from marey_schemas.documents.replicates import mean_interval
 from marey_schemas.queue.job_params import EvaluateParams
 from marey_schemas.queue.jobs import CacheMode, DatasetInput, Job, JobOutput, JobState
 
@@ -58,8 +57,8 @@ class Measurement:
 class ParentChange:
     """Change of the metric from a parent of the first bad version to this version.
 
-    `interval` has the bounds, at 95 % confidence, of the mean change over all trials, computed by bootstrap. It is None
-    if the metric is not a mean over trials, or if fewer than two trials have a value of the metric.
+    `interval` has the bounds, at 95 % confidence, of the mean change over the replicates. It is None if the metric is
+    not a mean over trials, or if the evaluations have too few replicates.
     """
 
     parent: Measurement
@@ -184,18 +183,18 @@ class VersionEvaluations:
         return jobs.submit(self.project.name, request.model_copy(update=chosen))
 
     def interval(self, before: Measurement, after: Measurement) -> tuple[float, float] | None:
-        """Return the bounds, at 95 % confidence, of the mean change of the metric over the trials of two versions.
+        """Return the bounds, at 95 % confidence, of the mean change of the metric over the replicates of two versions.
 
-        Returns None if the metric is not a mean over trials, if a version was not evaluated, or if fewer than two
-        trials have a value of the metric.
+        Returns None if the metric is not a mean over trials, if a version was not evaluated, or if there are too few
+        replicates.
         """
         metric = HEADLINE_METRICS[self.metric].of_trials
         if metric is None or before.output is None or after.output is None:
             return None
-        return change_interval(self._trials(before.output), self._trials(after.output), metric)
+        return change_interval(self._document(before.output), self._document(after.output), metric)
 
-    def _trials(self, output: JobOutput) -> list[dict[str, Any]]:
-        return list(trial_rows(self.project.evaluations.get(output.item).document(revision=output.revision)))
+    def _document(self, output: JobOutput) -> Mapping[str, Any]:
+        return self.project.evaluations.get(output.item).document(revision=output.revision)
 
 
 def find_crossing(
@@ -254,33 +253,24 @@ def _changes(among: VersionRange, evaluations: VersionEvaluations, first_bad: Co
     return tuple(changes)
 
 
-def change_interval(
-    before: Iterable[Mapping[str, Any]], after: Iterable[Mapping[str, Any]], metric: str
-) -> tuple[float, float] | None:
-    """Compute the bounds of the mean change of a metric over the trials for which both evaluations have a value.
+def change_interval(before: Mapping[str, Any], after: Mapping[str, Any], metric: str) -> tuple[float, float] | None:
+    """Compute the bounds of the mean change of a metric of the suite over the replicates of two evaluations.
 
     Parameters
     ----------
-    before, after : one row for each trial, as `trial_rows` yields
+    before, after : documents of the evaluations
     metric : name of the metric
 
     Returns
     -------
-    (2,) float    bounds at 95 % confidence, in the unit of the metric, by bootstrap over trials; None if fewer than two
-        trials have a value of the metric in both evaluations
+    (2,) float    bounds at 95 % confidence, in the unit of the metric; None if the evaluations have too few replicates
     """
-    earlier = {row["trial"]: row.get(metric) for row in before}
-    pairs = [
-        (first, second)
-        for row in after
-        if (second := row.get(metric)) is not None and (first := earlier.get(row["trial"])) is not None
+    sides = [(document.get("replicates") or {}).get("suite", {}).get(metric, ()) for document in (before, after)]
+    changes = [
+        second - first for first, second in zip(*sides, strict=False) if first is not None and second is not None
     ]
-    if len(pairs) < 2:
-        return None
-    changes = np.array([second - first for first, second in pairs])
-    drawn = np.random.default_rng(0).integers(len(changes), size=(RESAMPLES, len(changes)))
-    low, high = np.quantile(changes[drawn].mean(axis=1), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(low), float(high)
+    found = mean_interval(changes) if changes else None
+    return None if found is None or found.low is None or found.high is None else (found.low, found.high)
 
 
 def _detail(job: Job) -> str:

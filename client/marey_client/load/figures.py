@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from marey_client.errors import MareyError
 from marey_client.transport import Transport
-from marey_schemas.queue.replicates import student_quantile
+from marey_schemas.documents.replicates import student_quantile
 
 PERCENTILES = (50, 95, 99)
 MOST_REPLICATES = 10

@@ -1,9 +1,16 @@
-"""Comparison of two evaluations of the same trials: changes with their confidence intervals."""
+"""Comparison of two evaluations of the same trials: changes with their confidence intervals.
+
+Trials are no sample: they differ by what they ask for, and not by chance. What differs by chance are replicates. So
+each replicate gives one change, the mean over the trials, and the interval is that of these changes by Student's t. A
+verdict needs more: among many metrics, one in twenty would seem to change by chance alone. So their probabilities are
+corrected by Holm's method within each family of metrics, and the probability that a family contains any false verdict
+is at most 1 - `CONFIDENCE`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +21,9 @@ from marey_motion.evaluation.perceived import require_same_metric
 from marey_motion.evaluation.provenance import require_comparable
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.matching.record import TrialRecord
-from marey_schemas.documents.evaluations import CONFIDENCE, RESAMPLES
+from marey_schemas.documents.evaluations import CONFIDENCE
+from marey_schemas.documents.replicates import LEAST_REPLICATES, mean_interval
 
-BOOTSTRAP_SEED = 0
 SAME_CHANGE = 1e-12
 """Relative difference up to which two changes count as equal, because rounding can cause a difference of this size."""
 
@@ -38,39 +45,44 @@ LESS_IS_BETTER = (
     "foot_depth_p95",
     "treading_per_s",
 )
-"""Metrics for which a lower value is better; for all other metrics, only the change is reported."""
+"""Metrics for which a lower value is better: one family. All others are another family, without directions."""
 
 
 @dataclass(frozen=True)
 class MetricChange:
-    """Change of one metric, as a mean over trials.
+    """Change of one metric, as a mean over trials and replicates.
 
     Parameters
     ----------
     before, after : means over the trials in which the metric is defined in both evaluations, in the unit of the metric
     change : mean of after - before over these trials
-    low, high : bounds of the mean change at `CONFIDENCE`, by bootstrap over trials (bias corrected and accelerated)
-    trials : number of these trials; with a single trial, `low` and `high` equal `change`
+    low, high : bounds of the mean change at `CONFIDENCE`, over the replicates; None if there are too few replicates
+    trials : number of these trials
+    replicates : number of replicates with a change
+    p : probability of a mean change of this size or more by chance, corrected for the other metrics of its family; None
+        if there are too few replicates, or if nothing changed
     """
 
     metric: str
     before: float
     after: float
     change: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
     trials: int
+    replicates: int = 1
+    p: float | None = None
 
     @property
     def verdict(self) -> str:
         """Verdict: same, better, worse, changed or unclear.
 
-        "changed" is used if neither lower nor higher values of the metric are better; "unclear" means that the
-        interval contains 0, or that there is only one trial.
+        "changed" is used if neither lower nor higher values of the metric are better; "unclear" means that chance can
+        explain the change, or that there are too few replicates to know.
         """
         if self.low == self.high == 0.0:
             return "same"
-        if self.low <= 0.0 <= self.high or self.trials < 2:
+        if self.p is None or self.p > 1.0 - CONFIDENCE:
             return "unclear"
         if self.metric not in LESS_IS_BETTER:
             return "changed"
@@ -138,7 +150,7 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     return Comparison(
         before=before,
         after=after,
-        metrics=_metric_changes(before, after),
+        metrics=metric_changes(before, after),
         changed=_trial_changes(before, after),
         removed=tuple(sorted(uids[0] - uids[1])),
         added=tuple(sorted(uids[1] - uids[0])),
@@ -147,60 +159,108 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     )
 
 
-def paired_change(metric: str, before: Sequence[float] | Floats, after: Sequence[float] | Floats) -> MetricChange:
-    """Compute the change of one metric over trials paired by index, with its bootstrap interval.
+def metric_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[MetricChange, ...]:
+    """Compute the changes of all metrics that both evaluations define in one trial at least.
+
+    Parameters
+    ----------
+    before, after : EvaluationResult    with the same trials
+
+    Returns
+    -------
+    tuple of MetricChange    in alphabetical order, with probabilities that are corrected within their family
+    """
+    pairs = {metric: (_values(before, metric), _values(after, metric)) for metric in _names(before) & _names(after)}
+    known = {
+        metric: pair for metric, pair in sorted(pairs.items()) if np.any(np.isfinite(pair[0]) & np.isfinite(pair[1]))
+    }
+    return corrected([paired_change(metric, *pair) for metric, pair in known.items()])
+
+
+def paired_change(metric: str, before: Floats, after: Floats) -> MetricChange:
+    """Compute the change of one metric over replicates paired by index, with its interval.
 
     Parameters
     ----------
     metric : str    name of the metric
-    before, after : sequence of float    value of each trial, in the metric's unit
+    before, after : (T, R) float64    value of each trial in each replicate, in the metric's unit; NaN where the metric
+        is not defined. At least one value is defined in both
 
     Returns
     -------
-    MetricChange    mean change and its bounds
+    MetricChange    mean change, its bounds, and its probability without a correction for other metrics
     """
-    first, second = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
-    change = second - first
-    low, high = _interval(change)
-    return MetricChange(metric, float(first.mean()), float(second.mean()), float(change.mean()), low, high, len(change))
-
-
-def _interval(change: NDArray[np.float64]) -> tuple[float, float]:
-    from scipy.stats import bootstrap
-
+    both = np.isfinite(before) & np.isfinite(after)
+    defined = both.any(axis=0)
+    first, second = (np.mean(side[:, defined], axis=0, where=both[:, defined]) for side in (before, after))
+    change = np.mean((after - before)[:, defined], axis=0, where=both[:, defined])
+    count, low, high, p = len(change), None, None, None
     least, most = float(change.min()), float(change.max())
-    if most - least <= SAME_CHANGE * max(abs(least), abs(most)):  # nothing to resample; acceleration would be 0 / 0
-        return least, most
-    found = bootstrap(
-        (change,),
-        np.mean,
-        confidence_level=CONFIDENCE,
-        n_resamples=RESAMPLES,
-        method="BCa",
-        rng=np.random.Generator(np.random.PCG64(BOOTSTRAP_SEED)),
-    ).confidence_interval
-    return float(found.low), float(found.high)
+    if least == most == 0.0:
+        low = high = 0.0
+    elif count >= LEAST_REPLICATES:
+        if most - least <= SAME_CHANGE * max(abs(least), abs(most)):
+            low, high, p = least, most, 0.0
+        else:
+            _, _, low, high = mean_interval(change.tolist())
+            p = probability(change)
+    trials = int(np.count_nonzero(both.any(axis=1)))
+    return MetricChange(
+        metric, float(first.mean()), float(second.mean()), float(change.mean()), low, high, trials, count, p
+    )
 
 
-def _metric_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[MetricChange, ...]:
-    changes = []
-    for metric in sorted(_names(before) & _names(after)):
-        pairs = [
-            (first, second)
-            for first, second in zip(_values(before, metric), _values(after, metric), strict=True)
-            if first is not None and second is not None
-        ]
-        if pairs:
-            changes.append(paired_change(metric, *zip(*pairs, strict=True)))
-    return tuple(changes)
+def probability(changes: Floats) -> float:
+    """Compute the probability of a mean at least so far from 0 if the changes of replicates differed by chance only.
+
+    Parameters
+    ----------
+    changes : (R,) float64    one change per replicate, at least two that differ
+
+    Returns
+    -------
+    float    0 to 1, by Student's t, for both sides
+    """
+    from scipy.special import stdtr
+
+    spread = float(np.std(changes, ddof=1)) / np.sqrt(len(changes))
+    return float(2.0 * stdtr(len(changes) - 1, -abs(float(np.mean(changes))) / spread))
+
+
+def corrected(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
+    """Correct the probabilities of changes for the number of metrics in their family, by Holm's method.
+
+    Parameters
+    ----------
+    changes : sequence of MetricChange    with uncorrected probabilities
+
+    Returns
+    -------
+    tuple of MetricChange    in the same order
+    """
+    raised: dict[str, float] = {}
+    for judged in (True, False):
+        own = sorted(
+            (one.p, one.metric) for one in changes if one.p is not None and (one.metric in LESS_IS_BETTER) == judged
+        )
+        most = 0.0
+        for place, (p, metric) in enumerate(own):
+            most = max(most, min(1.0, (len(own) - place) * p))
+            raised[metric] = most
+    return tuple(replace(one, p=raised.get(one.metric)) for one in changes)
 
 
 def _names(result: EvaluationResult) -> set[str]:
+    if result.replicates is not None:
+        return set(result.replicates.names)
     return {name for trial in result.trials for name in trial.metrics}
 
 
-def _values(result: EvaluationResult, metric: str) -> list[float | None]:
-    return [trial.metrics.get(metric) for trial in result.trials]
+def _values(result: EvaluationResult, metric: str) -> Floats:
+    """Return one metric of each trial in each replicate, (T, R); NaN where it is not defined."""
+    if result.replicates is not None:
+        return result.replicates.of_trials(metric)
+    return np.array([[np.nan if (value := each.metrics.get(metric)) is None else value] for each in result.trials])
 
 
 def _trial_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[TrialChange, ...]:

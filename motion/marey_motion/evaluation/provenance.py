@@ -42,10 +42,15 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
         clips={clip.uid: clip.content or own for clip, own in zip(database.clips, rows, strict=True)},
         normaliser=database.normaliser.digest,
         options=_digest({"database": database.options, "controller": options.controller, "window": options.window}),
-        scenarios=_digest(list(trials)),
+        scenarios=_digest([*trials, *_drawn(options)]),
         code_version=code_version(),
         limits=_digest(options.limits),
     )
+
+
+def _drawn(options: EvaluationOptions) -> list[dict[str, int]]:
+    """Return what determines the replicates; empty if there is only one, which is the trial itself."""
+    return [{"replicates": options.replicates, "seed": options.seed}] if options.replicates > 1 else []
 
 
 def require_comparable(before: Provenance, after: Provenance) -> None:

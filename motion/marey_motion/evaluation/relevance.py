@@ -86,6 +86,94 @@ def find_jumps(clips: Sequence[DatabaseClip], record: TrialRecord) -> Jumps:
     return Jumps(at + 1, left[at], entered[at], ~chosen[at])
 
 
+@dataclass(frozen=True, eq=False)
+class UsageTally:
+    """Count of the use of C clips with N rows, to which records are added one after the other.
+
+    Parameters
+    ----------
+    popularity : (N,) int64    number of ticks that displayed each row
+    entries : (C,) int64    number of jumps to each clip
+    shown : (C,) bool for each trial, by its name: whether one of its records displayed each clip
+    """
+
+    popularity: NDArray[np.int64]
+    entries: NDArray[np.int64]
+    shown: dict[str, NDArray[np.bool_]]
+
+    @classmethod
+    def of(cls, clips: Sequence[DatabaseClip]) -> UsageTally:
+        """Make a count without any record.
+
+        Parameters
+        ----------
+        clips : sequence of DatabaseClip    the clips
+
+        Returns
+        -------
+        UsageTally    zeros
+        """
+        return cls(np.zeros(clip_starts(clips)[-1], dtype=np.int64), np.zeros(len(clips), dtype=np.int64), {})
+
+    @classmethod
+    def total(cls, tallies: Sequence[UsageTally]) -> UsageTally:
+        """Add counts of the same clips; a trial that several of them have is shown where one of them shows it.
+
+        Parameters
+        ----------
+        tallies : sequence of UsageTally    at least one
+
+        Returns
+        -------
+        UsageTally    the sum
+        """
+        first, *others = tallies
+        total = cls(first.popularity.copy(), first.entries.copy(), dict(first.shown))
+        for other in others:
+            total.popularity[:] += other.popularity
+            total.entries[:] += other.entries
+            for trial, shown in other.shown.items():
+                total.shown[trial] = shown | total.shown.get(trial, False)
+        return total
+
+    def add(self, clips: Sequence[DatabaseClip], trial: str, record: TrialRecord) -> None:
+        """Count one more record of a trial.
+
+        Parameters
+        ----------
+        clips : sequence of DatabaseClip    the clips
+        trial : str    name of the trial
+        record : TrialRecord    T ticks
+        """
+        self.popularity[:] += np.bincount(record.rows, minlength=len(self.popularity))
+        shown = np.bincount(clips_of_rows(clips, record.rows), minlength=len(clips)) > 0
+        self.shown[trial] = shown | self.shown.get(trial, False)
+        entered = clips_of_rows(clips, find_jumps(clips, record).entered)
+        self.entries[:] += np.bincount(entered, minlength=len(clips))
+
+    def usage(self, clips: Sequence[DatabaseClip]) -> tuple[ClipUsage, ...]:
+        """Return the use of each clip.
+
+        Parameters
+        ----------
+        clips : sequence of DatabaseClip    the clips
+
+        Returns
+        -------
+        tuple of ClipUsage    one per clip, in the order of the clips
+        """
+        total = max(int(self.popularity.sum()), 1)
+        trials = np.zeros(len(clips), dtype=np.int64)
+        for shown in self.shown.values():
+            trials += shown
+        usage = []
+        for index, clip in enumerate(clips):
+            frames = self.popularity[clip.start : clip.stop]
+            ticks = int(frames.sum())
+            usage.append(ClipUsage(index, ticks, ticks / total, int(self.entries[index]), int(trials[index]), frames))
+        return tuple(usage)
+
+
 def measure_usage(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> tuple[ClipUsage, ...]:
     """Count the ticks that display each clip, and the jumps to it, over all records.
 
@@ -98,22 +186,10 @@ def measure_usage(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord])
     -------
     tuple of ClipUsage    one per clip, in the order of the clips
     """
-    starts = clip_starts(clips)
-    popularity = np.zeros(starts[-1], dtype=np.int64)
-    entries = np.zeros(len(clips), dtype=np.int64)
-    trials = np.zeros(len(clips), dtype=np.int64)
-    for record in records:
-        popularity += np.bincount(record.rows, minlength=len(popularity))
-        trials += np.bincount(clips_of_rows(clips, record.rows), minlength=len(clips)) > 0
-        entered = clips_of_rows(clips, find_jumps(clips, record).entered)
-        entries += np.bincount(entered, minlength=len(clips))
-    total = max(int(popularity.sum()), 1)
-    usage = []
-    for index, clip in enumerate(clips):
-        frames = popularity[clip.start : clip.stop]
-        ticks = int(frames.sum())
-        usage.append(ClipUsage(index, ticks, ticks / total, int(entries[index]), int(trials[index]), frames))
-    return tuple(usage)
+    tally = UsageTally.of(clips)
+    for number, record in enumerate(records):
+        tally.add(clips, str(number), record)
+    return tally.usage(clips)
 
 
 def count_switches(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> NDArray[np.int64]:

@@ -12,6 +12,7 @@ from marey_motion.evaluation.perceived import PerceivedTransitions
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import TrialRecord
+from marey_schemas.documents.replicates import MeanInterval, mean_interval
 from marey_schemas.options.evaluation import EvaluationOptions
 
 Metrics = Mapping[str, float | None]
@@ -30,6 +31,70 @@ class TrialResult:
 
 
 @dataclass(frozen=True, eq=False)
+class ReplicateValues:
+    """Metrics of T trials in each of R replicates, and of the whole suite; NaN where a metric is not defined.
+
+    Parameters
+    ----------
+    names : names of the M metrics of trials
+    values : (T, R, M) float64    in the unit of each metric
+    followed : (T, R) bool    whether the character kept all limits
+    suite : (R,) float64 for each metric of the suite, by name
+    """
+
+    names: tuple[str, ...]
+    values: NDArray[np.float64]
+    followed: NDArray[np.bool_]
+    suite: Mapping[str, NDArray[np.float64]]
+
+    @property
+    def count(self) -> int:
+        """The number R of replicates."""
+        return int(self.values.shape[1])
+
+    def of_trials(self, metric: str) -> NDArray[np.float64]:
+        """Return one metric of each trial in each replicate.
+
+        Parameters
+        ----------
+        metric : str    one of `names`
+
+        Returns
+        -------
+        (T, R) float64    in the unit of the metric
+        """
+        return self.values[:, :, self.names.index(metric)]
+
+    def interval(self, metric: str) -> MeanInterval | None:
+        """Return the mean of a metric of the suite over the replicates with its 95 % interval.
+
+        Parameters
+        ----------
+        metric : str    name of the metric
+
+        Returns
+        -------
+        MeanInterval or None    None if the metric is not defined
+        """
+        return interval_of(self.suite.get(metric, np.empty(0)))
+
+
+def interval_of(values: NDArray[np.float64]) -> MeanInterval | None:
+    """Return the mean of the values of replicates with its 95 % interval; values that are not defined are left out.
+
+    Parameters
+    ----------
+    values : (R,) float64    a metric in each replicate, NaN where it is not defined
+
+    Returns
+    -------
+    MeanInterval or None    None if no value is defined
+    """
+    known = values[np.isfinite(values)].tolist()
+    return mean_interval(known) if known else None
+
+
+@dataclass(frozen=True, eq=False)
 class ClipUsage:
     """Use of one clip in the suite; `clip` is an index of `EvaluationResult.clips`.
 
@@ -38,7 +103,7 @@ class ClipUsage:
     ticks : number of ticks in which the clip was displayed
     share : share of all ticks of the suite, 0 to 1
     entries : number of jumps to the clip, chosen or forced by the end of a clip
-    trials : number of trials in which the clip was displayed
+    trials : number of trials in which the clip was displayed, in any of their replicates
     popularity : (frames,) int64    number of ticks in which each frame was displayed
     """
 
@@ -104,11 +169,15 @@ class EvaluationResult:
 
     Parameters
     ----------
-    suite : pooled metrics over all trials, and by family under "circle.…" and "switching.…"
+    trials : metrics of each trial; if there are replicates, the means over the replicates
+    suite : pooled metrics over all trials, and by family under "circle.…" and "switching.…"; if there are replicates,
+        the means of the values of the replicates
     usage : use of each clip, in the order of `clips`
     switches : (S, 3) int64    for each pair of rows between which the suite jumped: the row before the jump, the
         row after it, and the number of these jumps; ordered by the first two
-    records : record of each trial, in the order of `trials`
+    records : record of each trial, in the order of `trials`; if there are replicates, of the first one. `switches`
+        belong to these records, and `usage` to all replicates
+    replicates : metrics of each replicate; None if there is only one
     perceived : transitions under a perceptual metric; None if none was chosen
     baseline : result of the same suite over clips generated for every cell of the grid, without records; None if not
         computed
@@ -126,3 +195,4 @@ class EvaluationResult:
     baseline: EvaluationResult | None = None
     notes: tuple[str, ...] = ()
     perceived: PerceivedTransitions | None = None
+    replicates: ReplicateValues | None = None

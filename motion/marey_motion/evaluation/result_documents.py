@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.judgement import judge
 from marey_motion.evaluation.perceived import PerceivedTransitions
-from marey_motion.evaluation.result import ClipUsage, Coverage, EvaluationResult, Provenance, TrialResult
+from marey_motion.evaluation.result import (
+    ClipUsage,
+    Coverage,
+    EvaluationResult,
+    Provenance,
+    ReplicateValues,
+    TrialResult,
+)
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import TrialRecord
@@ -37,7 +44,40 @@ def result_to_tree(result: EvaluationResult) -> Tree:
     dict    plain values and arrays
     """
     perceived = {} if result.perceived is None else {"perceived": asdict(result.perceived)}
-    return {"schema": EVALUATION_SCHEMA, **_result_body(result), **perceived}
+    return {"schema": EVALUATION_SCHEMA, **_result_body(result), **_replicates_to_tree(result.replicates), **perceived}
+
+
+def _replicates_to_tree(replicates: ReplicateValues | None) -> Tree:
+    """Convert the metrics of all replicates, with the mean and the ends of the interval of each metric of the suite."""
+    if replicates is None:
+        return {}
+    intervals = {name: replicates.interval(name) for name in replicates.suite}
+    told = {name: one._asdict() for name, one in intervals.items() if one is not None}
+    return {
+        "replicates": {
+            "names": list(replicates.names),
+            "values": np.nan_to_num(replicates.values),
+            "defined": np.isfinite(replicates.values),
+            "followed": replicates.followed,
+            "suite": {name: [_defined(value) for value in own.tolist()] for name, own in replicates.suite.items()},
+            "intervals": told,
+        }
+    }
+
+
+def _defined(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _replicates(tree: Mapping[str, Any] | None) -> ReplicateValues | None:
+    if tree is None:
+        return None
+    return ReplicateValues(
+        names=tuple(tree["names"]),
+        values=np.where(tree["defined"], tree["values"], np.nan),
+        followed=tree["followed"],
+        suite={name: np.array(own, dtype=np.float64) for name, own in tree["suite"].items()},  # None becomes NaN
+    )
 
 
 def _result_body(result: EvaluationResult) -> Tree:
@@ -119,6 +159,7 @@ def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> Evaluati
         baseline=None if tree["baseline"] is None else _result(tree["baseline"], ()),
         notes=tuple(tree["notes"]),
         perceived=PerceivedTransitions.from_tree(tree.get("perceived")),
+        replicates=_replicates(tree.get("replicates")),
     )
 
 
@@ -137,7 +178,7 @@ def options_from_tree(tree: Mapping[str, Any]) -> EvaluationOptions:
     ------
     ValidationError    if a value is out of range
     """
-    flat = {**tree, **tree["grid"]}
+    flat = {"replicates": 1, **tree, **tree["grid"]}  # results of old versions have no replicates
     known = EvaluationOptions.model_fields.keys() & flat.keys()  # results of old versions have no limits
     return EvaluationOptions.model_validate({name: flat[name] for name in known})
 

@@ -17,7 +17,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.selection import clips_by_source
 from marey_motion.evaluation.perceived import PerceivedRows
 from marey_motion.evaluation.result import Coverage
-from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
+from marey_motion.evaluation.running import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import Status, TrialRecord
 from marey_schemas.documents.metrics import MetricIdentity

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from itertools import count
 from math import radians
@@ -15,38 +14,25 @@ from math import radians
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.looks import LooksMeter
-from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics
+from marey_motion.evaluation.metrics import measure_trial
+from marey_motion.evaluation.pooling import pool_suite
 from marey_motion.evaluation.provenance import provenance_of
-from marey_motion.evaluation.relevance import count_switches, measure_usage, treading_share, unused_clips
-from marey_motion.evaluation.result import EvaluationResult, TrialResult
-from marey_motion.evaluation.scenario import (
-    LOOK_AHEAD_S,
-    Reference,
-    Trial,
-    reference,
-    require_names,
-    suite_trials,
-)
+from marey_motion.evaluation.relevance import UsageTally, count_switches, treading_share, unused_clips
+from marey_motion.evaluation.replicates import MeasuredReplicates, run_of, run_replicates, simulate
+from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.running import CancelCallback, ProgressCallback, run_each
+from marey_motion.evaluation.scenario import Trial, reference, require_names, suite_trials
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
-from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.rigs import map_joints
 from marey_schemas.options.evaluation import EvaluationOptions
 
-ProgressCallback = Callable[[int, int, str], None]
-CancelCallback = Callable[[], bool]
 _baselines: dict[EvaluationOptions, EvaluationResult] = {}
 BASELINE_CLIP_S = 8.0
-
-
-class EvaluationCancelled(MotionError):
-    """The evaluation was cancelled; finished trials were reported to the caller."""
-
-    default_code = "evaluation-cancelled"
 
 
 def run_suite(
@@ -103,7 +89,7 @@ def run_suite(
 
     if ahead:
         run = _runner(database, index, options)
-        _run_ahead(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
+        run_each(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     return [records[trial.name] for trial in wanted]
 
 
@@ -111,48 +97,7 @@ def _runner(
     database: MatchingDatabase, index: SearchIndex | None, options: EvaluationOptions
 ) -> Callable[[Trial], TrialRecord]:
     searched = index or build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
-    return lambda trial: run_trial(database, searched, guide_for(trial, database), options.controller)
-
-
-def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
-    """Compute a trial's trajectory, extended beyond the end of the trial by the look-ahead of the database.
-
-    Parameters
-    ----------
-    trial : Trial    the trial
-    database : MatchingDatabase    rate and horizons
-
-    Returns
-    -------
-    Reference    the trajectory
-    """
-    horizon_s = max(LOOK_AHEAD_S, *database.options.horizons_s)
-    return reference(trial, database.options.rate_hz, horizon_s)
-
-
-def _run_ahead(
-    run: Callable[[Trial], TrialRecord],
-    trials: Sequence[Trial],
-    keep: Callable[[Trial, TrialRecord], None],
-    threads: int,
-    cancelled: CancelCallback,
-) -> None:
-    """Run trials, `threads` at a time, and pass each record to `keep` when the trial ends."""
-    waiting = list(reversed(trials))
-    running: dict[Future[TrialRecord], Trial] = {}
-    with ThreadPoolExecutor(max_workers=threads, thread_name_prefix="trial") as pool:
-        while waiting or running:
-            stopping = bool(waiting) and cancelled()
-            while waiting and not stopping and len(running) < threads:
-                trial = waiting.pop()
-                running[pool.submit(run, trial)] = trial
-            if stopping and not running:
-                raise EvaluationCancelled(
-                    f"the evaluation was stopped; {len(waiting)} of {len(trials)} trials were not run"
-                )
-            ended, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in sorted(ended, key=lambda one: running[one].name):
-                keep(running.pop(future), future.result())
+    return lambda trial: simulate(database, searched, options, run_of(trial, 0, options))
 
 
 def assemble(
@@ -161,6 +106,7 @@ def assemble(
     trials: Sequence[Trial],
     records: Sequence[TrialRecord],
     *,
+    replicates: MeasuredReplicates | None = None,
     baseline: EvaluationResult | None = None,
 ) -> EvaluationResult:
     """Measure finished trials and assemble the result.
@@ -171,6 +117,7 @@ def assemble(
     options : EvaluationOptions    options of the evaluation
     trials : sequence of Trial    the trials
     records : sequence of TrialRecord    their records
+    replicates : MeasuredReplicates, optional    the further replicates, if the options ask for more than one
     baseline : EvaluationResult, optional    the same suite over generated clips
 
     Returns
@@ -179,7 +126,7 @@ def assemble(
 
     Raises
     ------
-    MotionError    if the records belong to other trials
+    MotionError    if the records belong to other trials, or if replicates are missing
     """
     if len(trials) != len(records):
         raise MotionError(f"each trial needs one record, but there are {len(records)} records for {len(trials)} trials")
@@ -188,36 +135,27 @@ def assemble(
         measure_trial(trial, reference(trial, rate), record, options, looks)
         for trial, record in zip(trials, records, strict=True)
     )
-    usage = measure_usage(database.clips, records)
+    pooled = pool_suite(results, treading_share(database.clips, records), options, replicates)
+    tally = UsageTally.of(database.clips)
+    for trial, record in zip(trials, records, strict=True):
+        tally.add(database.clips, trial.name, record)
+    if replicates is not None:
+        tally = UsageTally.total([tally, replicates.usage])
+    usage = tally.usage(database.clips)
     return EvaluationResult(
         options=options,
         provenance=provenance_of(database, options, trials),
         clips=database.clips,
-        trials=results,
-        suite={
-            **_suite_metrics(results, options),
-            "unused_clips": float(len(unused_clips(usage))),
-            "treading_share": treading_share(database.clips, records),
-        },
+        trials=pooled.trials,
+        suite={**pooled.suite, "unused_clips": float(len(unused_clips(usage)))},
         usage=usage,
         switches=count_switches(database.clips, records),
         coverage=measure_coverage(database, options),
         records=tuple(records),
         baseline=baseline,
         notes=tuple(str(note) for note in database.notes),
+        replicates=pooled.replicates,
     )
-
-
-def _suite_metrics(results: Sequence[TrialResult], options: EvaluationOptions) -> dict[str, float | None]:
-    metrics = _pooled_with_asymmetry(results)
-    for family in options.families:
-        own = [result for result in results if result.trial.family == family]
-        metrics |= {f"{family}.{name}": value for name, value in _pooled_with_asymmetry(own).items()}
-    return metrics
-
-
-def _pooled_with_asymmetry(results: Sequence[TrialResult]) -> dict[str, float | None]:
-    return {**pooled_metrics(results), "offset_asymmetry": offset_asymmetry(results)}
 
 
 def evaluate(
@@ -250,8 +188,9 @@ def evaluate(
     """
     trials = suite_trials(options)
     records = run_suite(database, options, trials=trials, threads=threads, progress=progress, cancelled=cancelled)
+    replicates = run_replicates(database, options, trials, threads=threads, cancelled=cancelled)
     baseline = evaluate_baseline(options, threads=threads, cancelled=cancelled) if with_baseline else None
-    return assemble(database, options, trials, records, baseline=baseline)
+    return assemble(database, options, trials, records, replicates=replicates, baseline=baseline)
 
 
 def evaluate_baseline(
@@ -262,6 +201,8 @@ def evaluate_baseline(
     cancelled: CancelCallback | None = None,
 ) -> EvaluationResult:
     """Evaluate clips generated for every cell of the grid, without records; the last result is cached.
+
+    The baseline has no replicates: it is a scale for the eye, and no statistic is computed from it.
 
     Parameters
     ----------
@@ -278,6 +219,7 @@ def evaluate_baseline(
     ------
     EvaluationCancelled    if cancelled
     """
+    options = options.replace(replicates=1)
     if options not in _baselines:
         trials = suite_trials(options)
         database, notes = baseline_database(options)

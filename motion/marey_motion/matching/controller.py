@@ -127,7 +127,12 @@ class _Arrays(NamedTuple):
 
 
 def run_trial(
-    database: MatchingDatabase, index: SearchIndex, guide: Trajectory, options: ControllerOptions
+    database: MatchingDatabase,
+    index: SearchIndex,
+    guide: Trajectory,
+    options: ControllerOptions,
+    *,
+    start_ticks: int = 0,
 ) -> TrialRecord:
     """Simulate a character that follows a trajectory by motion matching, from the first tick on.
 
@@ -139,6 +144,8 @@ def run_trial(
     index : SearchIndex    index of the database's normalised features
     guide : trajectory    T ticks at the database's rate; ground positions in metres, headings in radians
     options : ControllerOptions    options of the controller
+    start_ticks : int    ticks by which the trial starts after the row that the first search finds, in the same clip;
+        if the clip ends earlier, the trial starts just before its end
 
     Returns
     -------
@@ -179,7 +186,7 @@ def run_trial(
         match_cost=np.empty(ticks),
         continuing_cost=np.empty(ticks),
     )
-    kernels.run(index, rows, trajectory, constants, played)
+    kernels.run(index, rows, trajectory, constants, start_ticks, played)
     costs = pose_costs(database, played.rows, options)
     return TrialRecord(rate_hz=guide.rate_hz, pose_cost=costs, **played._asdict())
 

@@ -223,6 +223,16 @@ def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-un
 
 
 @compiled
+def _later_row(playback, row, ticks):  # type: ignore[no-untyped-def]
+    """Find the row `ticks` after `row`, or the last row of its clip that another one follows."""
+    for _ in range(ticks):
+        if playback.successors[playback.successors[row]] < 0:
+            break
+        row = playback.successors[row]
+    return row
+
+
+@compiled
 def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
     """Return whether the desired velocity or direction jumped between the times `before` and `when`, in ticks."""
     last = wish.speeds.shape[0] - 1
@@ -269,12 +279,16 @@ def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def run(index, playback, wish, rules, record):  # type: ignore[no-untyped-def]
-    """Simulate one trial, and fill the arrays of `record` with its ticks."""
+def run(index, playback, wish, rules, skipped, record):  # type: ignore[no-untyped-def]
+    """Simulate one trial, and fill the arrays of `record` with its ticks.
+
+    The trial starts `skipped` ticks after the row that the first search finds, or just before the end of its clip.
+    """
     query = np.empty(index.rows.shape[1])
     offsets = np.zeros((2, 3))
     root = np.array([wish.positions[0, 0], wish.positions[0, 1], wish.headings[0]])
     row, first_cost = _first_row(index, playback, rules, wish, root, query)
+    row = _later_row(playback, row, skipped)
     status = FORCED
     before = when = 0.0
     forced_at = -rules.period

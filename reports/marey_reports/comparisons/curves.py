@@ -21,8 +21,8 @@ from marey_reports.drawing.paper import (
     plain,
     tick_whole_numbers,
 )
+from marey_schemas.documents.replicates import mean_interval
 from marey_schemas.queue.comparisons import Curve
-from marey_schemas.queue.replicates import mean_interval
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

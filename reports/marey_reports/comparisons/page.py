@@ -17,8 +17,8 @@ from marey_reports.drawing.markup import Content, element
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.paper import QUIET, SMALL, plain
 from marey_reports.drawing.tables import Cell, Number, facts, table
+from marey_schemas.documents.replicates import LEAST_REPLICATES
 from marey_schemas.queue.comparisons import MOST_DRAWN, ComparedColumn, ComparedRun, RunComparison, number_of
-from marey_schemas.queue.replicates import LEAST_REPLICATES
 from marey_schemas.wording import counted
 
 FileType = Literal["html", "svg", "png"]

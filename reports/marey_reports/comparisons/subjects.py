@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from marey_reports.drawing.paper import shortened
 from marey_schemas.documents.evaluations import CONFIDENCE
+from marey_schemas.documents.replicates import LEAST_REPLICATES
 from marey_schemas.queue.comparisons import ComparedColumn, ComparedRun, FieldSummary, RunComparison, number_of
-from marey_schemas.queue.replicates import LEAST_REPLICATES
 
 LONGEST_LABEL, LONGEST_VALUE = 46, 24
 COMMIT_SIGNS = 8

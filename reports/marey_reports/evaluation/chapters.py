@@ -8,7 +8,7 @@ import numpy as np
 
 from marey_motion.evaluation.judgement import LimitCheck, Measure, TrialVerdict, exceeded_in_suite, judge
 from marey_motion.evaluation.relevance import SourceUsage, recorded_rows, sum_by_source
-from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.result import EvaluationResult, ReplicateValues
 from marey_motion.evaluation.scenario import demand
 from marey_reports.drawing.markup import Content, Html, element, joined
 from marey_reports.drawing.page import Section, shown
@@ -22,7 +22,9 @@ from marey_reports.evaluation.figures import (
     USE_FIGURES,
     DrawnFigure,
 )
+from marey_reports.evaluation.sentences import interval_text
 from marey_reports.evaluation.words import find_holes
+from marey_schemas.documents.replicates import MeanInterval
 from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
@@ -50,12 +52,20 @@ def headline(result: EvaluationResult) -> Html:
         (
             ("trajectories followed", f"{judgement.followed} of {len(judgement.trials)}", judgement.grade),
             ("feet in contact slide at", _written(result, "foot_skate"), _beside_clips(result)),
-            ("distance from the path", _written(result, "offset_mean"), beside),
+            ("distance from the path", _written(result, "offset_mean"), _joined(_spread(result), beside)),
             ("speeds and turns covered", f"{covered} of {coverage.deficit_s.size}", f"{duration(held)} of clips"),
             ("clips used", f"{used} of {len(sources)}", _mirroring(result)),
             ("left-right symmetry", f"{coverage.symmetry:.2f}", "of the data; 1: both sides equal, 0: one side only"),
         )
     )
+
+
+def _spread(result: EvaluationResult) -> str:
+    return "" if result.replicates is None else interval_text(result.replicates, "offset_mean", 2)
+
+
+def _joined(*parts: str) -> str:
+    return "; ".join(part for part in parts if part)
 
 
 def coverage_chapter(result: EvaluationResult, figures: Figures) -> Section:
@@ -172,7 +182,9 @@ def baseline_chapter(result: EvaluationResult) -> Section:
     The baseline consists of the same trials with generated clips, one for each speed and turn rate.
     """
     base = result.baseline
-    heads = ["measure", "this dataset", *(["generated baseline"] if base is not None else []), "unit"]
+    replicates = result.replicates
+    heads = ["measure", "this dataset", *(["95 % interval"] if replicates is not None else [])]
+    heads += [*(["generated baseline"] if base is not None else []), "unit"]
     beyond = exceeded_in_suite(result)
     rows: list[Sequence[Cell]] = []
     for name, metric in METRICS.items():
@@ -180,17 +192,33 @@ def baseline_chapter(result: EvaluationResult) -> Section:
             continue
         look = BEYOND if METRICS[name].limited_as in beyond or name in beyond else ""
         row: list[Cell] = [metric.label, number(result.suite[name], metric.digits, look=look)]
+        if replicates is not None:
+            row.append(_interval(replicates.interval(name), metric.digits))
         if base is not None:
             row.append(number(base.suite.get(name), metric.digits))
         rows.append([*row, metric.unit])
+    pooled = HOW_POOLED if replicates is None else f"{HOW_POOLED} {_replicated(replicates)}"
     about = (
-        f"{HOW_POOLED} {MARKED} The baseline is the same suite with generated clips, one for each speed and turn rate. "
+        f"{pooled} {MARKED} The baseline is the same suite with generated clips, one for each speed and turn rate. "
         "It shows the results of the same motion matching if no data is missing."
         if base is not None
-        else f"{HOW_POOLED} {MARKED} No baseline was evaluated."
+        else f"{pooled} {MARKED} No baseline was evaluated."
     )
     listing = table("Metrics of the suite", heads, rows, numbers=range(1, len(heads) - 1), sortable=False)
     return Section("numbers", "Metrics", (element("p", about), listing))
+
+
+def _replicated(replicates: ReplicateValues) -> str:
+    return (
+        f"Each trial ran {replicates.count} times, with another phase of the stride at the start and another length of "
+        "the approach. Values are means over these replicates; their 95 % intervals show how far chance moves them."
+    )
+
+
+def _interval(found: MeanInterval | None, digits: int) -> Number:
+    if found is None or found.low is None or found.high is None:
+        return Number(None, "–")
+    return Number(found.low, f"{number(found.low, digits).written} to {number(found.high, digits).written}")
 
 
 def appendix_chapter(result: EvaluationResult) -> Section:

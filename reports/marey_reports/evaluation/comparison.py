@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from marey_motion.evaluation.compare import Comparison, MetricChange
 from marey_motion.evaluation.judgement import Judgement, judge, judge_trial
 from marey_motion.evaluation.relevance import sum_by_source
@@ -20,6 +22,7 @@ from marey_reports.evaluation.figures import (
     USE_FIGURES,
     DrawnFigure,
 )
+from marey_schemas.documents.replicates import LEAST_REPLICATES, mean_interval
 from marey_schemas.options.verdict import VerdictLimits
 from marey_schemas.wording import counted
 
@@ -36,17 +39,31 @@ def compared(before: EvaluationResult, after: EvaluationResult) -> str:
     shared = kept[0].keys() & kept[1].keys()
     gained = sum(kept[1][name] and not kept[0][name] for name in shared)
     lost = sum(kept[0][name] and not kept[1][name] for name in shared)
-    if second.followed == first.followed:
-        start, parts = "Neither better nor worse", [f"the character follows {_share(second)} trajectories, as before"]
-    else:
-        start = "Better" if second.followed > first.followed else "Worse"
-        parts = [f"the character follows {_share(second)} trajectories, {first.followed} before"]
+    start = _direction(before, after)
+    same = second.followed == first.followed
+    parts = [
+        f"the character follows {_share(second)} trajectories, {'as before' if same else f'{first.followed} before'}"
+    ]
     if gained or lost:
         parts.append(f"{counted(gained, 'trajectory')} gained and {lost} lost")
     offsets = before.suite.get("offset_mean"), after.suite.get("offset_mean")
     if offsets[0] is not None and offsets[1] is not None:
         parts.append(f"it is {offsets[1]:.2f} m from its path on average, {offsets[0]:.2f} m before")
     return f"{start}: {'; '.join(parts)}."
+
+
+def _direction(before: EvaluationResult, after: EvaluationResult) -> str:
+    """Describe whether the number of followed trajectories changed by more than chance, over paired replicates."""
+    sides = [one.replicates for one in (before, after)]
+    followed = [np.count_nonzero(one.followed, axis=0) for one in sides if one is not None]
+    if len(followed) < 2 or len(followed[0]) != len(followed[1]):
+        return "Unclear, because there are no replicates"
+    change = mean_interval((followed[1] - followed[0]).tolist())
+    if change.low is None or change.high is None:
+        return "Unclear, because there are too few replicates"
+    if change.low <= 0.0 <= change.high:
+        return "No difference found"
+    return "Better" if change.mean > 0.0 else "Worse"
 
 
 def paired(before: EvaluationResult, after: EvaluationResult) -> list[tuple[TrialResult, TrialResult]]:
@@ -99,8 +116,8 @@ def metric_chapter(
     if comparison is not None:
         text = (
             "Each value is the mean over the trials for which both evaluations define it, also for largest distances "
-            "and counts, for which the report of one evaluation shows the maximum and the sum. The 95 % confidence "
-            "intervals of the mean changes were computed by resampling the trials."
+            "and counts, for which the report of one evaluation shows the maximum and the sum. "
+            f"{_about_intervals(before)}"
         )
     listing = table(
         "Metrics of the suite", heads, rows, numbers=(1, 2, 3, 4) if comparison else (1, 2, 3), sortable=False
@@ -177,10 +194,24 @@ def _shift(old: TrialResult, new: TrialResult) -> float:
 
 
 def _interval(change: MetricChange | None, digits: int) -> Number:
-    if change is None:
+    if change is None or change.low is None or change.high is None:
         return Number(None, "–")
     low, high = (number(bound, digits, signed=True).written for bound in (change.low, change.high))
     return Number(change.low, f"{low} to {high}")
+
+
+def _about_intervals(result: EvaluationResult) -> str:
+    replicates = result.options.replicates
+    if replicates < LEAST_REPLICATES:
+        return (
+            f"The evaluations have {counted(replicates, 'replicate')}, so it is unknown which changes are chance. "
+            f"Evaluate with at least {LEAST_REPLICATES} replicates to know."
+        )
+    return (
+        f"The 95 % confidence intervals are those of the mean changes in {replicates} replicates. “Better”, “worse” "
+        "and “changed” are corrected for the number of metrics: by chance alone, about one of twenty comparisons has "
+        "a “better” or “worse”, and as many have a “changed”."
+    )
 
 
 def _look(change: MetricChange | None) -> str:

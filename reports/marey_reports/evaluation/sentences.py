@@ -10,7 +10,7 @@ import numpy as np
 
 from marey_motion.evaluation.judgement import REGIONS, Judgement, LimitCheck, Measure, TrialVerdict, judge
 from marey_motion.evaluation.relevance import sum_by_source
-from marey_motion.evaluation.result import Coverage, EvaluationResult
+from marey_motion.evaluation.result import Coverage, EvaluationResult, ReplicateValues
 from marey_motion.evaluation.scenario import demand
 from marey_reports.drawing.words import duration
 from marey_schemas.documents.evaluations import RegionVerdict
@@ -54,6 +54,8 @@ def verdict(result: EvaluationResult) -> str:
     if not judgement.trials:
         return "Not judged: the evaluation has no trials."
     parts = [f"the character follows {judgement.followed} of {counted(len(judgement.trials), 'trajectory')}"]
+    if result.replicates is not None:
+        parts[0] += f" ({_span(result.replicates)})"
     if judgement.followed < len(judgement.trials):
         worst = judgement.ranked[0]
         parts[0] += f", worst at a {demand(worst.outcome.trial)} ({failing(worst)})"
@@ -61,6 +63,8 @@ def verdict(result: EvaluationResult) -> str:
         parts.append(_looking_wrong(judgement))
     if not judgement.looks_measured:
         parts.append("how the motion looks was not measured")
+    if result.replicates is not None and (offset := interval_text(result.replicates, "offset_mean", 2)):
+        parts.append(f"it is {result.suite['offset_mean']:.2f} m from its path on average ({offset} m)")
     missing = result.coverage.deficit_s
     enough = int(np.count_nonzero(missing <= 0.0))
     parts.append(f"{enough} of {counted(missing.size, 'cell')} of speed and turn rate hold enough data")
@@ -68,6 +72,20 @@ def verdict(result: EvaluationResult) -> str:
     if unused := sum(1 for source in sources if not source.ticks):
         parts.append(f"{unused} of {counted(len(sources), 'clip')} {'is' if unused == 1 else 'are'} never used")
     return f"{judgement.grade.capitalize()}: {'; '.join(parts)}."
+
+
+def _span(replicates: ReplicateValues) -> str:
+    counts = np.count_nonzero(replicates.followed, axis=0)
+    between = f"{counts.min()}" if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"
+    return f"{between} in single replicates"
+
+
+def interval_text(replicates: ReplicateValues, metric: str, digits: int) -> str:
+    """Describe the interval of a metric of the suite over the replicates; empty if it has none."""
+    found = replicates.interval(metric)
+    if found is None or found.low is None or found.high is None:
+        return ""
+    return f"95 % interval {found.low:.{digits}f} to {found.high:.{digits}f}"
 
 
 def _looking_wrong(judgement: Judgement) -> str:

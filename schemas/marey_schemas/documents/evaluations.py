@@ -16,9 +16,6 @@ COSTS = ("match_cost", "continuing_cost", "pose_cost")
 CONFIDENCE = 0.95
 """Confidence level of intervals: of changes between two evaluations, and of means of replicates."""
 
-RESAMPLES = 9_999
-"""Number of bootstrap samples from which each confidence interval is computed; the trials are resampled."""
-
 
 class HeadlineMetric(NamedTuple):
     """Metric of an evaluation that is shown in lists and summaries."""

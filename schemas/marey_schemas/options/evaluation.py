@@ -76,6 +76,15 @@ class EvaluationOptions(Grid):
     switch_every_s: float = Field(
         5.0, ge=0.5, le=600, allow_inf_nan=False, description="Seconds that each speed of a switching trial lasts."
     )
+    replicates: int = Field(
+        8,
+        ge=1,
+        le=64,
+        description="Number of replicates: each trial runs so often, each time with another phase of the stride at the "
+        "start, and with an approach that is up to one second longer. Results are means with 95 % intervals. 1: only "
+        "the trial itself, as published, without intervals.",
+    )
+    seed: int = Field(0, ge=0, lt=2**63, description="Number from which the replicates are drawn.")
     window: Literal["circle", "all"] = Field(
         "circle", description="Part of a trial that is measured. circle: the circle only; all: also the approach."
     )

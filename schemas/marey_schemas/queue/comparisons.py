@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Answer
-from marey_schemas.queue.replicates import LEAST_REPLICATES
+from marey_schemas.documents.replicates import LEAST_REPLICATES
 from marey_schemas.queue.scripts import LONGEST_NAME, Value
 from marey_schemas.sizes import KIB
 

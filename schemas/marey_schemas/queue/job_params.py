@@ -131,6 +131,8 @@ class CutParams(TaggedResults):
 MOST_TRIALS = 2000
 MOST_SIMULATED_S = 100_000.0
 """Greatest total duration of all trials, in seconds; with default options it is 5,346 s."""
+MOST_REPLICATED_S = 800_000.0
+"""Greatest total duration of all replicates of all trials, in seconds: some minutes of a processor."""
 TRIALS_PER_TASK = 8
 MOST_EVALUATION_TASKS = 64
 
@@ -169,6 +171,12 @@ class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
             raise ValueError(
                 f"{self.trial_count} trials of this length simulate {simulated_s:,.0f} s together; at most "
                 f"{MOST_SIMULATED_S:,.0f} s are allowed"
+            )
+        if (replicated_s := simulated_s * self.replicates) > MOST_REPLICATED_S:
+            raise ValueError(
+                f"{self.replicates} replicates of {self.trial_count} trials of this length simulate "
+                f"{replicated_s:,.0f} s together; at most {MOST_REPLICATED_S:,.0f} s are allowed, so choose fewer "
+                "replicates"
             )
         for item, (start, stop) in self.trims.items():
             if stop <= start:

@@ -35,7 +35,7 @@ EVALUATE = KindDeclaration(
     implementation="marey_worker.kinds.evaluate:run",
     gathering="marey_worker.kinds.evaluate:gather",
     task_count=job_params.count_evaluation_tasks,
-    version=4,
+    version=5,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
         "rig": RIG,
@@ -56,7 +56,7 @@ COMPARE = KindDeclaration(
     description="Compares two evaluations trial by trial, with confidence intervals of the changes.",
     params=job_params.CompareParams,
     implementation="marey_worker.kinds.compare:run",
-    version=2,
+    version=3,
     inputs={
         "before": InputSpec(kind=Kind.EVALUATION, description="The evaluation before the change."),
         "after": InputSpec(
@@ -126,7 +126,7 @@ SUGGEST = KindDeclaration(
     "coverage.",
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
-    version=3,
+    version=4,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": METRIC},
     outputs={"document": "file"},
     facets=REMOVAL_FACETS,

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from marey_schemas.documents.replicates import mean_interval
 from marey_schemas.queue.comparisons import (
     MOST_DRAWN,
     ComparedColumn,
@@ -18,7 +19,6 @@ from marey_schemas.queue.comparisons import (
     Source,
     number_of,
 )
-from marey_schemas.queue.replicates import mean_interval
 from marey_server.errors import BadRequestProblem
 from marey_server.store.scripts import comparing
 from marey_server.store.scripts.comparing import RunToCompare

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.timeout(300)
 
 SMALL: dict[str, Any] = {
     "speeds_m_s": (1.0, 1.5), "turn_rates_deg_s": (-50.0, 0.0, 50.0), "families": ("circle",), "duration_s": 6.0,
-    "baseline": False, "report": False,
+    "baseline": False, "report": False, "replicates": 1,
 }  # fmt: skip
 
 
@@ -52,16 +52,21 @@ def test_without_all_that_can_go_no_trial_changes(lab: ProjectHandle, run: Comma
 
 
 def test_a_used_clip_that_goes_is_found_to_change_trials(lab: ProjectHandle) -> None:
-    first = evaluated(lab, name="first")
+    first = evaluated(lab, name="first", replicates=3)
     most = max(first.clips(), key=lambda clip: clip["ticks"])["clip"]
     second = evaluated(
-        lab, [clip for clip in lab.clips.list() if clip.path != most], name="second", normaliser=first.id
+        lab,
+        [clip for clip in lab.clips.list() if clip.path != most],
+        name="second",
+        normaliser=first.id,
+        replicates=3,
     )
     compared = first.compare(second)
     document = compared.document()
     assert compared.summary["changed_trials"] == len(document["changed"]) > 0
     assert len(document["removed"]) == 1
     own = next(change for change in document["metrics"] if change["metric"] == "offset_mean")
+    assert own["replicates"] == 3
     assert own["low"] <= own["change"] <= own["high"]
     assert compared.report().startswith(b"<!DOCTYPE html>")
 

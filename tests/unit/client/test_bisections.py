@@ -116,25 +116,19 @@ def test_one_version_is_no_range() -> None:
         read_range(ListedVersions([[], [0]]), "1", "1")
 
 
-def trials(values: Sequence[float | None]) -> list[dict[str, object]]:
-    return [{"trial": f"trial {place}", "offset_mean": value} for place, value in enumerate(values)]
+def replicated(values: Sequence[float | None]) -> dict[str, object]:
+    return {"replicates": {"suite": {"offset_mean": list(values)}}}
 
 
-def test_the_interval_of_a_change_pairs_the_trials() -> None:
+def test_the_interval_of_a_change_pairs_the_replicates() -> None:
     random = np.random.default_rng(3)
-    before = random.normal(1.0, 1.0, 40)
-    after = before + random.normal(0.05, 0.1, 40)
-    found = change_interval(trials(list(before)), trials(list(after))[::-1], "offset_mean")
-    assert found is not None
-    half_width = 1.96 * (after - before).std(ddof=1) / np.sqrt(40)
-    assert found == pytest.approx(
-        ((after - before).mean() - half_width, (after - before).mean() + half_width), abs=5e-3
-    )
-    assert found[0] > 0.0
+    before = random.normal(1.0, 1.0, 8)
+    after = before + random.normal(0.05, 0.01, 8)
+    found = change_interval(replicated(before.tolist()), replicated(after.tolist()), "offset_mean")
+    half_width = 2.364624 * (after - before).std(ddof=1) / np.sqrt(8)
+    assert found == pytest.approx(((after - before).mean() - half_width, (after - before).mean() + half_width))
 
 
-def test_trials_that_one_evaluation_does_not_define_do_not_count() -> None:
-    assert change_interval(trials([1.0, None, 2.0]), trials([1.5, 9.0, 2.5]), "offset_mean") == pytest.approx(
-        (0.5, 0.5)
-    )
-    assert change_interval(trials([1.0, None]), trials([1.5, 9.0]), "offset_mean") is None
+def test_evaluations_with_too_few_replicates_have_no_interval() -> None:
+    assert change_interval(replicated([1.0, None, 2.0]), replicated([1.5, 9.0, 2.5]), "offset_mean") is None
+    assert change_interval({}, replicated([1.5, 9.0, 2.5]), "offset_mean") is None

@@ -1,18 +1,23 @@
 """Comparison of two evaluations of the same trials, trial by trial."""
 
-from collections.abc import Iterator
 from dataclasses import replace
-from statistics import NormalDist
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_1samp
 from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.compare import compare_results, paired_change
+from marey_motion.evaluation.compare import (
+    LESS_IS_BETTER,
+    MetricChange,
+    compare_results,
+    corrected,
+    paired_change,
+)
 from marey_motion.evaluation.improvement.selection import joined
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.matching.building import union_normaliser, with_normaliser
@@ -91,80 +96,80 @@ def test_changes_of_metrics_are_means_over_paired_trials(database: MatchingDatab
     after = evaluated(without_sources(database, ["clip_003"]))
     for change in compare_results(result, after).metrics:
         pairs = [
-            (one.metrics[change.metric], other.metrics[change.metric])
+            (first, second)
             for one, other in zip(result.trials, after.trials, strict=True)
-            if None not in (one.metrics[change.metric], other.metrics[change.metric])
+            if (first := one.metrics[change.metric]) is not None
+            and (second := other.metrics[change.metric]) is not None
         ]
         assert change.trials == len(pairs)
         assert change.before == pytest.approx(np.mean([pair[0] for pair in pairs]))
         assert change.change == pytest.approx(np.mean([pair[1] - pair[0] for pair in pairs]), abs=1e-12)
-        assert change.low <= change.change + 1e-12
-        assert change.change - 1e-12 <= change.high
+        assert change.verdict in ("same", "unclear")  # with one replicate, nothing is known about chance
+
+
+def drawn(changes: Floats, metric: str = "offset_mean") -> MetricChange:
+    """Return the change of three trials whose mean changes in each replicate are given."""
+    before = np.random.default_rng(9).normal(size=(3, len(changes)))
+    (found,) = corrected([paired_change(metric, before, before + changes + np.array([[-1.0], [0.0], [1.0]]))])
+    return found
 
 
 def test_the_interval_holds_the_true_change_about_as_often_as_it_says() -> None:
     random = np.random.default_rng(1)
-    held = 0
-    for _ in range(60):
-        before = random.exponential(size=60)
-        after = before + 0.3 + random.normal(size=60)
-        change = paired_change("offset_mean", before, after)
-        held += change.low <= 0.3 <= change.high
-    assert 51 <= held <= 60
+    changes = [drawn(0.3 + random.normal(size=8)) for _ in range(400)]
+    held = sum(one.low <= 0.3 <= one.high for one in changes if one.low is not None and one.high is not None)
+    assert 365 <= held <= 395
 
 
-def test_the_interval_of_normal_changes_is_two_standard_errors_to_each_side() -> None:
-    changes = np.random.default_rng(4).normal(0.3, 1.0, 400)
-    found = paired_change("offset_mean", np.zeros(400), changes)
-    reach = 1.96 * changes.std() / np.sqrt(400)
-    assert (found.low, found.high) == pytest.approx((changes.mean() - reach, changes.mean() + reach), abs=0.05 * reach)
+def test_the_interval_is_that_of_student_over_replicates_and_not_over_trials() -> None:
+    changes = np.random.default_rng(4).normal(0.3, 0.1, 8)
+    found = drawn(changes)
+    reach = 2.364624 * changes.std(ddof=1) / np.sqrt(8)
+    assert (found.low, found.high) == pytest.approx((changes.mean() - reach, changes.mean() + reach))
+    assert (found.trials, found.replicates) == (3, 8)
+    assert found.p == pytest.approx(ttest_1samp(changes, 0.0).pvalue)
 
 
-def test_the_interval_of_skewed_changes_reaches_farther_to_the_long_side() -> None:
-    changes = np.sort(np.random.default_rng(5).exponential(size=25))
-    found = paired_change("offset_mean", np.zeros(25), changes)
-    low, high = efron_bounds(changes)
-    assert (found.low, found.high) == pytest.approx((low, high), abs=0.03 * (high - low))
-    assert high - changes.mean() > 1.25 * (changes.mean() - low)
-
-
-def efron_bounds(changes: Floats) -> Iterator[float]:
-    """Yield the bias-corrected and accelerated bounds of the mean as in Efron (1987), from other random resamples."""
-    normal, random, count = NormalDist(), np.random.default_rng(6), len(changes)
-    means = np.sort(random.choice(changes, (20_000, count)).mean(axis=1))
-    bias = normal.inv_cdf(np.mean(means < changes.mean()))
-    without = (changes.sum() - changes) / (count - 1)
-    apart = without.mean() - without
-    acceleration = np.sum(apart**3) / (6.0 * np.sum(apart**2) ** 1.5)
-    for tail in (0.025, 0.975):
-        shifted = bias + normal.inv_cdf(tail)
-        share = normal.cdf(bias + shifted / (1.0 - acceleration * shifted))
-        yield means[int(share * len(means))]
-
-
-def test_the_interval_is_the_same_every_time() -> None:
-    random = np.random.default_rng(2)
-    before, after = random.normal(size=40), random.normal(size=40)
-    assert paired_change("dse_v", before, after) == paired_change("dse_v", before, after)
+def test_replicates_in_which_a_metric_is_not_defined_are_left_out() -> None:
+    before = np.array([[1.0, np.nan, 2.0, 3.0, 1.0], [np.nan, np.nan, 1.0, 1.0, 1.0]])
+    after = before + np.array([0.1, 9.0, 0.2, 0.3, 0.2])
+    found = paired_change("offset_mean", before, after)
+    assert (found.trials, found.replicates) == (2, 4)
+    assert found.change == pytest.approx(0.2)
 
 
 def test_changes_that_differ_by_rounding_alone_have_an_interval_around_them() -> None:
-    counts = np.arange(9, 15)  # switches in 30 s, five more in every trial
+    counts = np.arange(9.0, 15.0)[None]  # switches in 30 s, five more in every replicate
     found = paired_change("transitions_per_s", counts / 30, (counts + 5) / 30)
-    assert found.low <= found.high
     assert (found.low, found.high) == pytest.approx((5 / 30, 5 / 30), rel=1e-12)
-    assert paired_change("transitions_per_s", [2.0, 2.0], [2.0, 2.0]).verdict == "same"
+    assert paired_change("transitions_per_s", counts, counts).verdict == "same"
 
 
-def test_a_verdict_needs_an_interval_without_zero_and_a_metric_with_a_direction() -> None:
-    before = np.linspace(1.0, 2.0, 30)
-    noise = np.random.default_rng(3).normal(size=30)
-    assert paired_change("offset_mean", before, before - 0.5 + 0.1 * noise).verdict == "better"
-    assert paired_change("offset_mean", before, before + 0.5 + 0.1 * noise).verdict == "worse"
-    assert paired_change("offset_mean", before, before + noise - noise.mean()).verdict == "unclear"
-    assert paired_change("transitions", before, before + 2.0 + 0.1 * noise).verdict == "changed"
-    assert paired_change("offset_mean", before, before).verdict == "same"
-    assert paired_change("offset_mean", [1.0], [0.5]).verdict == "unclear"
+def test_a_verdict_needs_more_than_chance_and_a_metric_with_a_direction() -> None:
+    noise = 0.1 * np.random.default_rng(3).normal(size=8)
+    assert drawn(noise - 0.5).verdict == "better"
+    assert drawn(noise + 0.5).verdict == "worse"
+    assert drawn(noise - noise.mean()).verdict == "unclear"
+    assert drawn(noise + 0.5, "transitions").verdict == "changed"
+    assert drawn(0.0 * noise).verdict == "unclear"  # the trials changed, although their means did not
+    assert paired_change("offset_mean", np.ones((1, 1)), np.zeros((1, 1))).verdict == "unclear"
+
+
+def test_the_verdicts_of_many_metrics_are_rarely_false_together() -> None:
+    """Chance alone: uncorrected, more than half of these families would contain a false verdict."""
+    random = np.random.default_rng(7)
+    metrics = LESS_IS_BETTER
+    false = 0
+    for _ in range(300):
+        changes = [paired_change(name, np.zeros((1, 8)), random.normal(size=(1, 8))) for name in metrics]
+        false += any(one.verdict != "unclear" for one in corrected(changes))
+    assert false <= 300 * 0.05 + 2.5 * np.sqrt(300 * 0.05 * 0.95)
+    # Holm's method: the least of two probabilities is doubled, the other one is raised to it at least.
+    pair = [
+        replace(drawn(np.arange(1.0, 9.0)), metric=name, p=p) for name, p in zip(metrics, (0.03, 0.02), strict=False)
+    ]
+    assert [one.p for one in corrected(pair)] == pytest.approx([0.04, 0.04])
+    assert [one.p for one in corrected([pair[0], replace(pair[1], metric="transitions")])] == [0.03, 0.02]
 
 
 def test_evaluations_under_other_conditions_are_refused_by_name(

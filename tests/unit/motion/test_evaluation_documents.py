@@ -24,6 +24,7 @@ OPTIONS = EvaluationOptions(
     speeds_m_s=(1.0, 2.0),
     turn_rates_deg_s=(-50.0, 0.0, 50.0),
     duration_s=12.0,
+    replicates=1,
     literal_formulas=True,
     database=DatabaseOptions(mirroring="add", extra_joints=("head",)),
     controller=ControllerOptions(root_clamp_m=0.5),

@@ -12,7 +12,7 @@ from tests.support.synthetic_databases import synthetic_database
 from marey_motion.alignment.dtw import warped_distance
 from marey_motion.clip import Clip
 from marey_motion.evaluation.improvement.duplicates import find_near_duplicates, frame_points, spared_sources
-from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.gait import generate_gait
 from marey_motion.gait.style import GaitStyle
 from marey_motion.matching.body import MatchingBody

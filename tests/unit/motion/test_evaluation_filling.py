@@ -15,7 +15,7 @@ from tests.support.synthetic_databases import arc_track, synthetic_database
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.filling import plan_fillings, rank_fillings
 from marey_motion.evaluation.improvement.selection import joined
-from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 
 THRESHOLD = 1.5

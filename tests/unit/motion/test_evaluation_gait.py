@@ -25,11 +25,11 @@ from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.matching import DatabaseOptions
 
 TURN_RATES = (-100.0, -75.0, -50.0, -25.0, 0.0, 25.0, 50.0, 75.0, 100.0)
-CIRCLES = EvaluationOptions(speeds_m_s=(1.0, 2.0, 3.0), turn_rates_deg_s=TURN_RATES, families=("circle",))
+CIRCLES = EvaluationOptions(speeds_m_s=(1.0, 2.0, 3.0), turn_rates_deg_s=TURN_RATES, families=("circle",), replicates=1)
 IMPOSSIBLE_M_S = 20.0
 RIGID = GaitStyle(bounce=0.0, lean=0.0, sway=0.0, arm_swing=0.0)
 SMALL = EvaluationOptions(
-    speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0, switch_every_s=2.0
+    speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0, switch_every_s=2.0, replicates=1
 )
 
 

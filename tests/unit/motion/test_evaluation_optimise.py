@@ -14,7 +14,7 @@ from marey_motion.evaluation.improvement.objective import headline_means, object
 from marey_motion.evaluation.improvement.optimise import Optimisation, optimise
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.suggestion_documents import optimisation_to_tree
-from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.options.improvement import ObjectiveOptions, OptimisationOptions
 

@@ -11,7 +11,7 @@ from marey_motion.evaluation.improvement.objective import HEADLINES, headline_me
 from marey_motion.evaluation.improvement.redundancy import leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.result import EvaluationResult
-from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.options.improvement import ObjectiveOptions
 

@@ -25,7 +25,7 @@ from tests.support.tiers import is_soak
 
 from marey_motion.evaluation.compare import compare_results
 from marey_motion.evaluation.judgement import GRADES, judge, judge_trial, mean_speed_m_s
-from marey_motion.evaluation.result import EvaluationResult, TrialResult
+from marey_motion.evaluation.result import EvaluationResult, ReplicateValues, TrialResult
 from marey_motion.evaluation.scenario import Trial, demand
 from marey_motion.evaluation.suite import evaluate
 from marey_motion.gait import generate_gait
@@ -195,7 +195,9 @@ def test_reports_are_made_of_little(name: str, result: EvaluationResult) -> None
 
 @pytest.mark.slow
 def test_a_real_evaluation_is_reported() -> None:
-    options = EvaluationOptions(speeds_m_s=(1.25, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0)
+    options = EvaluationOptions(
+        speeds_m_s=(1.25, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0, replicates=1
+    )
     clips = [
         SourceClip(f"gait{index}", f"gait {index}", generate_gait(speed, turn_rate, 4.0))
         for index, (speed, turn_rate) in enumerate(((1.25, 0.0), (1.25, 0.9), (2.0, 0.0)))
@@ -352,12 +354,23 @@ def test_each_region_gets_a_sentence_and_motion_that_no_trial_asks_for_is_named(
 # Comparisons
 
 
+def replicated(result: EvaluationResult, *counts: int) -> EvaluationResult:
+    """Return the evaluation with replicates, in each of which so many of its trials are followed."""
+    trials = len(result.trials)
+    followed = np.arange(trials)[:, None] < np.array(counts)
+    return replace(result, replicates=ReplicateValues((), np.empty((trials, len(counts), 0)), followed, {}))
+
+
 def test_a_comparison_says_whether_it_helped(result: EvaluationResult) -> None:
-    assert compared(judged(result, 3, 10), judged(result, 5, 10)).startswith(
+    few, many = replicated(judged(result, 3, 10), 3, 2, 3, 4), replicated(judged(result, 5, 10), 5, 5, 5, 6)
+    assert compared(few, many).startswith(
         "Better: the character follows 5 of 10 trajectories, 3 before; 2 trajectories gained and 0 lost"
     )
-    assert compared(judged(result, 5, 10), judged(result, 3, 10)).startswith("Worse: ")
-    assert compared(result, result).startswith("Neither better nor worse: ")
+    assert compared(many, few).startswith("Worse: ")
+    assert compared(few, few).startswith("No difference found: the character follows 3 of 10 trajectories, as before")
+    chance = replicated(judged(result, 5, 10), 2, 5, 1, 6)
+    assert compared(few, chance).startswith("No difference found: ")
+    assert compared(result, result).startswith("Unclear, because there are no replicates: ")
 
 
 @pytest.mark.slow

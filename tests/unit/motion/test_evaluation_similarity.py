@@ -11,6 +11,7 @@ from tests.support.synthetic_databases import Track, arc_track, synthetic_databa
 from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.evaluation.similarity import (
     accepted_distance,
     measure_similarity,
@@ -19,7 +20,6 @@ from marey_motion.evaluation.similarity import (
     window_cells,
     window_rows,
 )
-from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import Status
 

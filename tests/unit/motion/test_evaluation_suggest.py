@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.support.smaller_databases import without_rows, without_sources
 from tests.support.suggestion_cases import (
+    OPTIONS,
     UNWANTED,
     evaluated,
     named,
@@ -26,8 +27,11 @@ from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.selection import joined
 from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree, suggestions_to_tree
+from marey_motion.evaluation.replicates import run_replicates
+from marey_motion.evaluation.running import EvaluationCancelled
+from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.similarity import accepted_distance
-from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.evaluation.suite import assemble
 from marey_motion.formats import read_motion
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
@@ -63,6 +67,21 @@ def test_every_kind_of_suggestion_is_made(found: Suggestions) -> None:
     assert [source for source, _ in found.spared] == ["copy_of_clip_000"]
     assert {filling.source for filling in found.fillings} <= {"turn_000", "turn_001"}
     assert found.similarity.threshold == 3.0
+
+
+def test_what_another_replicate_shows_is_not_called_unused(database: MatchingDatabase) -> None:
+    options = OPTIONS.replace(replicates=3)
+    trials = suite_trials(options)
+    replicates = run_replicates(database, options, trials)
+    assert replicates is not None
+    (own,) = (clip for clip in database.clips if clip.uid == UNWANTED[0])
+    replicates.usage.popularity[own.start + 5] += 1
+    result = assemble(database, options, trials, simulated(database, options), replicates=replicates)
+    found = suggest(database, result, options=SuggestionOptions(removals=0, consider=0))
+    assert UNWANTED[1] in {clip.source for clip in found.unused.clips}
+    assert UNWANTED[0] not in {clip.source for clip in found.unused.clips}
+    shown = {result.clips[use.clip].uid for use in result.usage if use.ticks}
+    assert not shown & {clip.source for clip in found.unused.clips}
 
 
 def test_the_threshold_is_the_suites_own_when_none_is_given(database: MatchingDatabase) -> None:
@@ -166,7 +185,7 @@ def test_progress_only_rises_and_the_work_can_be_stopped(database: MatchingDatab
         suggest(database, result, options=options, cancelled=lambda: True)
 
 
-REAL = EvaluationOptions(duration_s=15.0, families=("circle",))
+REAL = EvaluationOptions(duration_s=15.0, families=("circle",), replicates=1)
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,9 @@ from tests.support.evaluation_cases import arc, trajectory_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_to_tree
+from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
-from marey_motion.evaluation.suite import EvaluationCancelled, assemble, run_suite
+from marey_motion.evaluation.suite import assemble, run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
 from marey_schemas.encoding.codecs import encode_tree
@@ -17,7 +18,7 @@ from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.matching import ControllerOptions
 
 OPTIONS = EvaluationOptions(
-    speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0, switch_every_s=2.0
+    speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0, switch_every_s=2.0, replicates=1
 )
 TRIALS = suite_trials(OPTIONS)
 
@@ -216,7 +217,9 @@ def test_the_unused_clips_can_go_without_changing_a_trial(
 
 def test_a_clip_of_the_whole_trajectory_is_followed_without_error_or_transition() -> None:
     for speed, turn_rate in ((2.0, 50.0), (1.0, -100.0), (3.0, 25.0)):
-        options = EvaluationOptions(speeds_m_s=(speed,), turn_rates_deg_s=(turn_rate,), families=("circle",))
+        options = EvaluationOptions(
+            speeds_m_s=(speed,), turn_rates_deg_s=(turn_rate,), families=("circle",), replicates=1
+        )
         (trial,) = suite_trials(options)
         asked = reference(trial)
         database = trajectory_database((asked.positions, asked.headings))
@@ -237,6 +240,7 @@ def test_straight_and_circle_clips_hold_speed_and_turn_in_every_mode() -> None:
                 speeds_m_s=(speed,),
                 turn_rates_deg_s=(turn_rate,),
                 families=("circle",),
+                replicates=1,
                 controller=ControllerOptions(follow=follow, root_inertialisation=False),
             )
             trials = suite_trials(options)
@@ -250,7 +254,9 @@ def test_straight_and_circle_clips_hold_speed_and_turn_in_every_mode() -> None:
 
 
 def test_a_set_that_holds_the_mirror_image_of_every_clip_turns_alike_to_both_sides() -> None:
-    options = EvaluationOptions(families=("circle",), controller=ControllerOptions(root_inertialisation=False))
+    options = EvaluationOptions(
+        families=("circle",), replicates=1, controller=ControllerOptions(root_inertialisation=False)
+    )
     grid = options
     database = trajectory_database(*(arc(v, w, 10.0) for v, w in product(grid.speeds_m_s, grid.turn_rates_deg_s)))
     result = assemble(database, options, suite_trials(options), run_suite(database, options))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import t, ttest_1samp
 
-from marey_schemas.queue.replicates import mean_interval, student_quantile
+from marey_schemas.documents.replicates import mean_interval, student_quantile
 
 
 def test_the_quantile_is_that_of_student() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from marey_motion.evaluation.judgement import judge
 from marey_motion.evaluation.perceived import PerceivedRows
 from marey_motion.evaluation.relevance import recorded_rows, sum_by_source
+from marey_motion.evaluation.replicates import MeasuredReplicates, run_replicates
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
 from marey_motion.evaluation.scenario import Trial, suite_trials
@@ -36,10 +37,11 @@ Headline = dict[str, float | int | None]
 
 
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
-    """Simulate the trials of this task by motion matching; the result refers to the file with their records."""
+    """Simulate the trials of this task and their replicates; the result refers to the file with what was measured."""
     options = EvaluationOptions.of(params)
     trials = _trials(params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
+    runs = len(trials) * options.replicates
     started = time.monotonic()
     with refusing_motion_errors():
         records = run_suite(
@@ -48,14 +50,25 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
             trials=trials,
             index=clips.index,
             threads=context.threads,
-            progress=context.progress,
+            progress=lambda done, _total, note: context.progress(done, runs, note),
         )
-    file = context.scratch / "records.msgpack"
-    file.write_bytes(encode_tree(records_to_tree(trials, records), MSGPACK, arrays="blocks"))
+        replicates = run_replicates(
+            clips.database,
+            options,
+            trials,
+            index=clips.index,
+            threads=context.threads,
+            progress=lambda done, _total, note: context.progress(len(trials) + done, runs, note),
+        )
+    found = {"records": records_to_tree(trials, records)}
+    if replicates is not None:
+        found["replicates"] = replicates.as_tree()
+    file = context.scratch / "trials.msgpack"
+    file.write_bytes(encode_tree(found, MSGPACK, arrays="blocks"))
     return {
         "trials": len(trials),
         "seconds": round(time.monotonic() - started, 4),
-        "records": {"blob": context.put_file(file)},
+        "measured": {"blob": context.put_file(file)},
     }
 
 
@@ -65,15 +78,14 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     context.progress(0, GATHERING_STEPS, "reading the records of the trials")
     database = read_clips(context, params, options.database).database
     trials = _trials(params, options)
-    known = _read_records(context, results)
-    records = [known[trial.name] for trial in trials]
+    records, replicates = _read_trials(context, results, trials)
     with refusing_motion_errors():
         baseline = None
         if params.baseline:
             context.progress(1, GATHERING_STEPS, "measuring generated clips")
             baseline = evaluate_baseline(options, threads=context.threads)
         context.progress(2, GATHERING_STEPS, "measuring the trials")
-        result = assemble(database, options, trials, records, baseline=baseline)
+        result = assemble(database, options, trials, records, replicates=replicates, baseline=baseline)
         if (metric := read_metric(context, params.metric)) is not None:
             result = replace(result, perceived=PerceivedRows(database, metric).transitions(result.switches))
     evaluation = {
@@ -110,11 +122,14 @@ def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, 
     return trials
 
 
-def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dict[str, TrialRecord]:
-    known: dict[str, TrialRecord] = {}
-    for result in results:
-        known |= records_from_tree(decode_tree(context.blob(result["records"]["blob"]), MSGPACK))
-    return known
+def _read_trials(
+    context: Context, results: Sequence[Mapping[str, Any]], trials: Sequence[Trial]
+) -> tuple[list[TrialRecord], MeasuredReplicates | None]:
+    """Read what the tasks have found: the record of each trial, and its further replicates if there are any."""
+    found = [decode_tree(context.blob(result["measured"]["blob"]), MSGPACK) for result in results]
+    known = {name: record for one in found for name, record in records_from_tree(one["records"]).items()}
+    trees = [one["replicates"] for one in found if "replicates" in one]
+    return [known[trial.name] for trial in trials], MeasuredReplicates.from_trees(trees, trials)
 
 
 def headline_of(result: EvaluationResult) -> Headline:

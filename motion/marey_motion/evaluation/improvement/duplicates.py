@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from marey_motion.alignment.dtw import RangeBounds, distance_bound, warped_distance
 from marey_motion.evaluation.improvement.selection import clips_by_source, source_of
 from marey_motion.evaluation.perceived import PerceivedRows
-from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
+from marey_motion.evaluation.running import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 
 ProgressCallback = Callable[[int, int, str], None]

@@ -13,8 +13,8 @@ from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.selection import clips_by_source, same_skeleton
 from marey_motion.evaluation.perceived import PerceivedRows
 from marey_motion.evaluation.result import Coverage
+from marey_motion.evaluation.running import CancelCallback, EvaluationCancelled
 from marey_motion.evaluation.similarity import every_kth, nearest_poses, window_cells, window_rows
-from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.options.evaluation import EvaluationOptions
 

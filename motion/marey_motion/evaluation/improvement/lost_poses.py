@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Flags
 from marey_motion.evaluation.improvement.selection import clips_by_source
 from marey_motion.evaluation.perceived import PerceivedRows
+from marey_motion.evaluation.running import CancelCallback, EvaluationCancelled
 from marey_motion.evaluation.similarity import source_of_rows
-from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 
 ProgressCallback = Callable[[int, int, str], None]

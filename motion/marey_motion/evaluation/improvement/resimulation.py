@@ -25,9 +25,11 @@ from numpy.typing import NDArray
 from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.metrics import measure_trial
+from marey_motion.evaluation.replicates import guide_for
 from marey_motion.evaluation.result import TrialResult
+from marey_motion.evaluation.running import CancelCallback
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
-from marey_motion.evaluation.suite import CancelCallback, guide_for, run_suite
+from marey_motion.evaluation.suite import run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.display import switched_rows
 from marey_motion.matching.record import TrialRecord

@@ -33,8 +33,8 @@ from marey_motion.evaluation.perceived import PerceivedRows, indistinguishable
 from marey_motion.evaluation.provenance import provenance_of
 from marey_motion.evaluation.relevance import sum_by_source
 from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.running import CancelCallback
 from marey_motion.evaluation.similarity import PoseSimilarity, accepted_distance, measure_similarity
-from marey_motion.evaluation.suite import CancelCallback
 from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.documents.metrics import MetricDocument
 from marey_schemas.options.improvement import SuggestionOptions
@@ -121,7 +121,9 @@ def suggest(
         database, result.options, trials=trials, records=records, threads=threads, cancelled=cancelled
     )
     seen = None if metric is None else PerceivedRows(database, metric)
-    unused = find_unused(database, trials, records, result.options, index=simulation.index)
+    # The records are those of the first replicates only; the usage is that of all.
+    shown = np.concatenate([use.popularity > 0 for use in result.usage])
+    unused = find_unused(database, trials, records, result.options, index=simulation.index, shown=shown)
     duplicates = find_near_duplicates(
         database, threshold_cm=how.duplicate_cm, seen=seen, threads=threads, **stages.watch("duplicates")
     )

@@ -12,8 +12,9 @@ from marey_motion.evaluation.improvement.objective import headline_means, object
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
 from marey_motion.evaluation.result import Metrics
+from marey_motion.evaluation.running import CancelCallback
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
-from marey_motion.evaluation.suite import CancelCallback, run_suite
+from marey_motion.evaluation.suite import run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.features import feature_layout
 from marey_motion.matching.normaliser import UNMATCHED_SCALE

@@ -90,6 +90,7 @@ def find_unused(
     options: EvaluationOptions,
     *,
     index: SearchIndex | None = None,
+    shown: NDArray[np.bool_] | None = None,
 ) -> Unused:
     """Find the source clips, and ranges of frames of other clips, that no trial needs, the longest first.
 
@@ -102,12 +103,15 @@ def find_unused(
     records : sequence of TrialRecord    their records
     options : EvaluationOptions    options of the evaluation
     index : SearchIndex, optional    the index that the trials were run with, built if None
+    shown : (N,) bool, optional    rows that were displayed in replicates without a record, and are needed, too
 
     Returns
     -------
     Unused    sources, ranges and rows
     """
     needed = _needed(database, trials, records, options, index)
+    if shown is not None:
+        needed |= shown
     rate = database.options.rate_hz
     # What may not be chosen near a frame must stay in one clip with it: only a clip's own frames are barred.
     barred = int(np.ceil(options.controller.reselect_window_s * rate)) + 1
@@ -118,15 +122,15 @@ def find_unused(
     rows = np.zeros(database.row_count, dtype=np.bool_)
     for source, members in clips_by_source(database.clips).items():
         own = [database.clips[index] for index in members]
-        shown = np.any([needed[clip.start : clip.stop] for clip in own], axis=0)
+        wanted = np.any([needed[clip.start : clip.stop] for clip in own], axis=0)
         name = min(own, key=lambda clip: clip.mirrored_from is not None).name
-        if not shown.any():
-            clips.append(UnusedClip(source, name, len(shown) / rate))
-            spans = [(0, len(shown))]
+        if not wanted.any():
+            clips.append(UnusedClip(source, name, len(wanted) / rate))
+            spans = [(0, len(wanted))]
         elif any(clip.loop for clip in own) and database.options.end_policy == "loop":
             continue
         else:
-            spans = _gaps(shown, before, after, int(np.ceil(LEAST_RANGE_S * rate)))
+            spans = _gaps(wanted, before, after, int(np.ceil(LEAST_RANGE_S * rate)))
             first_s = own[0].first_s
             ranges += [
                 UnusedRange(source, name, *span, first_s + span[0] / rate, first_s + span[1] / rate) for span in spans
