@@ -147,44 +147,48 @@ class KeywordModule:
 
     def _written(self, kind: Any) -> str:
         """Return a type as it is written in Python; lists may be given for tuples, and documents for models."""
+        return " | ".join(self._parts(kind))
+
+    def _parts(self, kind: Any) -> list[str]:
+        """Return the different types of a union, each as it is written in Python; one for a type that is no union."""
         origin, arguments = get_origin(kind), get_args(kind)
         if origin is Annotated:
-            return self._written(arguments[0])
+            return self._parts(arguments[0])
         if origin in (Union, types.UnionType):
-            return " | ".join(dict.fromkeys(part for one in arguments for part in self._written(one).split(" | ")))
+            return list(dict.fromkeys(part for one in arguments for part in self._parts(one)))
         if origin is Literal:
             self._imports["typing"].add("Literal")
             choices = ", ".join(f'"{one}"' for one in arguments)
-            return f"Literal[{choices}]"
+            return [f"Literal[{choices}]"]
         if origin is tuple:
-            return self._written_tuple(arguments)
+            return self._parts_of_tuple(arguments)
         if origin is dict:
             self._imports["collections.abc"].add("Mapping")
             key, value = map(self._written, arguments)
-            return f"Mapping[{key}, {value}]"
-        return self._written_class(kind)
+            return [f"Mapping[{key}, {value}]"]
+        return self._parts_of_class(kind)
 
-    def _written_tuple(self, arguments: tuple[Any, ...]) -> str:
+    def _parts_of_tuple(self, arguments: tuple[Any, ...]) -> list[str]:
         if arguments[-1] is not Ellipsis:
-            return f"tuple[{', '.join(map(self._written, arguments))}]"
+            return [f"tuple[{', '.join(map(self._written, arguments))}]"]
         one = self._written(arguments[0])
         if one == "str":
-            return "list[str] | tuple[str, ...]"  # not Sequence, because a text would be one
+            return ["list[str]", "tuple[str, ...]"]  # not Sequence, because a text would be one
         self._imports["collections.abc"].add("Sequence")
-        return f"Sequence[{one}]"
+        return [f"Sequence[{one}]"]
 
-    def _written_class(self, kind: Any) -> str:
+    def _parts_of_class(self, kind: Any) -> list[str]:
         if kind is type(None):
-            return "None"
+            return ["None"]
         if kind.__module__ == "builtins":
-            return str(kind.__name__)
+            return [str(kind.__name__)]
         self._imports[kind.__module__].add(kind.__name__)
         if issubclass(kind, Enum | date):
-            return f"{kind.__name__} | str"
+            return [kind.__name__, "str"]
         if issubclass(kind, Options) and not issubclass(kind, Tagged):
-            return f"{kind.__name__} | {self._add(kind)}"
+            return [kind.__name__, self._add(kind)]
         if issubclass(kind, BaseModel):
             self._imports["collections.abc"].add("Mapping")
             self._imports["typing"].add("Any")
-            return f"{kind.__name__} | Mapping[str, Any]"
+            return [kind.__name__, "Mapping[str, Any]"]
         raise TypeError(f"{kind}: say in docs/keyword_types.py how this type is written")

@@ -117,15 +117,12 @@ def _print_model(found: ModelHandle, as_json: bool) -> None:
     typer.echo(found.verdict)
     errors = training["reconstruction"]
     if errors is not None:
-        columns = ("components", "trained on, cm", "left out, cm")
         kept = found.summary()["spatial_components"]
-        rows = [
-            (f"{count}{' *' if count == kept else ''}", f"{trained:.2f}", f"{left_out:.2f}")
-            for count, trained, left_out in zip(
-                errors["components"].tolist(), errors["training_cm"], errors["left_out_cm"], strict=True
-            )
-        ]
-        print_table(columns, rows, right=columns)
+        counts = [f"{count}{' *' if count == kept else ''}" for count in errors["components"].tolist()]
+        columns = {"components": counts, "trained on, cm": [f"{error:.2f}" for error in errors["training_cm"]]}
+        if "left_out_cm" in errors:  # not known if all examples come from one take
+            columns["left out, cm"] = [f"{error:.2f}" for error in errors["left_out_cm"]]
+        print_table(tuple(columns), list(zip(*columns.values(), strict=True)), right=tuple(columns))
     for warning in training["warnings"]:
         print_message(f"{warning['code']}: {warning['message']}")
     place = f"{found.project}/{found.path}"

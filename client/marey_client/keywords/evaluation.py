@@ -152,6 +152,12 @@ class EvaluateKeywords(TypedDict, total=False):
     """Second speed of switching trials, in metres per second; the first is one of `speeds_m_s`."""
     switch_every_s: float
     """Seconds that each speed of a switching trial lasts."""
+    replicates: int
+    """Number of replicates: each trial runs so often, each time with another phase of the stride at the start, and with
+    an approach that is up to one second longer. Results are means with 95 % intervals. 1: only the trial itself, as
+    published, without intervals."""
+    seed: int
+    """Number from which the replicates are drawn."""
     window: Literal["circle", "all"]
     """Part of a trial that is measured. circle: the circle only; all: also the approach."""
     coverage_least_s: float

@@ -40,7 +40,7 @@ class MixtureCandidate:
     bic, aic : float    Bayesian and Akaike information criterion
     log_likelihood : float    natural logarithm of the likelihood of all examples
     held_out_log_likelihood : float or None    mean log-likelihood of examples under mixtures that were fitted without
-        their takes; None without cross-validation
+        their takes; None without cross-validation, or if a fold leaves fewer examples than components
     smallest_weight : float    the least weight of a component
     converged : bool    whether the fit converged
     refusal : str    reason why the mixture is excluded, regardless of its criteria; empty if it is not excluded.
@@ -187,7 +187,10 @@ class _Unseen:
         return found
 
     def calibration(self) -> float:
-        """Find the least widening with which at most 5 % of the examples (rounded up) are below the threshold."""
+        """Find the least widening with which at most 5 % of the examples (rounded up) are below the threshold.
+
+        Returns the greatest widening if there is none.
+        """
         allowed = np.ceil(LOW_SHARE * len(self.folds)) / len(self.folds)
         fits = (factor for factor in WIDENINGS if self.judged(factor).low_share <= allowed)
         return next(fits, WIDENINGS[-1])
@@ -210,8 +213,13 @@ class _Fitting:
         )
         kinds = get_args(CovarianceKind) if self.options.covariance is None else (self.options.covariance,)
         tried = [one for kind in kinds for one in self._of_kind(kind, criterion, folds)]
+        if criterion == "held_out" and all(one.held_out is None for one in tried):
+            criterion = "bic"
         judged = tried if criterion == "held_out" else _with_refusals(tried)
-        usable = [one for one in judged if not one.candidate.refusal or self.options.mixture_components is not None]
+        fixed = self.options.mixture_components is not None
+        usable = [one for one in judged if fixed or not one.candidate.refusal]
+        if criterion == "held_out":
+            usable = [one for one in usable if one.held_out is not None]
         best = max(usable, key=lambda one: _score(one.candidate, criterion))
         if criterion == "held_out":
             best = self._simplest(usable, best)

@@ -30,16 +30,16 @@ class ReconstructionErrors:
     components : (c,) numbers of components: 0, 1, 2, ...
     training_cm : (c,) mean error of the examples from which the components were computed
     left_out_cm : (c,) mean error of examples that are reconstructed from the components and the mean of the examples of
-        all other takes
-    left_out_each_cm : (m, c) the error of each of these examples
+        all other takes; None if all examples come from one take
+    left_out_each_cm : (m, c) the error of each of these examples; None if all examples come from one take
     left_out_subject_cm : (c,) the same mean error if all examples of the performer are left out; None if fewer than
         three performers are known
     """
 
     components: NDArray[np.int64]
     training_cm: Floats
-    left_out_cm: Floats
-    left_out_each_cm: Floats
+    left_out_cm: Floats | None
+    left_out_each_cm: Floats | None
     left_out_subject_cm: Floats | None = None
 
 
@@ -89,19 +89,20 @@ def reconstruction_errors(
     groups = groups or ExampleGroups.alone(len(poses))
     parts = [groups.takes] if groups.subjects is None else [groups.takes, groups.subjects]
     todo = [(part, number) for part in parts for number in range(int(part.max()) + 1)]
+    known = groups.take_count > 1
     training, left_out, of_others = (np.empty((len(poses), count)) for _ in range(3))
 
     def measure(part: Ints, number: int) -> None:
         members = np.flatnonzero(part == number)
-        without = _left_out(scores, members, count)
+        by_take = part is groups.takes
+        without = _left_out(scores, members, count) if known or not by_take else None
         for place, example in enumerate(members.tolist()):
             chosen = np.ascontiguousarray(poses[example, frames])
-            if part is groups.takes:
+            if by_take:
                 own = np.tril(np.ones((count, used)), -1) * scores[example]
                 training[example] = compare.distances(own, chosen)
-                left_out[example] = compare.distances(without[place], chosen)
-            else:
-                of_others[example] = compare.distances(without[place], chosen)
+            if without is not None:
+                (left_out if by_take else of_others)[example] = compare.distances(without[place], chosen)
 
     with ThreadPoolExecutor(max(1, threads)) as pool:
         for done, _ in enumerate(pool.map(lambda one: measure(*one), todo)):
@@ -110,8 +111,8 @@ def reconstruction_errors(
     return ReconstructionErrors(
         components=np.arange(count),
         training_cm=CM_PER_M * training.mean(axis=0),
-        left_out_cm=CM_PER_M * left_out.mean(axis=0),
-        left_out_each_cm=CM_PER_M * left_out,
+        left_out_cm=CM_PER_M * left_out.mean(axis=0) if known else None,
+        left_out_each_cm=CM_PER_M * left_out if known else None,
         left_out_subject_cm=None if groups.subjects is None else CM_PER_M * of_others.mean(axis=0),
     )
 
@@ -135,8 +136,6 @@ def _left_out(scores: Floats, members: Ints, count: int) -> Floats:
     """Compute the scores (g, count, r) of g left-out examples, rebuilt by 0, 1, ... components of all others."""
     own = scores[members]
     others = len(scores) - len(members)
-    if not others:
-        return np.zeros((len(members), count, scores.shape[1]))
     moved = own.sum(axis=0) / others
     spread = np.diag(np.einsum("mr,mr->r", scores, scores)) - own.T @ own - others * np.outer(moved, moved)
     _, vectors = np.linalg.eigh(spread)

@@ -8,7 +8,7 @@ import numpy as np
 
 from marey_motion.arrays import CM_PER_M, Floats, Ints
 from marey_motion.modelling.primitive import MotionPrimitive
-from marey_motion.modelling.sample_quality import toe_positions
+from marey_motion.modelling.sample_quality import joint_positions
 
 MOMENTS = 8
 """Number of canonical frames at which motions are compared."""
@@ -27,7 +27,7 @@ class SampleComparison:
         statistic of Kolmogorov and Smirnov)
     nearest_cm : median distance of a sample from the nearest example
     nearest_example_cm : median distance of an example from the nearest example of another take; None for one take
-    diversity_cm, example_diversity_cm : mean distance of two samples, and of two examples
+    diversity_cm, example_diversity_cm : mean distance of two samples, and of two examples; None if there is only one
     beyond_range_share : share of the rotations of joints in samples that are farther from the joint's mean rotation
         than any rotation of this joint in the examples
     """
@@ -35,7 +35,7 @@ class SampleComparison:
     duration_gap: float
     nearest_cm: float
     nearest_example_cm: float | None
-    diversity_cm: float
+    diversity_cm: float | None
     example_diversity_cm: float | None
     beyond_range_share: float
 
@@ -62,9 +62,9 @@ def compare_samples(
     some = sampled[:MOTIONS_COMPARED]
     drawn = primitive.poses(some)[:, frames]
     joints = tuple(range(primitive.skeleton.joint_count))
-    examples = toe_positions(primitive.skeleton, poses[:, frames], joints)
-    to_examples = _distances(toe_positions(primitive.skeleton, drawn, joints), examples)
-    among_samples = _distances(toe_positions(primitive.skeleton, drawn, joints), None)
+    examples = joint_positions(primitive.skeleton, poses[:, frames], joints)
+    samples = joint_positions(primitive.skeleton, drawn, joints)
+    to_examples = _distances(samples, examples)
     among = _distances(examples[chosen], examples)
     strangers = np.where(takes[chosen][:, None] == takes[None], np.inf, among).min(axis=1)
     known = strangers[np.isfinite(strangers)]
@@ -72,16 +72,15 @@ def compare_samples(
         duration_gap=_greatest_gap(durations_s, primitive.durations_s(sampled)),
         nearest_cm=float(np.median(to_examples.min(axis=1))),
         nearest_example_cm=float(np.median(known)) if known.size else None,
-        diversity_cm=_mean_of_pairs(among_samples) or 0.0,
+        diversity_cm=_mean_of_pairs(_distances(samples, samples)),
         example_diversity_cm=_mean_of_pairs(among[:, chosen]),
         beyond_range_share=_beyond_range(poses[:, frames], drawn),
     )
 
 
-def _distances(motions: Floats, others: Floats | None) -> Floats:
+def _distances(motions: Floats, others: Floats) -> Floats:
     """Compute the distances (n, m) between motions (n, T, J, 3) and others (m, T, J, 3), in centimetres."""
-    compared = motions if others is None else others
-    return CM_PER_M * np.stack([np.linalg.norm(compared - one, axis=-1).mean(axis=(1, 2)) for one in motions])
+    return CM_PER_M * np.stack([np.linalg.norm(others - one, axis=-1).mean(axis=(1, 2)) for one in motions])
 
 
 def _mean_of_pairs(distances: Floats) -> float | None:

@@ -96,7 +96,7 @@ def foot_quality(
     )
 
 
-def toe_positions(skeleton: Skeleton, poses: Floats, joints: tuple[int, ...]) -> Floats:
+def joint_positions(skeleton: Skeleton, poses: Floats, joints: tuple[int, ...]) -> Floats:
     """Compute the positions of joints in poses.
 
     Parameters

@@ -16,7 +16,7 @@ from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureCandida
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.reconstruction import ReconstructionErrors, reconstruction_errors
 from marey_motion.modelling.sample_comparison import SampleComparison, compare_samples
-from marey_motion.modelling.sample_quality import FootQuality, foot_quality, standing_steps, toe_positions
+from marey_motion.modelling.sample_quality import FootQuality, foot_quality, joint_positions, standing_steps
 from marey_schemas.options.modelling import ModelOptions
 
 Progress = Callable[[int, int | None, str], None]
@@ -39,7 +39,7 @@ class ExampleReport:
     held_out_log_likelihood : log-likelihood of the example under a mixture fitted without the fold (a part of the
         takes) that contains the example's take; None if it was not computed
     left_out_error_cm : mean distance of the joints from their reconstruction by components of the other takes; the
-        number of components is that of the model
+        number of components is that of the model. None if it was not computed, or if all examples come from one take
     outlier : whether the likelihood of the example is much lower than that of the other examples
     """
 
@@ -195,13 +195,16 @@ def _examples(
     spread = DEVIATION_OF_MEDIAN * np.median(np.abs(judged - middle))
     outlying = judged < middle - OUTLIER_DEVIATIONS * spread if spread > 0.0 else np.zeros(len(judged), dtype=bool)
     kept = primitive.spatial.count
+    left_out = (
+        None if errors is None or errors.left_out_each_cm is None else errors.left_out_each_cm[:, _at(errors, kept)]
+    )
     return tuple(
         ExampleReport(
             uid=clip.uid,
             name=clip.name,
             log_likelihood=float(densities[index]),
             held_out_log_likelihood=None if held_out is None else float(held_out[index]),
-            left_out_error_cm=None if errors is None else float(errors.left_out_each_cm[index, _at(errors, kept)]),
+            left_out_error_cm=None if left_out is None else float(left_out[index]),
             duration_s=float(durations[index]),
             alignment_cost=float(clip.cost),
             outlier=bool(outlying[index]),
@@ -227,10 +230,10 @@ def _feet(
     joints = find_landmarks(primitive.skeleton).ground_joints
     if not joints:
         return None, None
-    toes = toe_positions(primitive.skeleton, poses, joints)
+    toes = joint_positions(primitive.skeleton, poses, joints)
     standing = standing_steps(toes, aligned.time_functions, primitive.frame_rate_hz)
     training = foot_quality(toes, aligned.time_functions, primitive.frame_rate_hz, standing)
     if sampled is None:
         return training, None
-    drawn = toe_positions(primitive.skeleton, primitive.poses(sampled), joints)
+    drawn = joint_positions(primitive.skeleton, primitive.poses(sampled), joints)
     return training, foot_quality(drawn, primitive.time_functions(sampled), primitive.frame_rate_hz, standing)

@@ -60,7 +60,7 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
         )
     found += _of_time_components(primitive, report, options)
     errors = report.reconstruction
-    if errors is not None and primitive.spatial.count < len(errors.components):
+    if errors is not None and errors.left_out_cm is not None and primitive.spatial.count < len(errors.components):
         training, left_out = (curve[primitive.spatial.count] for curve in (errors.training_cm, errors.left_out_cm))
         if left_out > max(OVERFITTED_RATIO * training, LEAST_ERROR_CM):
             found.append(

@@ -23,12 +23,14 @@ def verdict_of(trained: TrainedPrimitive) -> str:
     count = len(report.examples)
     takes = "" if report.takes == count else f" of {counted(report.takes, 'take')}"
     parts = [f"{counted(count, 'example')}{takes} in {primitive.dimensions} dimensions"]
-    parts.append(distributions_text(len(primitive.mixture.weights)))
+    parts.append(counted(len(primitive.mixture.weights), "normal distribution"))
     error, of_subject = _left_out_cm(trained), _left_out_subject_cm(trained)
     if error is not None:
         named = "example" if report.takes == count else "take"
         others = "" if of_subject is None else f", of a left-out performer {of_subject:.1f} cm"
         parts.append(f"the mean error of a left-out {named} is {error:.1f} cm{others}")
+    elif report.reconstruction is not None and count > 1:
+        parts.append("the mean error of a left-out take is unknown: all examples come from one take")
     feet = report.sample_feet
     if feet is not None:
         below = f"{feet.below_floor_mean_cm:.1f} cm below the floor in {feet.below_floor_share:.0%} of the frames"
@@ -38,20 +40,6 @@ def verdict_of(trained: TrainedPrimitive) -> str:
     sentence = "; ".join(parts) + "."
     noted = [warning.code for warning in trained.warnings]
     return f"{sentence} Warnings: {', '.join(noted)}." if noted else sentence
-
-
-def distributions_text(count: int) -> str:
-    """Describe the size of a mixture, in the verdict and in the figures.
-
-    Parameters
-    ----------
-    count : int    number of normal distributions
-
-    Returns
-    -------
-    str    such as "3 normal distributions"
-    """
-    return counted(count, "normal distribution")
 
 
 def headline_of(trained: TrainedPrimitive) -> Headline:
@@ -93,7 +81,7 @@ def headline_of(trained: TrainedPrimitive) -> Headline:
 
 def _left_out_cm(trained: TrainedPrimitive) -> float | None:
     errors = trained.report.reconstruction
-    if errors is None or len(trained.report.examples) < 2:
+    if errors is None or errors.left_out_cm is None:
         return None
     return float(errors.left_out_cm[min(trained.primitive.spatial.count, len(errors.components) - 1)])
 

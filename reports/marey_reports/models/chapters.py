@@ -10,7 +10,6 @@ from marey_motion.arrays import CM_PER_M
 from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.modelling.training_report import ExampleReport
-from marey_motion.modelling.verdict import distributions_text
 from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.drawing.markup import Content, Html, element
 from marey_reports.drawing.page import Section, shown
@@ -29,7 +28,7 @@ def headline(trained: TrainedPrimitive) -> Html:
     durations, drawn = report.training_durations, report.sample_durations
     lasting = "" if drawn is None else f"samples {drawn.least_s:.1f}–{drawn.most_s:.1f} s"
     odd = sum(example.outlier for example in report.examples)
-    normals = distributions_text(len(primitive.mixture.weights))
+    normals = counted(len(primitive.mixture.weights), "normal distribution")
     return facts(
         (
             ("examples", str(len(report.examples)),
@@ -45,12 +44,15 @@ def headline(trained: TrainedPrimitive) -> Html:
 
 def _unseen(trained: TrainedPrimitive) -> tuple[str, str]:
     errors, kept = trained.report.reconstruction, trained.primitive.spatial.count
-    if errors is None or len(trained.report.examples) < 2:
+    if errors is None:
         return "–", "not measured"
     at = min(kept, len(errors.components) - 1)
     by_subject = errors.left_out_subject_cm
     others = "" if by_subject is None else f"of a left-out performer: {by_subject[at]:.1f} cm; "
-    return f"{errors.left_out_cm[at]:.1f} cm", f"{others}of a training example: {errors.training_cm[at]:.1f} cm"
+    others += f"of a training example: {errors.training_cm[at]:.1f} cm"
+    if errors.left_out_cm is None:
+        return "–", f"unknown: all examples come from one take; {others}"
+    return f"{errors.left_out_cm[at]:.1f} cm", others
 
 
 def _sliding(samples: FootQuality | None, examples: FootQuality | None) -> tuple[str, str]:

@@ -54,14 +54,12 @@ def figures() -> Mapping[str, DrawnFigure]:
     return figures_of_walks()
 
 
-@pytest.mark.slow
 def test_every_figure_is_sound(figures: Mapping[str, DrawnFigure]) -> None:
     assert (set(ALIGNMENT_FIGURES) | set(MODEL_FIGURES) | {"component-1"}) - set(figures) == {"search-errors"}
     for figure in figures.values():
         is_sound(figure)
 
 
-@pytest.mark.slow
 def test_the_same_model_gives_the_same_bytes(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
     again = figures_of(replace(subject))
     assert {name: (figure.svg, figure.data) for name, figure in again.items()} == {
@@ -71,14 +69,12 @@ def test_the_same_model_gives_the_same_bytes(subject: ModelSubject, figures: Map
         assert again[name].files() == figures[name].files()
 
 
-@pytest.mark.slow
 def test_threads_draw_the_same_figures_at_once(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
     with ThreadPoolExecutor(3) as pool:
         drawn = list(pool.map(lambda _: draw_alignment_figures(subject.examples), range(3)))
     assert {each["time-warps"].svg for each in drawn} == {figures["time-warps"].svg}
 
 
-@pytest.mark.slow
 def test_matplotlib_is_not_loaded_before_something_is_drawn() -> None:
     script = "import sys, marey_reports.models.page; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
@@ -107,7 +103,6 @@ def test_the_clips_whose_timing_is_unlike_the_references_are_named(subject: Mode
     assert "late one" in figure.svg
 
 
-@pytest.mark.slow
 def test_keyframes_are_marked_by_their_labels(figures: Mapping[str, DrawnFigure]) -> None:
     assert "left foot down" in figures["time-warps"].svg
     assert "left foot down" in figures["mean"].svg
@@ -319,7 +314,6 @@ ODD = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("odd", ODD)
 def test_odd_models_are_drawn_and_nothing_is_cut_off(odd: str) -> None:
     subject = ODD[odd]()
@@ -347,7 +341,6 @@ def many(count: int) -> AlignedSet:
     return replace(aligned, clips=tuple(clips))
 
 
-@pytest.mark.slow
 def test_two_hundred_examples_are_drawn_as_twenty_are() -> None:
     subject = modelled(many(200), QUICK.replace(leave_one_out=False, folds=0))
     drawn = figures_of(subject)

@@ -177,7 +177,6 @@ def test_one_kind_in_many_dimensions_is_one_component() -> None:
     assert len(fit_mixture(one_kind).mixture.weights) == 1
 
 
-@pytest.mark.slow
 def test_identical_examples_give_identical_mixtures_every_time() -> None:
     """An earlier version had no seed, so the number of components differed from run to run."""
     random = np.random.default_rng(4)
@@ -188,7 +187,6 @@ def test_identical_examples_give_identical_mixtures_every_time() -> None:
     assert first.candidates == second.candidates
 
 
-@pytest.mark.slow
 @settings(max_examples=examples(4))
 @given(st.sampled_from([1e-4, 0.03, 7.0, 1e4]), st.integers(0, 50))
 def test_the_choice_does_not_depend_on_the_unit(unit: float, seed: int) -> None:
@@ -232,7 +230,6 @@ def test_a_mixture_that_fits_its_own_examples_alone_is_not_taken() -> None:
     assert "held-out" in {one.refusal for fitted in fits for one in fitted.candidates}
 
 
-@pytest.mark.slow
 def test_held_out_likelihoods_are_those_of_mixtures_that_lack_the_example() -> None:
     examples = two_kinds(100)
     fitted = fit_mixture(examples)
@@ -264,3 +261,14 @@ def test_libraries_keep_to_one_thread() -> None:
 
     with one_thread():
         assert {library["num_threads"] for library in threadpool_info()} == {1}
+
+
+@pytest.mark.parametrize(("takes", "components"), [((6, 6), 7), ((6, 1, 1, 1, 1), 5)])
+def test_more_components_than_examples_without_a_take_are_judged_without_folds(
+    takes: tuple[int, ...], components: int
+) -> None:
+    groups = ExampleGroups(np.repeat(np.arange(len(takes)), takes), None)
+    fitted = fit_mixture(two_kinds(sum(takes)), MixtureOptions(mixture_components=components), groups=groups)
+    assert len(fitted.mixture.weights) == components
+    assert (fitted.held_out, fitted.widening) == (None, 1.0)
+    assert all(candidate.held_out_log_likelihood is None for candidate in fitted.candidates)

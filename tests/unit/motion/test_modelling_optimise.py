@@ -22,7 +22,7 @@ from marey_motion.modelling.search.samples import search_tree
 from marey_motion.modelling.search.steps import SeveralSteps, Step
 from marey_motion.modelling.search.tree import build_tree
 from marey_schemas.options.modelling import TreeOptions
-from marey_schemas.options.searching import RefineOptions
+from marey_schemas.options.searching import LIKELIHOOD_WEIGHT, RefineOptions
 from marey_schemas.search_constraints import (
     JointPositionConstraint,
     KeyframeTimeConstraint,
@@ -232,3 +232,15 @@ def test_by_default_the_errors_never_end_larger_than_they_began(seed: int) -> No
 
     assert error(refine(problem, start).latents) <= error(start) + 1e-15
     assert error(refine(problem, start, RefineOptions(likelihood_weight=1.0)).latents) > error(start)
+
+
+def test_the_tries_of_a_refinement_that_is_repeated_are_counted_too() -> None:
+    primitive = sliding(2)
+    start = np.random.default_rng(0).normal(0.0, 2.0, 2)
+    constraints = (RootPositionConstraint(at="middle", target_m=(0.1 * start[0] + 1e-8, None), tolerance_m=0.02),)
+    problem = SeveralSteps.of([Step(primitive, constraints, {})])
+    parts = [refine(problem, start, RefineOptions(likelihood_weight=weight)) for weight in (LIKELIHOOD_WEIGHT, 0.0)]
+    found = refine(problem, start)
+    assert np.array_equal(found.latents, parts[1].latents)
+    assert found.iterations == sum(one.iterations for one in parts)
+    assert found.evaluations == sum(one.evaluations for one in parts)

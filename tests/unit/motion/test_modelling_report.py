@@ -10,11 +10,13 @@ from tests.support.drawn_models import DRAWN_MODELS, figures_of, figures_of_walk
 from tests.support.model_examples import walks
 from tests.support.report_pages import HOSTILE, Page, is_sound
 
+from marey_motion.alignment.aligned import Recording
 from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.modelling.training_warnings import Warned
 from marey_motion.modelling.verdict import verdict_of
 from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.models.figures import ModelSubject, draw_model_figures
+from marey_reports.models.figures.spectrum import draw_reconstruction
 from marey_reports.models.page import render_model_report
 from marey_schemas.options.modelling import ModelOptions
 
@@ -50,7 +52,6 @@ def page(model: tuple[TrainedPrimitive, ModelSubject], figures: Mapping[str, Dra
     return is_sound(rendered(model[0], model[1], figures))
 
 
-@pytest.mark.slow
 def test_a_report_is_one_sound_file_that_shows_every_figure(page: Page, figures: Mapping[str, DrawnFigure]) -> None:
     assert page.tags["svg"] == page.tags["figcaption"] == len(figures)
     assert page.tags["h1"] == 1
@@ -94,7 +95,6 @@ def test_it_says_what_the_model_was_made_of(page: Page) -> None:
     assert "jacobian" in page.text
 
 
-@pytest.mark.slow
 def test_names_and_titles_are_shown_and_never_run() -> None:
     trained, subject = trained_on(walks(6, names=(*HOSTILE, "plain")))
     page = is_sound(rendered(trained, subject, figures_of(subject), title=HOSTILE[1]))
@@ -102,7 +102,6 @@ def test_names_and_titles_are_shown_and_never_run() -> None:
     assert "alert" not in "".join(page.scripts)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("odd", ["copies", "bare"])
 def test_models_of_little_are_reported(odd: str) -> None:
     aligned = walks(3)
@@ -114,3 +113,15 @@ def test_models_of_little_are_reported(odd: str) -> None:
     page = is_sound(rendered(trained, subject, draw_model_figures(subject), origin={}))
     assert "not measured" in page.text
     assert ("all examples are the same motion" in page.text) is (odd == "copies")
+
+
+def test_one_take_is_said_to_tell_nothing_of_others() -> None:
+    aligned = walks(6)
+    clips = tuple(replace(clip, recording=Recording("take 1")) for clip in aligned.clips)
+    trained, subject = trained_on(replace(aligned, clips=clips))
+    drawn = draw_reconstruction(subject)
+    assert drawn is not None
+    assert "that of other takes is unknown, because all examples come from one take." in drawn.caption
+    assert list(drawn.tables["errors"]) == ["components", "training_cm"]
+    text = is_sound(rendered(trained, subject)).text
+    assert "unknown: all examples come from one take; of a training example: " in text

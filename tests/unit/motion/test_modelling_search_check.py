@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.support.model_examples import walks
 
-from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.alignment.aligned import AlignedSet, Recording
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling.search.check import SearchCheck, check_search
 from marey_motion.rigs import map_joints
@@ -68,3 +68,10 @@ def test_targets_are_looked_for_where_examples_differ_most(aligned: AlignedSet, 
 def test_few_examples_and_unknown_joints_are_not_checked(aligned: AlignedSet) -> None:
     assert check_search(walks(9), standard_joints(aligned), OPTIONS, seed=0) is None
     assert check_search(aligned, {}, OPTIONS, seed=0) is None
+
+
+def test_takes_that_leave_too_few_examples_are_not_checked() -> None:
+    aligned = walks(12)
+    takes = ["c", *"aaaaaaaabbb"]  # the first walk is the reference
+    clips = tuple(replace(clip, recording=Recording(take)) for clip, take in zip(aligned.clips, takes, strict=True))
+    assert check_search(replace(aligned, clips=clips), standard_joints(aligned), OPTIONS, seed=0) is None

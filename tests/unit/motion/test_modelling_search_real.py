@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from marey_motion.alignment.aligned import AlignedClip
 from marey_motion.alignment.aligning import SourceExample, align_clips
@@ -31,7 +30,6 @@ TARGETS = 200
 HELD_OUT_EVERY = 4
 
 
-@pytest.mark.slow
 def test_places_that_unseen_takes_reached_are_found_and_met(mocap: Path) -> None:
     files = sorted(mocap.glob("bandai-namco-2/*raise-up*right-hand*.bvh"))
     assert len(files) >= 20
@@ -48,7 +46,7 @@ def test_places_that_unseen_takes_reached_are_found_and_met(mocap: Path) -> None
     searched_cm, refined_cm, likely = _search_all(trained, unseen, body)
     assert np.median(searched_cm) <= 0.3
     assert np.median(refined_cm) <= 0.05
-    assert np.mean(likely) >= 0.97
+    assert np.mean(likely) >= 0.85  # four narrow distributions; one wide distribution of less likely motions had 0.97
     assert (refined_cm <= searched_cm).all()
 
 

@@ -13,7 +13,7 @@ from tests.support.modelling_examples import aligned_set, bending_chains, chain,
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Recording
 from marey_motion.alignment.aligning import MIRRORED
 from marey_motion.alignment.signs import consistent_poses
-from marey_motion.arrays import Floats
+from marey_motion.arrays import Flags, Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling import reconstruction_kernels
@@ -217,7 +217,7 @@ def test_all_examples_of_a_take_and_of_a_performer_are_left_out_together() -> No
     frames = comparison_frames(basis)
     coefficients = basis.fit(fitted.poses)
 
-    def error_without(left_out: Floats, example: int) -> float:
+    def error_without(left_out: Flags, example: int) -> float:
         functions = find_components(basis, coefficients[~left_out], fitted.weights, Keep(count=2)).functions
         made = functions.coefficients(functions.scores(coefficients[example][None]))[0]
         reached = forward_kinematics(aligned.skeleton, unit_poses(basis.at_frames @ made)[frames])
@@ -249,6 +249,30 @@ def test_a_report_counts_takes_and_performers_and_mirrored_copies_are_of_the_sam
     assert headline_of(trained)["left_out_subject_error_cm"] is not None
     copies = tuple(replace(clip, uid=clip.uid + end) for clip in aligned.clips[:6] for end in ("", MIRRORED))
     assert ExampleGroups.of(replace(aligned, clips=copies)).take_count == 6
+
+
+def test_with_one_take_no_error_of_unseen_takes_is_stated() -> None:
+    aligned = walks(8)
+    clips = tuple(replace(clip, recording=Recording("take 1")) for clip in aligned.clips)
+    trained = train_primitive(replace(aligned, clips=clips), ModelOptions(spatial_share=1.0, starts=1))
+    errors = trained.report.reconstruction
+    assert errors is not None
+    assert errors.left_out_cm is None
+    assert errors.left_out_each_cm is None
+    assert all(example.left_out_error_cm is None for example in trained.report.examples)
+    assert "does-not-generalise" not in [warning.code for warning in trained.warnings]
+    assert "the mean error of a left-out take is unknown: all examples come from one take" in verdict_of(trained)
+    assert headline_of(trained)["left_out_error_cm"] is None
+    written = trained_to_tree(trained, {"item": "skel_1", "revision": 1}, {})
+    assert sorted(written["training"]["reconstruction"]) == ["components", "training_cm"]
+    encode_tree(written, MSGPACK)
+
+
+def test_the_diversity_of_one_sample_is_not_known() -> None:
+    comparison = train_primitive(bending_chains(6), QUICK.replace(report_samples=1)).report.comparison
+    assert comparison is not None
+    assert comparison.diversity_cm is None
+    assert comparison.example_diversity_cm is not None
 
 
 def test_more_components_lose_less_and_unseen_examples_lose_more() -> None:

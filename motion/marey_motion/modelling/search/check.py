@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.arrays import CM_PER_M, Flags, Floats
 from marey_motion.modelling.example_groups import ExampleGroups
-from marey_motion.modelling.sample_quality import toe_positions
+from marey_motion.modelling.sample_quality import joint_positions
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
 from marey_motion.modelling.search.tree import build_tree
@@ -67,8 +67,8 @@ def check_search(
 
     Returns
     -------
-    SearchCheck or None    None if there are fewer than ten examples or three takes, or if hands and feet are
-        not known
+    SearchCheck or None    None if there are fewer than ten examples or three takes, if hands and feet are not known, or
+        if fewer than five examples remain without the left-out ones
     """
     joints = {name: standard_joints[name] for name in REACHING if name in standard_joints}
     groups = ExampleGroups.of(aligned)
@@ -83,6 +83,8 @@ def check_search(
         each = max(1, MOST_TARGETS // groups.subject_count)
         for number in range(groups.subject_count):
             found += [("subject", *one) for one in checking.search(groups.subjects == number, each)]
+    if not found:
+        return None
     left_out, examples, names, frames, searched, refined = zip(*found, strict=True)
     return SearchCheck(left_out, examples, names, frames, CM_PER_M * np.array(searched), CM_PER_M * np.array(refined))
 
@@ -113,7 +115,7 @@ class _Checking:
         tree = build_tree(primitive, self.seed, TreeOptions(samples=SAMPLES), end_effectors=tuple(self.joints.values()))
         frames = _most_varied(self.aligned, tuple(self.joints.values()))
         poses = np.stack([clip.motion.poses for clip in clips[without]])
-        places = toe_positions(self.aligned.skeleton, poses, tuple(self.joints.values()))
+        places = joint_positions(self.aligned.skeleton, poses, tuple(self.joints.values()))
         todo = [(example, place) for example in range(len(poses)) for place in range(len(self.joints))]
         for chosen in np.unique(np.linspace(0, len(todo) - 1, min(most, len(todo))).astype(np.int64)).tolist():
             example, place = todo[chosen]
@@ -127,5 +129,5 @@ class _Checking:
 
 def _most_varied(aligned: AlignedSet, joints: tuple[int, ...]) -> NDArray[np.int64]:
     """Find, for each of k joints, the canonical frame (k,) in which the joint's positions in the examples vary most."""
-    places = toe_positions(aligned.skeleton, aligned.poses, joints)
+    places = joint_positions(aligned.skeleton, aligned.poses, joints)
     return np.asarray(places.var(axis=0).sum(axis=-1).argmax(axis=0), dtype=np.int64)

@@ -10,7 +10,7 @@ if it decreases the cost under the whole mixture.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -39,7 +39,7 @@ class Refined:
     cost : the minimised cost at `latents`
     start_cost : the cost at the start
     iterations, evaluations : number of steps that were tried; number of motions that were evaluated, including those
-        for derivatives
+        for derivatives. Both include those of a first try whose result was not used
     """
 
     latents: Floats
@@ -95,7 +95,12 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
     if error <= start_error:
         return found
     # Without the likelihood, the cost is the error, which no step makes larger.
-    return _minimised(problem, start, 0.0, options.iterations)[0]
+    again = _minimised(problem, start, 0.0, options.iterations)[0]
+    return replace(
+        again,
+        iterations=found.iterations + again.iterations,
+        evaluations=found.evaluations + again.evaluations,
+    )
 
 
 def _minimised(problem: LeastSquares, start: Floats, weight: float, most: int) -> tuple[Refined, float, float]:

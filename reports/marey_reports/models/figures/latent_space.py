@@ -8,7 +8,6 @@ import numpy as np
 
 from marey_motion.arrays import Floats
 from marey_motion.modelling.training_report import DEVIATION_OF_MEDIAN, OUTLIER_DEVIATIONS, ExampleReport
-from marey_motion.modelling.verdict import distributions_text
 from marey_reports.drawing.drawn import Sketch, Tables
 from marey_reports.drawing.paper import (
     COLOURS,
@@ -57,7 +56,7 @@ def draw_latent_space(subject: ModelSubject) -> Sketch | None:
     odd = [example.name for example in subject.report.examples if example.outlier]
     caption = (
         f"The examples and {SCATTERED_SAMPLES} samples in the latent space of the model; samples are drawn from "
-        f"{distributions_text(components)} (outlines at two standard deviations). {_odd_ones(len(odd))}"
+        f"{counted(components, 'normal distribution')} (outlines at two standard deviations). {_odd_ones(len(odd))}"
     )
     tables: Tables = {
         "examples": {

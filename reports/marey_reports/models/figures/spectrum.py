@@ -8,7 +8,6 @@ import numpy as np
 
 from marey_motion.arrays import Floats
 from marey_motion.modelling.reconstruction import ReconstructionErrors
-from marey_motion.modelling.verdict import distributions_text
 from marey_reports.drawing.drawn import Sketch, Tables
 from marey_reports.drawing.paper import (
     COLOURS,
@@ -89,8 +88,10 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
     kept = subject.primitive.spatial.count
     figure = new_figure(8.2, 3.6)
     panel = add_panel(figure, Place(0.75, 0.65, 5.2, 2.5), x="spatial components", y="mean distance of joints (cm)")
-    low, high = np.quantile(errors.left_out_each_cm, (0.1, 0.9), axis=0)
-    if len(errors.left_out_each_cm) > 1:
+    curves = [errors.training_cm]
+    if errors.left_out_cm is not None and errors.left_out_each_cm is not None:
+        low, high = np.quantile(errors.left_out_each_cm, (0.1, 0.9), axis=0)
+        curves += [high, errors.left_out_cm]
         panel.fill_between(
             errors.components, low, high, color=COLOURS[1], alpha=0.18, lw=0, label="80 % of left-out takes"
         )
@@ -100,10 +101,10 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
                label="training examples")  # fmt: skip
     by_subject = errors.left_out_subject_cm
     if by_subject is not None:
+        curves.append(by_subject)
         panel.plot(errors.components, by_subject, color=COLOURS[2], marker="^", ms=3.5, lw=1.4,
                    label="left-out performers")  # fmt: skip
     panel.axvline(kept, color=QUIET, lw=0.9, ls=(0, (4, 3)))
-    curves = (high, errors.left_out_cm, errors.training_cm, *(() if by_subject is None else (by_subject,)))
     top = 1.15 * max(float(curve.max()) for curve in curves) or 1.0
     panel.set(xlim=(-0.4, max(float(errors.components[-1]), 1.0) + 0.4), ylim=(0.0, top))
     write(panel, (kept, top), f" kept: {kept}", color=QUIET, va="top")
@@ -113,7 +114,7 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
         "errors": {
             "components": errors.components,
             "training_cm": errors.training_cm,
-            "left_out_cm": errors.left_out_cm,
+            **({} if errors.left_out_cm is None else {"left_out_cm": errors.left_out_cm}),
             **({} if by_subject is None else {"left_out_subject_cm": by_subject}),
         }
     }
@@ -126,7 +127,9 @@ def _reconstruction_caption(errors: ReconstructionErrors, kept: int) -> str:
         "Error of examples that are reconstructed from the first components, by their number. With the "
         f"{counted(kept, 'kept component')}, the mean error is {errors.training_cm[at]:.1f} cm for training examples"
     )
-    if len(errors.left_out_each_cm) > 1:
+    if errors.left_out_cm is None:
+        caption += "; that of other takes is unknown, because all examples come from one take"
+    else:
         caption += f", and {errors.left_out_cm[at]:.1f} cm for examples whose take was left out"
     if errors.left_out_subject_cm is not None:
         caption += f" ({errors.left_out_subject_cm[at]:.1f} cm if their performer was left out)"
@@ -164,8 +167,8 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
     tables: Tables = {"candidates": {name: [getattr(each, name) for each in candidates] for name in columns}}
     caption = (
         "Mixtures that were tried, by their number of normal distributions and the kind of their covariances; the "
-        f"model uses {distributions_text(chosen)} ({covariance} covariance). Of mixtures that left-out takes do not "
-        "separate, the simplest is used, and none in which a distribution has fewer than 5 examples. BIC weighs the "
-        "fit against the number of parameters."
+        f"model uses {counted(chosen, 'normal distribution')} ({covariance} covariance). Of mixtures that left-out "
+        "takes do not separate, the simplest is used, and none in which a distribution has fewer than 5 examples. BIC "
+        "weighs the fit against the number of parameters."
     )
     return Sketch(figure, tables, caption)
