@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Flags, Floats
 from marey_motion.editing.compute_budget import PER_NUMBER, PER_PLANTED_NUMBER, PER_RIG
 from marey_motion.editing.constraining import Constraint, constrain_motion, current_values
 from marey_motion.editing.foot_plants import Foot, FootContacts, find_contacts, find_feet
@@ -91,25 +92,32 @@ def constrain(take: Take, command: Constrain) -> Take:
 def _contradictions(constraints: Sequence[Constraint]) -> list[str]:
     """Name pairs of constraints that want a joint in two places, or in two orientations, in the same frames."""
     told = []
+    values = [one.target.values for one in constraints]
     for (first, a), (second, b) in combinations(enumerate(constraints), 2):
         start, stop = max(a.start, b.start), min(a.stop, b.stop)
-        if start < stop and a.target.joint == b.target.joint and _apart(a.target, b.target):
+        if start >= stop or a.target.joint != b.target.joint:
+            continue
+        common = (
+            own if len(own) == 1 else own[start - one.start : stop - one.start]
+            for one, own in ((a, values[first]), (b, values[second]))
+        )
+        apart = start + np.flatnonzero(np.broadcast_to(_apart(a.target, b.target, *common), stop - start))
+        if apart.size:
             told.append(
-                f"constraints[{first}] and constraints[{second}] contradict each other in the frames {start}:{stop}; "
-                "the result is between them, by their weights"
+                f"constraints[{first}] and constraints[{second}] contradict each other in the frames "
+                f"{apart[0]}:{apart[-1] + 1}; the result is between them, by their weights"
             )
     return told
 
 
-def _apart(a: Target, b: Target) -> bool:
-    """Return whether two targets of one joint cannot both be met, judging by their first values."""
-    if isinstance(a, PositionTarget) and isinstance(b, PositionTarget):
+def _apart(a: Target, b: Target, of_a: Floats, of_b: Floats) -> Flags:
+    """Mark the frames (F or 1) in which the values (F or 1, 3 or 4) of two targets of one joint cannot both be met."""
+    if isinstance(a, PositionTarget) and isinstance(b, PositionTarget) and np.allclose(a.offset, b.offset):
         axes = ["xyz".index(axis) for axis in a.axes if axis in b.axes]
-        same_point = np.allclose(a.offset, b.offset)
-        return bool(same_point and np.abs(a.values[0] - b.values[0])[axes].max(initial=0.0) > _OPTIONS.tolerance_m)
+        return np.asarray(np.abs(of_a - of_b)[:, axes].max(axis=1, initial=0.0) > _OPTIONS.tolerance_m)
     if isinstance(a, OrientationTarget) and isinstance(b, OrientationTarget):
-        return bool(abs(float(a.values[0] @ b.values[0])) < np.cos(0.5 * _OPTIONS.tolerance_rad))
-    return False
+        return np.asarray(np.abs((of_a * of_b).sum(axis=1)) < np.cos(0.5 * _OPTIONS.tolerance_rad))
+    return np.zeros(1, dtype=np.bool_)
 
 
 def plant_feet(take: Take, command: PlantFeet) -> Take:

@@ -29,6 +29,7 @@ from marey_schemas.editing.constraints import PlantOptions
 SUNK_M = 1e-4
 """Depth of a sole below its floor, in metres, that counts as rounding."""
 MOST_LIFTS = 3
+"""Greatest number of times that feet are lifted and their legs solved again."""
 ROUNDING = 1e-9
 """Difference, in metres and in components of quaternions, up to which a foot counts as in place."""
 
@@ -98,14 +99,16 @@ def with_feet(
     now = feet_as_motion(take.skeleton, part, feet)
     apart = np.maximum(np.abs(ankles - now.translations).max(axis=-1), np.abs(spins - now.rotations).max(axis=-1))
     moved = apart.max(axis=1) > ROUNDING
+    made = _solved(take.skeleton, part, feet, ankles, spins)
     for _ in range(MOST_LIFTS):
-        made = _solved(take.skeleton, part, feet, ankles, spins)
         sunk = np.maximum(
             floors[start:stop] - heights_of_soles(take.skeleton, made, [foot.leg.end for foot in feet]), 0.0
         )
         if sunk.max(initial=0.0) < SUNK_M:
             break
         ankles[..., 1] += sunk
+        moved |= (sunk >= SUNK_M).any(axis=1)
+        made = _solved(take.skeleton, part, feet, ankles, spins)
     rotations = motion.rotations.copy()
     rotations[start:stop][moved] = made.rotations[moved]
     return motion._replace(rotations=rotations)

@@ -125,6 +125,27 @@ def test_an_elbow_points_at_its_pole(body: Callable[[], Skeleton]) -> None:
         _constrained(clip, asked, solver="ccd")
 
 
+@pytest.mark.parametrize("place", [{}, {"shift_m": [0.0, 0.0, 0.0]}], ids=["held", "as in the source"])
+def test_an_elbow_turns_to_its_pole_where_the_wrist_is_already_in_place(place: dict[str, Any]) -> None:
+    clip = generate_gait(1.2, 0.0, 3.0)
+    shoulder, elbow, wrist = (_index(clip.skeleton, f"left_{part}") for part in ("shoulder", "elbow", "wrist"))
+    before = kinematics.global_positions(clip).astype(np.float64)
+    pole = before[90, elbow] + (0.6, 1.0, 0.0)
+    edited = _constrained(
+        clip, {"kind": "position", "joint": "left_wrist", "frames": [90, 110], "pole_m": pole.tolist(), **place}
+    )
+    after = kinematics.global_positions(edited).astype(np.float64)
+    for frame in (90, 100, 109):
+        line = after[frame, wrist] - after[frame, shoulder]
+        line /= np.linalg.norm(line)
+        ways = np.stack((after[frame, elbow] - after[frame, shoulder], pole - after[frame, shoulder]))
+        ways -= (ways @ line)[:, None] * line
+        ways /= np.linalg.norm(ways, axis=1)[:, None]
+        assert ways[0] @ ways[1] > 0.99
+    steps = np.linalg.norm(np.diff(after[:, elbow], axis=0), axis=1)
+    assert steps.max() < 0.08
+
+
 @pytest.mark.parametrize("body", [studio_skeleton, game_skeleton])
 def test_the_bend_of_a_hinge_is_positive_on_every_rig(body: Callable[[], Skeleton]) -> None:
     """Knees and elbows that may bend from 20 to 150 degrees are bent, and in their natural directions."""

@@ -8,8 +8,11 @@ from pydantic import ValidationError
 from tests.support.edited_takes import make_walk, under_static_root
 
 from marey_motion.clip import Clip
+from marey_motion.editing import kept_feet
 from marey_motion.editing.ground import estimate_sole, heights_of_soles
+from marey_motion.editing.kept_feet import SUNK_M, feet_as_motion, feet_of, with_feet
 from marey_motion.editing.registry import EditedClip, edit_clip
+from marey_motion.editing.take import EditedBody, Take
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
@@ -23,6 +26,10 @@ FLOOR_M = 0.02
 def _edited(clip: Clip, command: dict[str, Any], **sources: Clip) -> EditedClip:
     (made,) = edit_clip(clip, EditDocument.model_validate({"commands": [command]}).commands, sources=sources)
     return made
+
+
+def _take_of(clip: Clip) -> Take:
+    return Take(Motion.of(clip), clip.frame_rate_hz, EditedBody(clip.skeleton))
 
 
 def _soles(clip: Clip) -> np.ndarray:
@@ -75,6 +82,31 @@ def test_smoothing_lowers_no_foot_and_keeps_the_ends_and_what_it_is_not_asked_fo
     assert np.array_equal(_edited(walk, arms).clip.poses, _edited(walk, {**arms, "keep_feet": False}).clip.poses)
 
 
+def test_feet_in_place_are_lifted_to_a_floor_above_their_soles() -> None:
+    walk = make_walk(seconds=0.5)
+    take = _take_of(walk)
+    feet, motion, soles = feet_of(take), Motion.of(walk), _soles(walk)
+    floors = np.full_like(soles, 0.05)
+    floors[:10] = 0.0
+    made = with_feet(take, motion, feet, feet_as_motion(walk.skeleton, motion, feet), floors, slice(None))
+    lifted = heights_of_soles(walk.skeleton, made, [foot.leg.end for foot in feet])
+    assert soles[10:].min() < FLOOR_M + 1e-3
+    assert lifted[10:].min() > 0.05 - SUNK_M
+    assert np.array_equal(made.rotations[:10], motion.rotations[:10])
+
+
+def test_the_last_lift_of_feet_is_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_feet, "MOST_LIFTS", 1)
+    walk = make_walk(seconds=0.5)
+    take = _take_of(walk)
+    feet, motion = feet_of(take), Motion.of(walk)
+    wanted = feet_as_motion(walk.skeleton, motion, feet)
+    wanted.translations[..., 1] += 0.01
+    made = with_feet(take, motion, feet, wanted, np.full_like(_soles(walk), 0.05), slice(None))
+    lifted = heights_of_soles(walk.skeleton, made, [foot.leg.end for foot in feet])
+    assert lifted.min() > 0.05 - 1e-3
+
+
 def test_soles_come_to_the_ground_and_not_joints() -> None:
     walk = make_walk()
     lifted = _edited(walk, {"command": "translate", "shift_m": [0.0, 0.4, 0.0]}).clip
@@ -102,6 +134,15 @@ def test_what_does_not_fit_the_motion_is_told() -> None:
     assert told.startswith("constraints[0] and constraints[1] contradict each other in the frames 10:40")
     assert not warnings({"command": "constrain", "constraints": [places[0], {**places[1], "frames": [40, 60]}]})
     assert not warnings({"command": "constrain", "constraints": [places[0], places[0]]})
+    shifted = [
+        {"kind": "position", "joint": "left_wrist", "frames": frames, "shift_m": [0.0, 0.05, 0.0]}
+        for frames in ([0, 60], [30, 90])
+    ]
+    assert not warnings({"command": "constrain", "constraints": shifted})
+    (told,) = warnings(
+        {"command": "constrain", "constraints": [shifted[0], {**shifted[1], "shift_m": [0.0, 0.1, 0.0]}]}
+    )
+    assert "contradict each other in the frames 30:60" in told
     (told,) = warnings({"command": "constrain", "constraints": places[:1], "blend_s": 60.0})
     assert "the blend of 60 s is longer than the clip" in told
     (told,) = warnings({"command": "smooth", "window_s": 30.0})

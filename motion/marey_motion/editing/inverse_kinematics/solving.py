@@ -41,6 +41,10 @@ _ANYWHERE = Freedom()
 _OPTIONS = SolverOptions()
 _STILL = np.array([[1.0, 0.0, 0.0, 0.0]])
 
+# Sum of squared errors that counts as none: that of a nanometre; with a pole, that of a micrometre, because a pose that
+# meets its target already must still turn towards the pole.
+_ROUNDING, _WITH_POLE = 1e-18, 1e-12
+
 
 @dataclass(frozen=True, eq=False)
 class SolvedPoses:
@@ -317,7 +321,7 @@ def solve_two_bone(
         pole = None if position.pole is None else np.asarray(position.pole, dtype=np.float64)
         swivel_coherently(kernel_limb, problem, before, neighbours, pole)
     _measure(problem, options, found.after, found)
-    _keep_better(problem, before, found)
+    _keep_better(problem, before, found, _ROUNDING if position.pole is None else _WITH_POLE)
     return _solved(motion, problem, found)
 
 
@@ -337,14 +341,15 @@ def _kernel_limb(
     return _LimbKernel(start, middle, end, offset, hinge, float(damping_zone_rad), endings[ending])
 
 
-def _keep_better(problem: IkProblem, before: Floats, found: SolverResult) -> None:
+def _keep_better(problem: IkProblem, before: Floats, found: SolverResult, allowed: float) -> None:
     """Restore the given pose and its errors in each frame whose error was increased by the closed form.
 
-    `before` (F, K, 4) are the given local rotations. The error can increase if the wrist turns a tool away from its
-    target. In all other frames, the number of iterations is set to 1.
+    `before` (F, K, 4) are the given local rotations, and `allowed` is by how much the sum of squared errors may
+    increase. The error can increase if the wrist turns a tool away from its target. In all other frames, the number of
+    iterations is set to 1.
     """
     squares = problem.targets.scales**2
-    worse = (found.after**2) @ squares > (found.before**2) @ squares + 1e-18
+    worse = (found.after**2) @ squares > (found.before**2) @ squares + allowed
     problem.rotations[worse] = before[worse]
     found.after[worse] = found.before[worse]
     found.iterations[~worse] = 1
