@@ -93,7 +93,8 @@ class MetricChange:
 class TrialChange:
     """A trial whose records in two evaluations differ, with the first tick that differs and the mean offset in both.
 
-    `same_motion` is true if only the names of displayed clips differ and all numbers are equal.
+    Records are those of the first replicate, and offsets are means over all replicates. `same_motion` is true if only
+    the names of displayed clips differ and all numbers are equal.
     """
 
     trial: str
@@ -199,11 +200,8 @@ def paired_change(metric: str, before: Floats, after: Floats) -> MetricChange:
     if least == most == 0.0:
         low = high = 0.0
     elif count >= LEAST_REPLICATES:
-        if most - least <= SAME_CHANGE * max(abs(least), abs(most)):
-            low, high, p = least, most, 0.0
-        else:
-            _, _, low, high = mean_interval(change.tolist())
-            p = probability(change)
+        _, _, low, high = mean_interval(change.tolist())
+        p = probability(change)
     trials = int(np.count_nonzero(both.any(axis=1)))
     return MetricChange(
         metric, float(first.mean()), float(second.mean()), float(change.mean()), low, high, trials, count, p
@@ -215,14 +213,17 @@ def probability(changes: Floats) -> float:
 
     Parameters
     ----------
-    changes : (R,) float64    one change per replicate, at least two that differ
+    changes : (R,) float64    one change per replicate, not all 0
 
     Returns
     -------
-    float    0 to 1, by Student's t, for both sides
+    float    0 to 1, for both sides: by Student's t; if all changes are equal, which counts often are, by the sign test
     """
     from scipy.special import stdtr
 
+    least, most = float(changes.min()), float(changes.max())
+    if most - least <= SAME_CHANGE * max(abs(least), abs(most)):
+        return float(2.0 ** (1 - len(changes)))
     spread = float(np.std(changes, ddof=1)) / np.sqrt(len(changes))
     return float(2.0 * stdtr(len(changes) - 1, -abs(float(np.mean(changes))) / spread))
 

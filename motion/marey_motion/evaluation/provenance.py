@@ -80,7 +80,7 @@ def require_comparable(before: Provenance, after: Provenance) -> None:
 _CONDITIONS = {
     "normaliser": ("normalisers", "evaluate both with one pinned normaliser, or with one fitted on both"),
     "options": ("options", "evaluate both with the same database, controller and window"),
-    "scenarios": ("scenarios", "evaluate both over the same trials"),
+    "scenarios": ("scenarios", "evaluate both over the same trials, with the same replicates and the same seed"),
     "limits": (
         "limits of the verdict",
         "evaluate both with the same limits, and again if one of them has none, since looks were not measured then",

@@ -3,7 +3,7 @@
 A replicate differs from its trial in two things that no result should depend on: the character starts up to
 `START_S` later in the motion that the first search finds, so in another phase of its stride, and the approach is up to
 `APPROACH_S` longer. Both are drawn from a random stream that belongs to the seed, the trial and the number of the
-replicate alone, so that results depend neither on threads nor on the division into tasks. TrialReplicate 0 is the trial
+replicate alone, so that results depend neither on threads nor on the division into tasks. Replicate 0 is the trial
 itself.
 """
 
@@ -87,7 +87,7 @@ def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
 def simulate(
     database: MatchingDatabase, index: SearchIndex, options: EvaluationOptions, run: TrialReplicate
 ) -> TrialRecord:
-    """TrialReplicate motion matching along the trajectory of one replicate.
+    """Simulate motion matching along the trajectory of one replicate.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def run_replicates(
     index : SearchIndex, optional    index of the database's normalised features, built if None
     threads : int, optional    number of replicates at a time; one per processor if None
     progress : callable, optional    called as progress(replicates done, total, name of the last trial)
-    cancelled : callable, optional    called before each replicate; returns True to stop
+    cancelled : callable, optional    called before replicates are started; returns True to stop
 
     Returns
     -------

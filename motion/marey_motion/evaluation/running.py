@@ -15,7 +15,7 @@ Made = TypeVar("Made")
 
 
 class EvaluationCancelled(MotionError):
-    """The evaluation was cancelled; finished trials were reported to the caller."""
+    """The evaluation was cancelled; finished runs were reported to the caller."""
 
     default_code = "evaluation-cancelled"
 
@@ -35,7 +35,7 @@ def run_each(
     items : sequence    the items
     keep : callable    called with each item and its result, in the calling thread
     threads : int    number of items at a time
-    cancelled : callable    called before each item; returns True to stop
+    cancelled : callable    called before items are started, until it returns True to stop
 
     Raises
     ------
@@ -43,15 +43,16 @@ def run_each(
     """
     waiting = list(reversed(range(len(items))))
     running: dict[Future[Made], int] = {}
+    stopping = False
     with ThreadPoolExecutor(max_workers=threads, thread_name_prefix="trial") as pool:
         while waiting or running:
-            stopping = bool(waiting) and cancelled()
+            stopping = stopping or (bool(waiting) and cancelled())
             while waiting and not stopping and len(running) < threads:
                 number = waiting.pop()
                 running[pool.submit(run, items[number])] = number
             if stopping and not running:
                 raise EvaluationCancelled(
-                    f"the evaluation was stopped; {len(waiting)} of {len(items)} trials were not run"
+                    f"the evaluation was stopped; {len(waiting)} of {len(items)} runs were not made"
                 )
             ended, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in sorted(ended, key=running.__getitem__):

@@ -62,7 +62,7 @@ def run_suite(
     threads : int, optional    number of trials at a time; one per processor if None
     progress : callable, optional    called as progress(trials done, total, name of the last trial)
     finished : callable, optional    called with each trial and its record as soon as the trial ends
-    cancelled : callable, optional    called before each trial; returns True to stop
+    cancelled : callable, optional    called before trials are started; returns True to stop
 
     Returns
     -------
@@ -88,16 +88,20 @@ def run_suite(
         report(next(numbers), len(wanted), trial.name)
 
     if ahead:
-        run = _runner(database, index, options)
+        searched = index or _index_of(database)
+        run = _runner(database, searched, options)
         run_each(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     return [records[trial.name] for trial in wanted]
 
 
 def _runner(
-    database: MatchingDatabase, index: SearchIndex | None, options: EvaluationOptions
+    database: MatchingDatabase, index: SearchIndex, options: EvaluationOptions
 ) -> Callable[[Trial], TrialRecord]:
-    searched = index or build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
-    return lambda trial: simulate(database, searched, options, run_of(trial, 0, options))
+    return lambda trial: simulate(database, index, options, run_of(trial, 0, options))
+
+
+def _index_of(database: MatchingDatabase) -> SearchIndex:
+    return build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
 
 
 def assemble(
@@ -175,7 +179,8 @@ def evaluate(
     options : EvaluationOptions    options of the evaluation
     threads : int, optional    number of trials at a time; one per processor if None
     with_baseline : bool    whether to also evaluate generated clips
-    progress : callable, optional    called as progress(done, total, name)
+    progress : callable, optional    called as progress(runs done, total, name of the last trial); runs are all
+        replicates of the trials, and the trials over generated clips
     cancelled : callable, optional    returns True to stop
 
     Returns
@@ -187,9 +192,35 @@ def evaluate(
     EvaluationCancelled    if cancelled
     """
     trials = suite_trials(options)
-    records = run_suite(database, options, trials=trials, threads=threads, progress=progress, cancelled=cancelled)
-    replicates = run_replicates(database, options, trials, threads=threads, cancelled=cancelled)
-    baseline = evaluate_baseline(options, threads=threads, cancelled=cancelled) if with_baseline else None
+    index = _index_of(database)
+    replicated = len(trials) * options.replicates
+    total = replicated + (len(trials) if with_baseline else 0)
+    report = progress or (lambda _done, _total, _note: None)
+
+    def progress_after(before: int) -> ProgressCallback:
+        return lambda done, _total, note: report(before + done, total, note)
+
+    records = run_suite(
+        database,
+        options,
+        trials=trials,
+        index=index,
+        threads=threads,
+        progress=progress_after(0),
+        cancelled=cancelled,
+    )
+    replicates = run_replicates(
+        database,
+        options,
+        trials,
+        index=index,
+        threads=threads,
+        progress=progress_after(len(trials)),
+        cancelled=cancelled,
+    )
+    baseline = None
+    if with_baseline:
+        baseline = evaluate_baseline(options, threads=threads, progress=progress_after(replicated), cancelled=cancelled)
     return assemble(database, options, trials, records, replicates=replicates, baseline=baseline)
 
 
@@ -227,6 +258,8 @@ def evaluate_baseline(
         made = assemble(database, options, trials, records)
         _baselines.clear()
         _baselines[options] = replace(made, records=(), notes=(*notes, *made.notes))
+    elif progress is not None:
+        progress(len(_baselines[options].trials), len(_baselines[options].trials), "")
     return _baselines[options]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from marey_motion.evaluation.compare import Comparison, MetricChange
+from marey_motion.evaluation.compare import Comparison, MetricChange, probability
 from marey_motion.evaluation.judgement import Judgement, judge, judge_trial
 from marey_motion.evaluation.relevance import sum_by_source
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
@@ -22,7 +22,8 @@ from marey_reports.evaluation.figures import (
     USE_FIGURES,
     DrawnFigure,
 )
-from marey_schemas.documents.replicates import LEAST_REPLICATES, mean_interval
+from marey_schemas.documents.evaluations import CONFIDENCE
+from marey_schemas.documents.replicates import LEAST_REPLICATES
 from marey_schemas.options.verdict import VerdictLimits
 from marey_schemas.wording import counted
 
@@ -40,11 +41,10 @@ def compared(before: EvaluationResult, after: EvaluationResult) -> str:
     gained = sum(kept[1][name] and not kept[0][name] for name in shared)
     lost = sum(kept[0][name] and not kept[1][name] for name in shared)
     start = _direction(before, after)
-    same = second.followed == first.followed
-    parts = [
-        f"the character follows {_share(second)} trajectories, {'as before' if same else f'{first.followed} before'}"
-    ]
-    if gained or lost:
+    old, new = _followed(before, first), _followed(after, second)
+    trajectories = counted(len(second.trials), "trajectory")
+    parts = [f"the character follows {new} of {trajectories}, {'as before' if new == old else f'{old} before'}"]
+    if (gained or lost) and before.replicates is None:
         parts.append(f"{counted(gained, 'trajectory')} gained and {lost} lost")
     offsets = before.suite.get("offset_mean"), after.suite.get("offset_mean")
     if offsets[0] is not None and offsets[1] is not None:
@@ -58,12 +58,12 @@ def _direction(before: EvaluationResult, after: EvaluationResult) -> str:
     followed = [np.count_nonzero(one.followed, axis=0) for one in sides if one is not None]
     if len(followed) < 2 or len(followed[0]) != len(followed[1]):
         return "Unclear, because there are no replicates"
-    change = mean_interval((followed[1] - followed[0]).tolist())
-    if change.low is None or change.high is None:
+    change = (followed[1] - followed[0]).astype(np.float64)
+    if len(change) < LEAST_REPLICATES:
         return "Unclear, because there are too few replicates"
-    if change.low <= 0.0 <= change.high:
+    if not change.any() or probability(change) > 1.0 - CONFIDENCE:
         return "No difference found"
-    return "Better" if change.mean > 0.0 else "Worse"
+    return "Better" if change.mean() > 0.0 else "Worse"
 
 
 def paired(before: EvaluationResult, after: EvaluationResult) -> list[tuple[TrialResult, TrialResult]]:
@@ -81,7 +81,11 @@ def headline_of_two(before: EvaluationResult, after: EvaluationResult, labels: t
     enough = [f"{each.options.coverage_least_s:g} s" for each in (before, after)]
     return facts(
         (
-            ("trajectories followed", f"{first.followed} → {_share(second)}", " → ".join(labels)),
+            (
+                "trajectories followed",
+                f"{_arrow(_followed(before, first), _followed(after, second))} of {len(second.trials)}",
+                " → ".join(labels),
+            ),
             ("distance from the path (m)", _arrow(*(_written(each, "offset_mean") for each in (before, after))), ""),
             (
                 "speeds and turns covered",
@@ -132,7 +136,8 @@ def trial_chapter(
     pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
     pairs.sort(key=lambda pair: (-abs(_shift(*pair)), pair[0].trial.name))
     changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
-    text = f"The motion of the character changed in {changed:,} of {counted(len(before.trials), 'trial')}."
+    text = f"The motion of the character changed in {changed:,} of {counted(len(before.trials), 'trial')}"
+    text += "." if before.replicates is None else ", in the first replicate; distances are means over all replicates."
     if comparison is not None and (others := len(comparison.changed) - changed):
         text += f" In {counted(others, 'other trial')}, it is the same, but from other clips."
     heads = ("trial", "distance before (m)", "after (m)", "change (m)", "followed before", "after")
@@ -219,8 +224,11 @@ def _look(change: MetricChange | None) -> str:
     return {"better": "good", "worse": "bad"}.get(verdict, "")
 
 
-def _share(judgement: Judgement) -> str:
-    return f"{judgement.followed} of {len(judgement.trials)}"
+def _followed(result: EvaluationResult, judgement: Judgement) -> str:
+    """Return the number of followed trajectories, as the mean over the replicates if there are any."""
+    if result.replicates is None:
+        return str(judgement.followed)
+    return f"{np.count_nonzero(result.replicates.followed, axis=0).mean():.1f}".removesuffix(".0")
 
 
 def _arrow(old: str, new: str) -> str:

@@ -145,6 +145,13 @@ def test_changes_that_differ_by_rounding_alone_have_an_interval_around_them() ->
     assert paired_change("transitions_per_s", counts, counts).verdict == "same"
 
 
+@pytest.mark.parametrize(("replicates", "verdict"), [(3, "unclear"), (4, "unclear"), (8, "better")])
+def test_equal_changes_of_few_replicates_may_be_chance(replicates: int, verdict: str) -> None:
+    found = paired_change("offset_mean", np.ones((1, replicates)), np.zeros((1, replicates)))
+    assert found.p == 2.0 ** (1 - replicates)
+    assert found.verdict == verdict
+
+
 def test_a_verdict_needs_more_than_chance_and_a_metric_with_a_direction() -> None:
     noise = 0.1 * np.random.default_rng(3).normal(size=8)
     assert drawn(noise - 0.5).verdict == "better"

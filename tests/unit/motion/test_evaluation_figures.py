@@ -57,7 +57,6 @@ def other() -> EvaluationResult:
     return changed()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_has_the_same_bytes_each_time(name: str, result: EvaluationResult) -> None:
     first, second = is_sound_svg(figure_of(name)), draw_figure(name, result)
@@ -66,7 +65,6 @@ def test_a_figure_has_the_same_bytes_each_time(name: str, result: EvaluationResu
         assert is_sound(first).files() == second.files()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_of_two_results_is_the_same_drawing_each_time(
     name: str, result: EvaluationResult, other: EvaluationResult
@@ -78,7 +76,6 @@ def test_a_figure_of_two_results_is_the_same_drawing_each_time(
         assert is_sound(first).png == second.png
 
 
-@pytest.mark.slow
 def test_threads_draw_the_same_figures_at_once(result: EvaluationResult) -> None:
     def draw(_: int) -> tuple[str, bytes]:
         figure = draw_figure("scenario-switching", result)
@@ -114,7 +111,6 @@ def test_the_files_of_a_figure_are_its_pictures_and_its_data(result: EvaluationR
     assert [float(row["mean"]) for row in rows] == figure.data["tables"]["fits"]["mean"]
 
 
-@pytest.mark.slow
 def test_all_figures_of_a_result_are_drawn_but_those_it_has_no_trials_or_records_for() -> None:
     assert list(drawn_both()) == list(FIGURES)
     circles = synthetic_result(SMALL.replace(families=("circle",)), clips=3, frames=100)
@@ -222,7 +218,6 @@ def test_transition_costs_and_switches_are_those_of_the_record(result: Evaluatio
 # Figure 8
 
 
-@pytest.mark.slow
 def test_one_normal_has_the_static_error_as_its_mean_and_the_sign_can_be_turned(result: EvaluationResult) -> None:
     trial = "circle v=3 w=-50"
     metrics = next(each.metrics for each in result.trials if each.trial.name == trial)
@@ -393,14 +388,12 @@ def test_what_there_is_not_is_refused(result: EvaluationResult) -> None:
 # Evaluations of little
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", LITTLE)
 def test_evaluations_of_little_are_drawn(name: str) -> None:
     for figure in drawn_of_little(name).values():
         is_sound(figure) if is_soak() else is_sound_svg(figure)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["no windows", "one clip", "one speed", *SHOWS])
 def test_evaluations_of_little_are_compared(name: str) -> None:
     for figure in drawn_beside_little(name).values():
@@ -421,7 +414,6 @@ def standing() -> EvaluationResult:
     return replace(made, records=records, coverage=coverage)
 
 
-@pytest.mark.slow
 def test_of_a_clip_that_stands_rounding_is_not_shown_as_motion() -> None:
     figures = draw_figures(standing())
     assert "0 % of the time backward, 0 % mainly sideways." in figures["directions"].caption
@@ -430,7 +422,6 @@ def test_of_a_clip_that_stands_rounding_is_not_shown_as_motion() -> None:
         assert not re.search(r">1e", figure.svg.replace("\N{MINUS SIGN}", "-"))  # an axis in powers of ten
 
 
-@pytest.mark.slow
 def test_names_of_clips_are_drawn_as_they_are_but_for_signs_that_cannot_be() -> None:
     for name, figure in drawn_hostile().items():
         is_sound(figure) if name in (*USE_FIGURES, "points") or is_soak() else is_sound_svg(figure)

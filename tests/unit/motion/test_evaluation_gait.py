@@ -9,6 +9,7 @@ import pytest
 
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
+from marey_motion.evaluation import replicates
 from marey_motion.evaluation import suite as suites
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.result import EvaluationResult
@@ -19,7 +20,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import MatchingDatabase, SourceClip
-from marey_motion.matching.search import build_index
+from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.rigs import map_joints
 from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.matching import DatabaseOptions
@@ -210,3 +211,28 @@ def test_an_evaluation_has_its_baseline_beside_it() -> None:
     assert len(result.records) == len(result.trials) == 12
     assert told[-1] == 1.0
     assert evaluate(database, SMALL, with_baseline=False).baseline is None
+
+
+def test_an_evaluation_tells_its_progress_over_all_runs_and_builds_one_index(monkeypatch: pytest.MonkeyPatch) -> None:
+    database = database_of(gait_clips([(1.0, 0.0)], 4.0))
+    options = SMALL.replace(
+        speeds_m_s=(1.0,), turn_rates_deg_s=(0.0,), families=("circle",), duration_s=1.0, replicates=3
+    )
+    built, told = [], []
+
+    def build(*arguments: Any) -> SearchIndex:
+        built.append(len(arguments[0]))
+        return build_index(*arguments)
+
+    for module in (suites, replicates):
+        monkeypatch.setattr(module, "build_index", build)
+    monkeypatch.setattr(suites, "_baselines", {})
+
+    evaluate(database, options, with_baseline=False, progress=lambda *news: told.append(news[:2]))
+    assert built == [len(database.features)]
+    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    for _ in range(2):
+        told.clear()
+        evaluate(database, options, progress=lambda *news: told.append(news[:2]))
+        assert told[:4] == [(0, 4), (1, 4), (2, 4), (3, 4)]
+        assert told[-1] == (4, 4)

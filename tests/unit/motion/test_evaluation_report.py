@@ -79,7 +79,6 @@ def test_the_same_result_gives_the_same_page(result: EvaluationResult, figures: 
     assert once == again
 
 
-@pytest.mark.slow
 def test_without_figures_a_report_draws_them(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:
     assert render_report(result, title="Walks") == render_report(result, title="Walks", figures=figures)
 
@@ -101,7 +100,6 @@ def test_pictures_and_tables_can_be_read_aloud(result: EvaluationResult, figures
     assert '<html lang="en">' in source
 
 
-@pytest.mark.slow
 def test_names_of_clips_and_titles_are_shown_and_never_run(result: EvaluationResult) -> None:
     page = is_sound(render_report(hostile(), title=HOSTILE[1], figures=drawn_hostile()))
 
@@ -176,7 +174,6 @@ def test_digests_and_options_are_there_to_repeat_it(page: Page, result: Evaluati
     assert result.provenance.clips[result.clips[3].uid] in page.text
 
 
-@pytest.mark.slow
 def test_a_report_of_a_thousand_clips_stays_small() -> None:
     big = synthetic_result(clips=1_000, frames=300, unused=300)
     source = render_report(big, title="big")
@@ -186,14 +183,12 @@ def test_a_report_of_a_thousand_clips_stays_small() -> None:
     is_sound(source)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["no records", "nothing used", "no trials", "no numbers"])
 def test_reports_are_made_of_little(name: str, result: EvaluationResult) -> None:
     is_sound(render_report(little(name), title="little", figures=drawn_of_little(name)))
     is_sound(render_comparison(little(name), result, title="little", figures=drawn_beside_little(name)))
 
 
-@pytest.mark.slow
 def test_a_real_evaluation_is_reported() -> None:
     options = EvaluationOptions(
         speeds_m_s=(1.25, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0, replicates=1
@@ -373,7 +368,6 @@ def test_a_comparison_says_whether_it_helped(result: EvaluationResult) -> None:
     assert compared(result, result).startswith("Unclear, because there are no replicates: ")
 
 
-@pytest.mark.slow
 def test_a_comparison_shows_what_came_went_and_changed(result: EvaluationResult) -> None:
     after = changed()
     page = is_sound(render_comparison(result, after, title="Change", labels=("old", "new"), figures=drawn_both()))

@@ -212,7 +212,6 @@ def real(bandai: tuple[MatchingDatabase, MatchingDatabase]) -> Suggestions:
     return suggest(bandai[0], evaluated(bandai[0], REAL), collections={"turns": bandai[1]}, options=options)
 
 
-@pytest.mark.slow
 def test_on_real_clips_all_safe_removals_leave_every_record_bit_identical(
     bandai: tuple[MatchingDatabase, MatchingDatabase], real: Suggestions
 ) -> None:
@@ -223,7 +222,6 @@ def test_on_real_clips_all_safe_removals_leave_every_record_bit_identical(
     assert same_to_the_bit(database, real.result.records, less, simulated(less, REAL))
 
 
-@pytest.mark.slow
 def test_on_real_clips_ten_removals_do_what_was_predicted(
     bandai: tuple[MatchingDatabase, MatchingDatabase], real: Suggestions
 ) -> None:
@@ -233,7 +231,6 @@ def test_on_real_clips_ten_removals_do_what_was_predicted(
     assert real.plan[-1].metrics == headline_means(again.trials)
 
 
-@pytest.mark.slow
 def test_on_real_clips_turns_are_found_for_a_set_that_hardly_turns_and_help_where_predicted(
     bandai: tuple[MatchingDatabase, MatchingDatabase], real: Suggestions
 ) -> None:

@@ -8,7 +8,7 @@ from tests.support.evaluation_cases import arc, trajectory_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_to_tree
-from marey_motion.evaluation.running import EvaluationCancelled
+from marey_motion.evaluation.running import EvaluationCancelled, run_each
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
 from marey_motion.evaluation.suite import assemble, run_suite
 from marey_motion.matching.database import MatchingDatabase
@@ -124,7 +124,7 @@ def test_a_cancelled_suite_hands_over_what_it_finished_and_can_be_resumed(
     database: MatchingDatabase, records: list[TrialRecord]
 ) -> None:
     kept = {}
-    with pytest.raises(EvaluationCancelled, match="of 12 trials were not run"):
+    with pytest.raises(EvaluationCancelled, match="of 12 runs were not made"):
         run_suite(
             database,
             OPTIONS,
@@ -143,6 +143,15 @@ def test_a_suite_cancelled_at_once_runs_nothing(database: MatchingDatabase) -> N
         run_suite(database, OPTIONS, finished=lambda trial, _record: made.append(trial), cancelled=lambda: True)
 
     assert made == []
+
+
+def test_a_stop_is_asked_for_until_it_comes_and_then_holds() -> None:
+    answers = iter([False, True, False, False])
+    made: list[int] = []
+    with pytest.raises(EvaluationCancelled, match="2 of 4 runs were not made"):
+        run_each(lambda item: item, range(4), lambda item, _made: made.append(item), 2, lambda: next(answers))
+
+    assert made == [0, 1]
 
 
 def test_an_option_that_makes_no_sense_ends_the_suite_with_its_name(database: MatchingDatabase) -> None:
