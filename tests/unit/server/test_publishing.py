@@ -399,6 +399,28 @@ def test_what_a_batch_refers_to_within_itself_is_not_read_again(lab: Lab, monkey
     assert [one.created for one in again] == [False, True]
 
 
+def test_a_joint_that_only_other_clips_move_keeps_its_offset(lab: Lab) -> None:
+    """A rig whose clip moves a joint does not stand for a rig whose clips need the offset of this joint."""
+
+    def drafts(number: int, offset_m: float, moved: tuple[tuple[str, ...], ...]) -> list[Draft]:
+        hierarchy = skeleton_tree()
+        hierarchy["joints"][2]["offset"] = [0.0, offset_m, 0.0]
+        motions = [motion_tree({"output": f"rig{number}"}, seed=number) for _ in moved]
+        for motion, joints in zip(motions, moved, strict=True):
+            if joints:
+                motion |= {"translated_joints": joints, "translations": np.zeros((5, len(joints), 3), np.float32)}
+        return [
+            Draft(f"rig{number}", Kind.SKELETON, "rig", {"hierarchy": hierarchy}, "skeletons", reuse="by_content"),
+            *(
+                Draft(f"take{number}-{place}", Kind.CLIP, f"take{number}-{place}", {"motion": motion}, "takes")
+                for place, motion in enumerate(motions)
+            ),
+        ]
+
+    made = publish(lab, *drafts(0, 0.0, (("j2",),)), *drafts(1, 0.3, ((),)), *drafts(2, 0.6, (("j2",), ())))
+    assert len({one.item for one in made if one.name.startswith("rig")}) == 3
+
+
 def test_takes_of_one_rig_use_one_skeleton_whatever_means_nothing_differs(lab: Lab) -> None:
     """The root's offset, rounding, and an offset that the motion replaces differ from take to take."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,7 +19,7 @@ from marey_server.store.transaction import Transaction
 Tree = dict[str, Any]
 
 MOST_COMPARED = 500
-"""Greatest number of skeletons of a project with which a new skeleton is compared, the oldest first."""
+"""Greatest number of skeletons of a project with which a new skeleton is compared: the newest ones."""
 SAME_NUMBER = 1e-5
 """Greatest difference of equal bones, in metres, and of equal rotations: writers round numbers."""
 
@@ -29,7 +28,7 @@ _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class RigDocument:
-    """Document `hierarchy` of a skeleton. `moved` are the joints whose offsets the motion of a clip replaces."""
+    """Document `hierarchy` of a skeleton. `moved` are the joints whose offsets the motions of all its clips replace."""
 
     digest: str
     body: Tree
@@ -38,13 +37,14 @@ class RigDocument:
 
 def on_known_rigs(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
     """Replace the hierarchies of skeletons to be reused by content with those of the same rigs in the project."""
-    moved: defaultdict[str, set[str]] = defaultdict(set)
+    moved: dict[str, set[str]] = {}
     for one in loaded:
+        joints = set(one.bodies.get("motion", {}).get("translated_joints", ()))
         for name in one.refers:
-            moved[name].update(one.bodies.get("motion", {}).get("translated_joints", ()))
+            moved[name] = moved.get(name, joints) & joints
     new = {
         one.draft.name_in_batch: RigDocument(
-            one.contents["hierarchy"].digest, one.bodies["hierarchy"], frozenset(moved[name])
+            one.contents["hierarchy"].digest, one.bodies["hierarchy"], frozenset(moved.get(name, ()))
         )
         for one in loaded
         for name in (one.draft.name_in_batch,)
@@ -71,7 +71,7 @@ def _known_rigs(tx: Transaction, project: ProjectRow, new: Mapping[str, RigDocum
     tx.lock(f"content:{project.id}:{Kind.SKELETON}")  # as publication does, so that two imports see each other
     stored = _stored_digests(tx, project)
     unknown = {name: rig for name, rig in new.items() if rig.digest not in stored}
-    compared = list(stored)[:MOST_COMPARED]
+    compared = list(stored)[-MOST_COMPARED:]
     bodies = documents.load_bodies(tx, compared)
     candidates = [RigDocument(digest, bodies[digest]) for digest in compared]
     found = {}
@@ -98,12 +98,14 @@ def _stored_digests(tx: Transaction, project: ProjectRow) -> dict[str, str]:
     return {row.document_digest: row.id for row in tx.execute(statement)}
 
 
-def _is_same(one: RigDocument, other: RigDocument) -> bool:
-    return _structure(one.body) == _structure(other.body) and all(
+def _is_same(known: RigDocument, new: RigDocument) -> bool:
+    """Return whether the clips of a new skeleton mean the same on a known one.
+
+    Clips that move a joint of the known skeleton do not count: those of the new skeleton need the offset of this joint.
+    """
+    return _structure(known.body) == _structure(new.body) and all(
         abs(a - b) <= SAME_NUMBER
-        for a, b in zip(
-            _numbers(one.body, one.moved | other.moved), _numbers(other.body, one.moved | other.moved), strict=True
-        )
+        for a, b in zip(_numbers(known.body, new.moved), _numbers(new.body, new.moved), strict=True)
     )
 
 
