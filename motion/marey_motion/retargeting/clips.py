@@ -26,6 +26,13 @@ class RetargetedClip:
     ----------
     clip : Clip    the motion
     checks : tuple of CheckWarning    what differs from the poses of the source, and how far
+
+    Examples
+    --------
+    >>> from marey_motion import generate_gait
+    >>> from marey_motion import RetargetedClip
+    >>> RetargetedClip(generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=1.0), ()).checks
+    ()
     """
 
     clip: Clip
@@ -40,6 +47,11 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
     lengths of the target. If the clip translates joints, the target's bones point in the directions of the clip's
     translated bones; if the target is the source skeleton itself, the clip keeps its translations. The path of the
     pelvis is the source's path times the plan's scale; a root above the pelvis moves with the pelvis without turning.
+
+    Three corrections change this. Pelvis, spine and neck turn where the rotations of the source would put the hips or
+    the ends of the spine's bones elsewhere than its joint positions do. The middle of the hips travels instead of the
+    pelvis if a rest pose does not show how far the hips are below the pelvis. The whole clip is moved up or down if
+    its soles would not stand on the floor of the source.
 
     Parameters
     ----------
@@ -84,6 +96,19 @@ def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOption
     ------
     ClipError    if the clip's skeleton differs from the plan's source skeleton
     MappingError    if feet or hands are to be kept, but not all joints of both limbs are mapped in both skeletons
+
+    Examples
+    --------
+    >>> from marey_motion import game_skeleton, generate_gait, guess_axes, map_joints, plan_retarget
+    >>> from marey_motion import retarget_with_checks
+    >>> from marey_schemas.options.retargeting import RetargetOptions
+    >>> clip, target = generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0), game_skeleton()
+    >>> joints = map_joints(clip.skeleton), map_joints(target)
+    >>> axes = guess_axes(clip.skeleton, joints[0]), guess_axes(target, joints[1])
+    >>> plan = plan_retarget(clip.skeleton, joints[0], axes[0], target, joints[1], axes[1])
+    >>> made = retarget_with_checks(clip, plan, RetargetOptions(keep_feet=True))
+    >>> made.clip.frame_count, [check.code for check in made.checks]
+    (120, ['feet-kept'])
     """
     if not same_hierarchy(clip.skeleton, plan.source, tolerance_m=SAME_SKELETON_M):
         raise ClipError(

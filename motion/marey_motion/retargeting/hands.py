@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,12 +17,10 @@ from marey_motion.importing.checks import CheckWarning
 from marey_motion.motion import Motion
 from marey_motion.retargeting.planning import RetargetPlan
 from marey_motion.rigs.standard import SIDES
+from marey_schemas.options.retargeting import HandsFrom
 
 ELBOW_DAMPING_RAD = math.radians(10.0)
 """Angle before the full stretch of an arm at which the damping of its elbow begins."""
-
-
-HandsFrom = Literal["shoulders", "world"]
 
 
 class KeptHands(NamedTuple):

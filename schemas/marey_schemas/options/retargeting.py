@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from marey_schemas.base import Options
+
+HandsFrom = Literal["shoulders", "world"]
 
 
 class RetargetOptions(Options):
@@ -20,9 +22,15 @@ class RetargetOptions(Options):
         False,
         description="Keep the positions of the hands, scaled, so that hands that meet in the source meet again.",
     )
-    hands_from: Literal["shoulders", "world"] = Field(
+    hands_from: HandsFrom = Field(
         "shoulders",
         description="Point from which keep_hands scales. shoulders: the middle of the shoulders, by the length of the "
         "arms, which is within reach; world: the origin, by the scale of the root's path, for hands on objects or on "
         "the floor. An arm that is too short is stretched.",
     )
+
+    @model_validator(mode="after")
+    def _scales_what_it_keeps(self) -> Self:
+        if self.hands_from != "shoulders" and not self.keep_hands:
+            raise ValueError("hands_from has no effect without keep_hands; add keep_hands, or leave out hands_from")
+        return self

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from tests.support.judged_rigs import PAIRS, RIGS, Actor, JudgedRetargeting, degrees_between, plan_between
 from tests.support.tiers import is_soak
 
@@ -97,3 +98,8 @@ def test_hands_are_kept_in_the_world_as_far_as_arms_reach(rigs: dict[str, Actor]
         )
         far = np.linalg.norm(off[int(side == "right")], axis=1) > 0.02
         assert degrees_between(upper[far], fore[far]).max(initial=0.0) < 15.0, "an arm that misses is stretched"
+
+
+def test_where_hands_are_scaled_from_needs_hands_that_are_kept() -> None:
+    with pytest.raises(ValidationError, match="add keep_hands, or leave out hands_from"):
+        RetargetOptions(hands_from="world")
