@@ -50,7 +50,7 @@ it("draws both clips with WebGL, with every joint where the server computes it",
     expect(errors.length).toBe(expected.length);
     expect(Math.max(...errors), `frame ${frame}`).toBeLessThan(TOLERANCE_M);
   }
-  expect(await colours(page)).toBeGreaterThan(30);
+  await expect.poll(() => colours(page), { timeout: 20_000 }).toBeGreaterThan(30);
   await picture(page, "view-mannequins");
 });
 
@@ -104,7 +104,7 @@ it("draws side views where there is no WebGL", async () => {
   await plain.goto(page.url());
   const state = await scene(plain, (one) => one.actors.length === 2);
   expect(state.stage).toBe("canvas");
-  expect(await colours(plain)).toBeGreaterThan(5);
+  await expect.poll(() => colours(plain), { timeout: 20_000 }).toBeGreaterThan(5);
   await plain.getByText("This browser offers no WebGL").waitFor();
   await picture(plain, "view-without-webgl");
   await plain.close();

@@ -178,7 +178,7 @@ it("records each trial that a participant answers, by keys and by clicks, also a
       trial = again;
     }
     if (index === 0) {
-      expect(await colours(page)).toBeGreaterThan(15);
+      await expect.poll(() => colours(page), { timeout: 20_000 }).toBeGreaterThan(15);
       expect(await faults(page)).toEqual([]);
       await page.keyboard.press("1");
       await pictures(page, "trial");
@@ -259,7 +259,7 @@ it("shows its owner what participants perceived, and both motions of a pair", as
   const pairs = found.shown.flatMap((row, one) => row.slice(one + 1));
   const missing = pairs.filter((count) => count === 0).length;
   await page.getByText(missing === 0 ? "Every pair was shown." : `${missing} of ${pairs.length} pairs were never shown together.`).waitFor();
-  expect(await colours(page)).toBeGreaterThan(15); // the picture of the table
+  await expect.poll(() => colours(page), { timeout: 20_000 }).toBeGreaterThan(15); // the picture of the table
   await page.getByText("All pairs as a table").click();
   const rows = page.getByRole("region", { name: "All pairs" }).getByRole("row");
   expect(await rows.count()).toBe(1 + pairs.length);
