@@ -12,9 +12,9 @@ import numpy as np
 from marey_motion import kinematics
 from marey_motion.arrays import AnyFloats, Flags, Floats
 from marey_motion.clip import Clip
+from marey_motion.editing.annotations.contacts import contact_labels
 from marey_motion.editing.ground import LOWEST_SHARE, sole_heights
 from marey_motion.formats import read_motion
-from marey_motion.quality.feet import contact_labels
 from marey_motion.retargeting import RetargetPlan, plan_retarget
 from marey_motion.rigs import guess_axes, map_joints
 

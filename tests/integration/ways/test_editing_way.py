@@ -13,7 +13,7 @@ import pytest
 from tests.support.command_line import CommandLine
 
 from marey_client import Marey
-from marey_client.errors import Invalid, RequestFailed
+from marey_client.errors import Invalid, JobUnsuccessful, RequestFailed
 from marey_client.handles.clips import ClipHandle
 from marey_client.project import ProjectHandle
 from marey_client.reruns import compare_outputs
@@ -166,11 +166,9 @@ def test_where_results_should_go_must_be_clear(marey: Marey, lab: ProjectHandle)
         lab.edit("walks", [{"command": "mirror"}], in_place=True, into="elsewhere")
     (first, *_) = clips_of(lab, "walks").values()
     ended(marey, lab.edit(first, [{"command": "trim", "start": 10}], in_place=True))
-    stale = marey.jobs.wait(lab.edit(first, [{"command": "trim", "start": 20}], in_place=True).id)
-    assert stale.failure is not None
-    assert (stale.state, stale.failure.code) == ("failed", "nothing-done")
-    assert "walk -30" in stale.failure.detail
-    assert "submit the edit again" in stale.failure.detail
+    with pytest.raises(JobUnsuccessful, match=f"{first.path}: .* submit the edit again") as stale:
+        marey.jobs.wait(lab.edit(first, [{"command": "trim", "start": 20}], in_place=True).id)
+    assert stale.value.job.failure.code == "nothing-done"
     assert lab.clips.get(first.id).item.revision == 2
 
 
@@ -200,10 +198,9 @@ def test_a_clip_that_cannot_be_edited_is_refused_and_the_others_are_made(marey: 
     assert "commands[0] (trim)" in refusal["detail"]
     assert clips_of(lab, "clean").keys() == {"walk 0", "walk 30"}
 
-    nothing = marey.jobs.wait(lab.edit("walks", [{"command": "trim", "start": 100_000}], into="none").id)
-    assert nothing.failure is not None
-    assert (nothing.state, nothing.failure.code) == ("failed", "nothing-done")
-    assert "none of 3 clips can be edited; walks/" in nothing.failure.detail
+    with pytest.raises(JobUnsuccessful, match="none of 3 clips can be edited; walks/") as nothing:
+        marey.jobs.wait(lab.edit("walks", [{"command": "trim", "start": 100_000}], into="none").id)
+    assert nothing.value.job.failure.code == "nothing-done"
 
 
 def test_a_preview_shows_what_the_job_makes_and_stores_nothing(marey: Marey, lab: ProjectHandle) -> None:

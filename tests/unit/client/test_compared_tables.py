@@ -118,6 +118,6 @@ def test_the_detail_of_a_refusal_cannot_control_the_terminal(
     server.answers.append(httpx.Response(400, headers=headers, json=problem | {"instance": "i"}))
     monkeypatch.setattr(comparing, "connect", lambda _: nullcontext(server.marey()))
     told = run_here(["script", "compare", "lab", "train"]).stderr
-    assert told == "marey: the fields are b\\x1b]0;title\\x07 (no-field, request i)\n"
+    assert told == "marey: the fields are b\\x1b]0;title\\x07 (no-field, request i at http://server.test)\n"
     print_message("b\x1b]0;title\x07")
     assert capsys.readouterr().err == "b\\x1b]0;title\\x07\n"

@@ -122,7 +122,7 @@ def test_the_number_of_compared_pairs_does_not_grow_with_the_square_of_the_clips
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(references, "MOST_COMPARED", 4)
-    compared: list[tuple[int, int]] = []
+    compared: list[tuple[float, int]] = []
     for count in (8, 16):
         examples, _ = warped_walks(count)
         aligned = align_clips(

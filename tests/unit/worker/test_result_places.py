@@ -70,14 +70,21 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_results_that_would_replace_what_they_are_made_of_are_refused(project: ProjectInMemory, kind: str) -> None:
+def test_results_that_would_replace_what_they_are_made_of_are_refused(project: ProjectInMemory) -> None:
     move(project, "game", collection="game", below="")
-    result = KINDS[kind](project)
+    result = KINDS["retarget"](project)
     assert (result["clips"], codes(result), project.staged) == (0, ["own-input"] * 2, [])
     assert "game/left, which is an input" in result["refused"][0]["detail"]
     assert "another folder" in result["refused"][0]["detail"]
-    assert KINDS[kind](project, suffix="-short")["clips"] == 2
+    assert KINDS["retarget"](project, suffix="-short")["clips"] == 2
+
+
+def test_an_edit_whose_results_would_all_replace_what_they_are_made_of_fails(project: ProjectInMemory) -> None:
+    move(project, "game", collection="game", below="")
+    with pytest.raises(JobRefused, match="game/left, which is an input of the job; choose another folder"):
+        KINDS["edit"](project)
+    assert project.staged == []
+    assert KINDS["edit"](project, suffix="-short")["clips"] == 2
 
 
 @pytest.mark.parametrize("kind", KINDS)
