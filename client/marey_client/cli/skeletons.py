@@ -98,7 +98,7 @@ def joint_axes(
 
 def _assigned(assignments: list[str], known: set[str], mapped: Mapping[str, str]) -> dict[str, str]:
     """Return the joint of each standard joint in the texts; names in `mapped` can be cleared whatever they are."""
-    from marey_schemas.standard_joints import STANDARD_JOINTS
+    from marey_schemas.documents.standard_joints import STANDARD_JOINTS
 
     given: dict[str, str] = {}
     for assignment in assignments:

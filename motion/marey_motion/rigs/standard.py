@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from marey_schemas.standard_joints import CENTRE_JOINTS, FINGERS, SIDES, STANDARD_JOINTS
+from marey_schemas.documents.standard_joints import CENTRE_JOINTS, FINGERS, SIDES, STANDARD_JOINTS
 
 __all__ = ["CENTRE_JOINTS", "CHAINS", "ESSENTIAL_JOINTS", "FINGERS", "SIDES", "STANDARD_JOINTS", "mirrored"]
 

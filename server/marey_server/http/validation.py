@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -55,16 +55,11 @@ def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[byte
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise _bad_query(field_errors(error, values, _parameter)) from None
+        raise _bad_query(field_errors(error, values, ".".join)) from None
 
 
 def _known_parameters(known: Mapping[str, Any]) -> str:
     return f"The known parameters are {', '.join(sorted(known))}." if known else "This address has no parameters."
-
-
-def _parameter(steps: Iterable[str]) -> str:
-    """Return the name of a query parameter, without the place of a value among several."""
-    return ".".join(step for step in steps if not step.isdecimal())
 
 
 def _bad_query(faults: list[FieldError]) -> BadRequestProblem:
