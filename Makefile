@@ -19,10 +19,10 @@ PROCESSES ?= 4
 PAGES_IF_POSSIBLE := command -v npm > /dev/null && $(BIN)/python hatch_build.py || true
 
 .DEFAULT_GOAL := help
-.PHONY: help installed web web-test demo check test soak lint format dev bench docs pins audit bom clean
+.PHONY: help installed web web-test demo check slow-tests test soak lint format dev bench docs pins audit bom clean
 
 help: ## Show what can be made
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 22
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Marey needs Python 3.11 or newer; say which with make PYTHON=..."; exit 1; }
@@ -60,6 +60,9 @@ web-test: web ## Types and tests of the browser pages
 check: $(VENV)/.installed-dev lint ## In 4 minutes: lint, types, units, REST on SQLite, one whole way
 	$(PAGES_IF_POSSIBLE)
 	$(PYTEST) -n auto --tier check tests
+
+slow-tests: $(VENV)/.installed-dev ## Measure which tests the tier check leaves out, on a machine that does nothing else
+	$(PYTEST) -n auto --tier check --store-slow tests
 
 test: $(VENV)/.installed-dev lint ## In 15 minutes: everything a change can break, on SQLite and on Postgres
 	$(PAGES_IF_POSSIBLE)

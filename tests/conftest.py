@@ -14,6 +14,7 @@ from marey_schemas.processes.memory import loading_modules
 
 pytest_plugins = (
     "tests.support.database_fixtures",
+    "tests.support.slow_tests",
     "tests.support.tiers",
     "tests.support.store_fixtures",
     "tests.support.queue_desk",

@@ -24,7 +24,6 @@ def as_tree(document: Any) -> dict[str, Any]:
     return dict(document.model_dump(mode="json", by_alias=True))
 
 
-@pytest.mark.slow
 def test_the_example_runs_as_it_is_written(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
     (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     take = generate_gait(1.5, math.radians(50.0), 4.0)

@@ -24,7 +24,6 @@ from marey_server.launchers.kubernetes.manifests import Pool, worker_job
 from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.launcher import EngineError, LaunchContext, LauncherUnusable, WorkerEnd, WorkerRequest
 
-pytestmark = pytest.mark.slow
 T = TypeVar("T")
 
 SECRET = "marey_secret_of_workers"

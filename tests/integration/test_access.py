@@ -182,7 +182,6 @@ def is_about_nobody(person: Person, route: Route) -> bool:
     return operation.access is Access.ANYONE and (useless or route.template.endswith("/login"))
 
 
-@pytest.mark.slow
 def test_an_attempt_ends_with_its_own_token_and_no_other(house: House) -> None:
     template = "/jobs/{job}/attempts/{fence}/fail".format(**house.variables)
     body = {"write_id": "12345678", "code": "gave-up"}
@@ -264,7 +263,6 @@ def test_a_worker_rotates_its_token_which_no_other_token_can(house: House) -> No
         assert worker.post(f"/tokens/{own}/rotate", json=wrong).status_code == 422
 
 
-@pytest.mark.slow
 def test_guesses_of_project_names_are_limited_and_then_no_answer_tells_one(database: Database, tmp_path: Path) -> None:
     with running(database, tmp_path, name_guesses_per_hour=GUESSES) as server:
         owner, guesser = server.client(server.make_project("secret")), server.client(server.make_user("eve"))

@@ -1,7 +1,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from marey_motion.formats.bvh import read_bvh
@@ -21,7 +20,6 @@ def arrays_of(path: Path) -> list[NDArray[np.float32]]:
     return arrays
 
 
-@pytest.mark.slow
 def test_every_real_motion_comes_back_to_the_bit(mocap: Path) -> None:
     checked = 0
     for path in sorted(mocap.rglob("*.bvh")):

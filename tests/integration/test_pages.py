@@ -171,7 +171,6 @@ def shown(sqlite_template: Path, tmp_path: Path) -> Iterator[tuple[Server, httpx
 
 
 @pytest.mark.chromium
-@pytest.mark.slow
 def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_path: Path) -> None:
     server, owner = shown
     names = [_upload(owner, file) for file in _takes(tmp_path)]
@@ -188,7 +187,6 @@ def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_pat
 
 
 @pytest.mark.chromium
-@pytest.mark.slow
 def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded(
     shown: tuple[Server, httpx.Client], tmp_path: Path
 ) -> None:
@@ -284,7 +282,6 @@ def _positions(owner: httpx.Client, clip: str) -> dict[str, list[float]]:
 
 
 @pytest.mark.node
-@pytest.mark.slow
 def test_decoder_and_kinematics_in_typescript_agree_with_those_in_python(tmp_path: Path) -> None:
     write_cases(tmp_path)
     _run_vitest("unit", MAREY_WEB_CASES=str(tmp_path))

@@ -237,7 +237,6 @@ class Program:
                 assert self.attempt("mia", datasets.delete_ref, one.source, expected_rev=None) == "proposal-open"
 
 
-@pytest.mark.slow
 @pytest.mark.soak
 def test_main_moves_only_as_its_rule_allows(database: Database) -> None:
     merged = 0

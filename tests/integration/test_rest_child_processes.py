@@ -24,8 +24,6 @@ from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_server.motions import previewing
 from marey_server.process.memory import UNKNOWN_CLIENTS
 
-pytestmark = pytest.mark.slow  # each test ends a child, and the next one takes seconds to start
-
 WAITING = "tests.support.child_functions:wait_for"
 TRIM = {"commands": [{"command": "trim", "stop": 20}]}
 

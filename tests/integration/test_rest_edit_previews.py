@@ -161,7 +161,6 @@ def test_commands_that_cannot_be_applied_are_refused_with_their_number(owner: ht
     assert answer.json()["errors"][0]["pointer"] == "/commands"
 
 
-@pytest.mark.slow
 def test_what_would_take_long_is_left_to_a_job(
     owner: httpx.Client, clip: str, walk: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,7 +133,6 @@ def test_a_waiting_worker_hears_of_a_job_when_it_is_submitted(owner: httpx.Clien
     assert claim(worker, wait_s=0.1) == []
 
 
-@pytest.mark.slow
 def test_who_prefers_to_wait_is_answered_when_the_job_has_ended(
     server: Server, owner: httpx.Client, worker: httpx.Client
 ) -> None:
@@ -335,7 +334,6 @@ def test_anybody_may_list_the_kinds_of_jobs(server: Server) -> None:
         assert unknown.json()["detail"].startswith("There is no job kind 'Levitate'")
 
 
-@pytest.mark.slow
 def test_jobs_of_lost_workers_are_taken_back_whatever_becomes_of_the_other_chores(
     database: Database, tmp_path: Path, test_kinds: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -356,7 +354,6 @@ def test_jobs_of_lost_workers_are_taken_back_whatever_becomes_of_the_other_chore
         assert again["job"] == job["id"]
 
 
-@pytest.mark.slow
 def test_the_server_takes_back_jobs_of_lost_workers_by_itself(
     database: Database, tmp_path: Path, test_kinds: None
 ) -> None:

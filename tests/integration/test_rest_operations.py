@@ -83,7 +83,6 @@ def process(tmp_path: Path) -> Iterator[Process]:
         started.process.wait()
 
 
-@pytest.mark.slow
 def test_a_fresh_folder_gets_a_database_and_an_administrator_whose_token_only_the_owner_reads(process: Process) -> None:
     file = process.folder / "admin.token"
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -110,7 +109,6 @@ def test_requests_are_logged_as_json_with_who_what_and_how_long(process: Process
     assert not any("secret-name" in json.dumps(line) or process.token in json.dumps(line) for line in process.lines)
 
 
-@pytest.mark.slow
 def test_questions_for_readiness_are_not_logged(process: Process) -> None:
     before = len(process.lines)
     for _ in range(3):
@@ -121,7 +119,6 @@ def test_questions_for_readiness_are_not_logged(process: Process) -> None:
     assert any(line["message"].startswith("Running upgrade") for line in process.lines)
 
 
-@pytest.mark.slow
 def test_a_stopping_server_finishes_what_it_began_and_takes_nothing_new(process: Process) -> None:
     host, port = process.address.removeprefix("http://").split(":")
     body = json.dumps({"name": "slow"}).encode()
@@ -284,7 +281,6 @@ def test_signing_in_gives_a_token_and_signing_out_ends_it(database: Database, tm
         assert server.client().post("/login", json=again).status_code == 200
 
 
-@pytest.mark.slow
 def test_a_log_tells_where_everything_is_and_what_to_do_next(process: Process) -> None:
     process.end()
     told = "\n".join(line["message"] for line in process.lines)
@@ -294,7 +290,6 @@ def test_a_log_tells_where_everything_is_and_what_to_do_next(process: Process) -
     assert process.token not in told
 
 
-@pytest.mark.slow
 def test_questions_for_work_that_find_none_and_probes_are_not_logged(process: Process) -> None:
     headers = {"Authorization": f"Bearer {process.token}"}
     asked = httpx.post(f"{process.address}/api/v1/leases", json={"worker": "w", "kinds": ["retarget"]}, headers=headers)
@@ -309,7 +304,6 @@ def test_questions_for_work_that_find_none_and_probes_are_not_logged(process: Pr
     assert logged == [("/api/v1/me", 200), ("/api/v1/leases", 401)]
 
 
-@pytest.mark.slow
 def test_a_worker_beside_the_server_logs_in_the_same_form(tmp_path: Path) -> None:
     process = Process(tmp_path / "data", MAREY_LOCAL_WORKERS="1")
     try:

@@ -68,7 +68,6 @@ def upload(client: httpx.Client, files: dict[str, bytes]) -> list[dict[str, Any]
     return answer.json()["entries"]
 
 
-@pytest.mark.slow  # needs children of its own, and new ones after each bomb
 def test_bombs_are_refused_and_the_files_beside_them_are_imported(small: Server) -> None:
     owner = small.client(small.make_project())
     walk = write_bvh(generate_gait(1.3, 0.0, 1.0))

@@ -25,7 +25,6 @@ def marey(tmp_path: Path) -> Iterator[Marey]:
     assert process.stop() == 0
 
 
-@pytest.mark.slow
 def test_a_job_over_its_time_has_failed_for_that_and_is_not_tried_again(marey: Marey) -> None:
     project = marey.create_project(ProjectCreate(name="lab"))
     sleep = {"how": "sleep", "seconds": 60}

@@ -95,7 +95,6 @@ def working(server: Server, folder: Path) -> Iterator[None]:
         assert worker.stop() == 0, worker.log.read_text()
 
 
-@pytest.mark.slow
 def test_one_trace_leads_from_the_upload_to_the_result(
     collector: Receiver, sqlite_template: Path, tmp_path: Path
 ) -> None:

@@ -113,7 +113,6 @@ def processes_of(name: str) -> list[psutil.Process]:
     return [process for process in found.values() if process.info["ppid"] not in found]
 
 
-@pytest.mark.slow
 class LauncherContract:
     """Tests that every launcher must pass; each subclass defines the fixture `make_launcher`."""
 

@@ -21,6 +21,7 @@ import pytest
 from hatch_build import SOURCES as PAGE_SOURCES
 from hatch_build import pages_are_current
 from tests.support.database_fixtures import BACKENDS
+from tests.support.slow_tests import function_of, slow_tests
 
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
 """Environment variable with the path of the folder of real motion capture."""
@@ -92,7 +93,7 @@ def _needs_mocap(item: pytest.Item) -> bool:
 
 
 def _slow(item: pytest.Item) -> bool:
-    return item.get_closest_marker("slow") is not None
+    return function_of(item) in slow_tests() and not item.config.getoption("store_slow")
 
 
 def _soak_only(item: pytest.Item) -> bool:

@@ -162,7 +162,6 @@ def test_a_copy_takes_the_record_along_and_the_other_project_refuses_the_export(
     ProjectHandle(project.transport, "away").delete()
 
 
-@pytest.mark.slow
 def test_results_of_jobs_keep_the_record_of_their_source(run: CommandLine, project: ProjectHandle) -> None:
     set_consent(project, "walk", -1)
     set_consent(project, "turn", 10)

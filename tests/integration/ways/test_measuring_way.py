@@ -38,13 +38,11 @@ def test_the_capacity_is_computed(run: CommandLine) -> None:
     assert "saturates first" in run(*told("capacity")).stdout
 
 
-@pytest.mark.slow
 def test_a_new_server_is_measured_and_removed(run: CommandLine) -> None:
     assert "cycles/s" in run(*told("bench", "serve"), *SHORT).stdout
     assert "predicted jobs/s" in run(*told("bench", "costs"), "--rounds", "1").stdout
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_each_fault_happens_and_each_job_has_one_visible_result(tmp_path: Path) -> None:
     server = ServerProcess(tmp_path, **QUICK_LEASES).start()

@@ -48,7 +48,6 @@ def test_the_commands_and_the_python_of_the_page_work_in_their_order(
     assert list(lab.schedules.list()) == []
 
 
-@pytest.mark.slow
 def test_the_server_submits_a_job_at_its_time_and_the_worker_runs_it(
     marey: Marey, lab: ProjectHandle, run: CommandLine, tmp_path: Path
 ) -> None:

@@ -85,7 +85,6 @@ class NamedCluster:
         self._api.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 class OwnPodContract:
     """Tests that the stub and every real cluster must pass; each subclass defines the fixture `cluster`."""

@@ -216,7 +216,6 @@ def test_a_name_the_server_would_refuse_is_refused_before_it_is_sent(nowhere: di
     assert done.stderr.startswith("marey: name: ")
 
 
-@pytest.mark.slow
 def test_a_server_that_is_not_there_is_one_line_and_exit_status_1(nowhere: dict[str, str]) -> None:
     done = marey("project", "ls", env=nowhere)
     assert done.returncode == 1
@@ -225,7 +224,6 @@ def test_a_server_that_is_not_there_is_one_line_and_exit_status_1(nowhere: dict[
     assert "marey_very_secret" not in done.stderr
 
 
-@pytest.mark.slow
 def test_with_v_the_whole_story_is_told_without_the_token(nowhere: dict[str, str]) -> None:
     done = marey("project", "ls", "-v", env=nowhere)
     assert done.returncode == 1
@@ -679,7 +677,6 @@ def test_without_a_terminal_nobody_is_asked_and_one_line_says_what_to_do(
     assert told in done.stderr
 
 
-@pytest.mark.slow
 def test_a_password_may_be_piped(nowhere: dict[str, str]) -> None:
     done = marey("login", "--name", "ada", env=nowhere, stdin="correct horse battery\n")
     assert done.returncode == 1

@@ -84,7 +84,7 @@ def test_pictures_are_drawn_as_svg_with_nothing_cut_off(
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if name in ("annotations", "an edited arm") else pytest.mark.soak)
+        pytest.param(name, marks=[] if name in ("annotations", "an edited arm") else pytest.mark.soak)
         for name in DIFFERENCES
     ],
 )

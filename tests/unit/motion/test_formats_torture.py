@@ -27,12 +27,11 @@ from marey_motion.skeleton import EndSite, Skeleton
 CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y", trust_options=True)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "outcome"),
     [
-        pytest.param(big.short_lines, f"read {big.SIZE // 18}", marks=pytest.mark.slow),
-        pytest.param(big.long_numbers, f"read {big.SIZE // 207}", marks=pytest.mark.slow),
+        pytest.param(big.short_lines, f"read {big.SIZE // 18}"),
+        pytest.param(big.long_numbers, f"read {big.SIZE // 207}"),
         (big.endless_hierarchy, "format-limit"),
         (big.one_line, "frame-width"),
         (big.rubbish, "not-bvh"),

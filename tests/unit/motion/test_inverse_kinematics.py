@@ -106,7 +106,6 @@ def _targets_everywhere(skeleton: Skeleton, motion: Motion) -> list[Target]:
     ]
 
 
-@pytest.mark.slow
 def test_derivatives_of_all_kinds_of_targets_are_those_of_finite_differences(skeleton: Skeleton) -> None:
     motion = _moved(skeleton, frames=1)
     targets = _targets_everywhere(skeleton, motion)

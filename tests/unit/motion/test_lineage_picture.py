@@ -68,9 +68,7 @@ GRAPHS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "a chain" else []) for name in GRAPHS]
-)
+@pytest.mark.parametrize("name", [pytest.param(name) for name in GRAPHS])
 def test_pictures_are_the_same_svg_each_time_with_nothing_cut_off(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     figures: list[Any] = []
 
@@ -87,10 +85,7 @@ def test_pictures_are_the_same_svg_each_time_with_nothing_cut_off(name: str, mon
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow if name in ("cut off", "names with signs") else pytest.mark.soak)
-        for name in GRAPHS
-    ],
+    [pytest.param(name, marks=[] if name in ("cut off", "names with signs") else pytest.mark.soak) for name in GRAPHS],
 )
 def test_pictures_are_the_same_png_each_time(name: str) -> None:
     drawn = draw_lineage(GRAPHS[name], "png")

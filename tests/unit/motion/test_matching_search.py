@@ -118,7 +118,6 @@ def test_a_search_finds_what_going_through_all_rows_finds(make: Callable[..., An
             assert list(zip(*(part.tolist() for part in found), strict=True)) == truth
 
 
-@pytest.mark.slow
 def test_ten_thousand_queries_of_a_walking_database_are_answered_exactly() -> None:
     rng = np.random.default_rng(7)
     features = gait_like(6000, 27, rng)

@@ -198,7 +198,6 @@ def algorithm_1(source: SimpleNamespace, target: Actor, plan: RetargetPlan, fram
     return local
 
 
-@pytest.mark.slow
 def test_the_precomputed_corrections_equal_algorithm_1_done_pose_by_pose(studio: Actor, game: Actor) -> None:
     for source, target in ((studio, game), (game, studio)):
         moving = SimpleNamespace(clip=tumbling(source.skeleton), skeleton=source.skeleton, axes=source.axes)

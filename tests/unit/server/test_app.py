@@ -83,7 +83,6 @@ def test_a_server_that_starts_again_replaces_its_workers_token_and_no_other_serv
         database.read(SYSTEM, tokens.resolve_token, first)
 
 
-@pytest.mark.slow
 def test_a_port_that_is_taken_is_told_with_what_to_do(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

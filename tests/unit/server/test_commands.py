@@ -96,7 +96,6 @@ def test_a_purge_deletes_what_is_old_and_makes_the_file_smaller(data: Path, caps
     commands.fsck(data=data)
 
 
-@pytest.mark.slow
 def test_a_purge_beside_a_running_server_deletes_and_says_why_the_file_stays(
     data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,8 +8,6 @@ import sys
 import threading
 from pathlib import Path
 
-import pytest
-
 from marey_server.process.computing import ComputeThreads
 from marey_server.store.database.lanes import Client
 
@@ -28,7 +26,6 @@ commands.serve(data=sys.argv[1], port=0, drain_s=1, local_workers=0, log_form="t
 """
 
 
-@pytest.mark.slow
 def test_a_server_that_is_told_to_stop_does_not_wait_for_computations(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", ENDLESS, str(tmp_path)], stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None

@@ -58,7 +58,6 @@ def test_a_node_whose_name_ends_in_an_asterisk_is_no_search_by_the_start_of_name
     assert models_of(lab, "stan*") == [ids["g/stan*"]]
 
 
-@pytest.mark.slow
 def test_the_model_beside_the_graph_is_taken_however_many_there_are_elsewhere(
     lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]]
 ) -> None:

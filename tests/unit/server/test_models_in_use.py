@@ -88,7 +88,6 @@ def test_a_model_that_describes_nothing_is_refused(loaded: LoadedModel) -> None:
         parse_model(LoadedModel(broken, loaded.hierarchy))
 
 
-@pytest.mark.slow
 def test_a_server_starts_without_what_models_need() -> None:
     told = (
         "import sys, marey_server.app; print([name for name in ('sklearn', 'scipy', 'numba') if name in sys.modules])"

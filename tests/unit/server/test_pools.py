@@ -78,7 +78,6 @@ def test_each_pool_gets_a_launcher_with_its_own_token_and_options(database: Data
     assert database.read(SYSTEM, tokens.resolve_token, context.token).labels == {"gpu": "a100"}
 
 
-@pytest.mark.slow
 def test_a_launcher_that_does_not_exist_is_an_error_in_one_line(tmp_path: Path) -> None:
     file = tmp_path / "marey.toml"
     file.write_text('launcher = "slrum"\n[[pools]]\nname = "gpu"\nmost = 1\n')

@@ -243,7 +243,6 @@ ODD = ("text", 10**400, {"a": "b"})
 """Values that a document of a model may put into its summary."""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("value", ODD, ids=str)
 def test_odd_values_in_a_summary_break_no_query(queried: QueriedLab, value: object) -> None:
     names = ("frame_rate_hz", "duration_s", "joints", "warnings", "subject", "shoot_day", "consent_until", "action")

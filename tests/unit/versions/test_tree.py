@@ -130,7 +130,6 @@ def test_a_difference_loads_the_chunks_of_each_level_of_both_trees_at_once() -> 
     assert store.requests == decode(root, store[root]).level + 1
 
 
-@pytest.mark.slow
 def test_one_change_reads_and_writes_few_chunks() -> None:
     store = Counting(stored(numbered(30_000))[0])
     root = build(ChunksInMemory(), sorted(numbered(30_000).items()))

@@ -113,7 +113,6 @@ def test_the_use_of_each_clip_is_published_as_its_facets(project: ProjectInMemor
     assert all((values["usage"] > 0) == (values["used_frames"] > 0) for values in facets.values())
 
 
-@pytest.mark.slow
 def test_the_report_names_its_files_and_figures_of_the_trials_that_were_asked_for(project: ProjectInMemory) -> None:
     wanted = PARAMS.model_copy(update={"report": True, "trial_figures": ("switching v=1 w=50",)})
     evaluate.gather(project, wanted, [evaluate.run(project, wanted)])

@@ -3,8 +3,6 @@
 import subprocess
 import sys
 
-import pytest
-
 LOADING = """
 import sys
 from marey_schemas.queue.job_kinds import job_kinds
@@ -15,7 +13,6 @@ print(*(name for name in avoided if name in sys.modules))
 """
 
 
-@pytest.mark.slow
 def test_a_worker_waits_for_no_statistics_and_no_drawing_before_its_first_job() -> None:
     told = subprocess.run([sys.executable, "-c", LOADING], capture_output=True, text=True, check=True)
     assert (told.stdout.strip(), told.stderr) == ("", "")
@@ -43,7 +40,6 @@ print(max(searched) < gc.get_freeze_count() / 20, *(one() for one in left))
 """
 
 
-@pytest.mark.slow
 def test_garbage_of_jobs_is_freed_without_a_search_of_loaded_modules() -> None:
     told = subprocess.run([sys.executable, "-c", COLLECTING], capture_output=True, text=True, check=True)
     assert (told.stdout.split(), told.stderr) == (["True", "None", "None"], "")

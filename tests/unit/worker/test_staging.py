@@ -29,7 +29,6 @@ def let_go(folder: Path) -> None:
     (folder / "go").touch()
 
 
-@pytest.mark.slow
 def test_the_next_job_runs_while_the_last_results_are_stored(shared_server: FakeServer, tmp_path: Path) -> None:
     first = being_stored(shared_server)
     second = running(shared_server, tmp_path)
@@ -55,7 +54,6 @@ def test_a_third_job_waits_until_the_results_of_the_first_are_published(shared_s
     assert order.index(("claimed", second)) < order.index(("ended", first)) < order.index(("claimed", third))
 
 
-@pytest.mark.slow
 def test_results_that_are_refused_while_the_next_job_runs_fail_their_own_job(
     shared_server: FakeServer, tmp_path: Path
 ) -> None:
@@ -124,7 +122,6 @@ def test_a_lease_that_is_lost_while_results_are_stored_is_given_up_without_anoth
     assert ("ended", first) not in shared_server.order
 
 
-@pytest.mark.slow
 def test_the_time_limit_of_a_job_includes_the_storing_of_its_results(shared_server: FakeServer, tmp_path: Path) -> None:
     first = being_stored(shared_server, time_limit_s=1)
     second = running(shared_server, tmp_path)
@@ -134,7 +131,6 @@ def test_the_time_limit_of_a_job_includes_the_storing_of_its_results(shared_serv
     assert shared_server.ended(second)["result"] == {"waited": True}
 
 
-@pytest.mark.slow
 def test_heartbeats_and_log_of_a_job_go_on_while_its_results_are_stored(
     shared_server: FakeServer, tmp_path: Path
 ) -> None:
@@ -150,7 +146,6 @@ def test_heartbeats_and_log_of_a_job_go_on_while_its_results_are_stored(
     shared_server.ended(second)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("how", ["cancelled", "segfault"])
 def test_the_death_of_the_child_in_the_next_job_does_not_affect_results_that_are_stored(
     shared_server: FakeServer, tmp_path: Path, how: str
@@ -184,7 +179,6 @@ def test_results_are_published_although_the_next_job_does_not_read_its_answers(
     assert shared_server.ended(second)["result"] == {"waited": True}
 
 
-@pytest.mark.slow
 def test_on_sigterm_a_job_whose_results_are_stored_is_given_back_with_the_next_one(
     server: FakeServer, start_worker: StartWorker, tmp_path: Path
 ) -> None:

@@ -24,7 +24,6 @@ def alive(pid: int) -> bool:
         return False
 
 
-@pytest.mark.slow
 def test_a_kind_of_another_distribution_runs_and_its_result_log_and_progress_arrive(shared_server: FakeServer) -> None:
     job = shared_server.submit("add", {"a": 2, "b": 3})
     end = shared_server.ended(job)
@@ -39,7 +38,6 @@ def test_a_child_stays_warm_between_jobs(shared_server: FakeServer) -> None:
     assert len({end["result"]["pid"] for end in ends}) == 1
 
 
-@pytest.mark.slow
 def test_the_next_job_begins_while_the_end_of_the_last_one_is_reported(
     server: FakeServer, start_worker: StartWorker
 ) -> None:
@@ -52,7 +50,6 @@ def test_the_next_job_begins_while_the_end_of_the_last_one_is_reported(
     assert [server.ended(job)["result"]["sum"] for job in (first, second)] == [1, 2]
 
 
-@pytest.mark.slow
 def test_a_job_is_run_once_although_the_answer_to_its_claim_was_lost(
     server: FakeServer, start_worker: StartWorker
 ) -> None:
@@ -64,7 +61,6 @@ def test_a_job_is_run_once_although_the_answer_to_its_claim_was_lost(
     assert [name for name, _ in server.order].count("claimed") == 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("lost", [0, 1])
 def test_a_worker_goes_on_with_the_token_that_replaced_its_own(
     server: FakeServer, start_worker: StartWorker, tmp_path: Path, lost: int
@@ -86,7 +82,6 @@ def test_a_worker_goes_on_with_the_token_that_replaced_its_own(
     assert [name for name, _ in server.order].count("claimed") == 2
 
 
-@pytest.mark.slow
 def test_a_claim_whose_token_ended_before_it_was_answered_is_given_up_for_one_with_the_new_token(
     server: FakeServer, start_worker: StartWorker, tmp_path: Path
 ) -> None:
@@ -103,7 +98,6 @@ def test_a_claim_whose_token_ended_before_it_was_answered_is_given_up_for_one_wi
     assert worker.process.wait(60) == 1  # a token that nobody replaced is refused as before
 
 
-@pytest.mark.slow
 def test_a_worker_that_stops_reports_what_is_done(server: FakeServer, start_worker: StartWorker) -> None:
     server.may_complete.clear()
     worker = start_worker("--slots", "1")
@@ -130,7 +124,6 @@ def test_a_job_that_was_not_spread_over_tasks_is_done_and_gathered_at_once(share
     assert shared_server.ended(shared_server.submit("tally", {"tasks": 1}))["result"] == {"seen": [[0, 1]]}
 
 
-@pytest.mark.slow
 def test_the_attempts_own_token_is_used_for_the_attempt(server: FakeServer, start_worker: StartWorker) -> None:
     start_worker()
     job = server.submit("add", {"a": 1, "b": 1})
@@ -138,7 +131,6 @@ def test_the_attempts_own_token_is_used_for_the_attempt(server: FakeServer, star
     assert server.tokens_seen == {"Bearer marey_worker_token", f"Bearer mareyjob_secret_of_{job}"}
 
 
-@pytest.mark.slow
 def test_no_secret_stands_in_arguments_or_environment(server: FakeServer, start_worker: StartWorker) -> None:
     secrets = {"MAREY_DATABASE_URL": "postgresql://marey:hunter2@db/marey", "PGPASSWORD": "hunter2"}
     worker = start_worker(env=secrets, forked=False)
@@ -202,7 +194,6 @@ def test_a_result_that_no_request_can_contain_fails_its_job_and_not_the_worker(
     assert shared_server.ended(after)["result"]["sum"] == 2
 
 
-@pytest.mark.slow
 def test_the_same_crash_has_the_same_signature_and_another_has_another(shared_server: FakeServer) -> None:
     signatures = [
         shared_server.ended(shared_server.submit("misbehave", {"how": how}))["signature"]
@@ -220,14 +211,12 @@ def test_a_crash_leaves_its_traceback_in_the_log(shared_server: FakeServer) -> N
     assert b"_segfault" in shared_server.logs[job]
 
 
-@pytest.mark.slow
 def test_an_exception_is_named_in_the_answer_and_traced_in_the_log(shared_server: FakeServer) -> None:
     job = shared_server.submit("misbehave", {"how": "raise"})
     assert "Traceback" not in shared_server.ended(job)["detail"]
     assert b"Traceback" in shared_server.logs[job]
 
 
-@pytest.mark.slow
 def test_memory_hoarded_by_a_grandchild_is_noticed_and_all_are_killed(
     shared_server: FakeServer, tmp_path: Path
 ) -> None:
@@ -239,14 +228,12 @@ def test_memory_hoarded_by_a_grandchild_is_noticed_and_all_are_killed(
     shared_server.until(lambda: not alive(hoarder))
 
 
-@pytest.mark.slow
 def test_a_copy_that_a_job_made_of_its_process_does_not_answer_for_it(shared_server: FakeServer) -> None:
     assert shared_server.ended(shared_server.submit("misbehave", {"how": "fork-and-raise"}))["result"] == {
         "survived": True
     }
 
 
-@pytest.mark.slow
 def test_answers_that_come_too_late_do_not_reach_the_next_job(shared_server: FakeServer) -> None:
     shared_server.documents["clip_1", 1, "motion"] = {"some": "document"}
     for _ in range(3):
@@ -273,7 +260,6 @@ def test_a_cancelled_job_is_stopped(shared_server: FakeServer) -> None:
     assert shared_server.ended(shared_server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
 
 
-@pytest.mark.slow
 def test_a_job_whose_lease_was_lost_is_given_up_without_another_word(shared_server: FakeServer) -> None:
     job = shared_server.submit("misbehave", {"how": "sleep", "seconds": 60}, heartbeat_s=0.3)
     shared_server.until(lambda: shared_server.heartbeats[job])
@@ -283,7 +269,6 @@ def test_a_job_whose_lease_was_lost_is_given_up_without_another_word(shared_serv
     assert job not in shared_server.failed
 
 
-@pytest.mark.slow
 def test_a_job_goes_on_while_the_server_is_away_and_is_published_when_it_is_back(
     shared_server: FakeServer, tmp_path: Path
 ) -> None:
@@ -312,7 +297,6 @@ def test_on_sigterm_a_running_job_is_given_back_and_the_exit_status_says_so(
     assert server.failed[job]["interrupted"] is True
 
 
-@pytest.mark.slow
 def test_a_job_is_given_back_if_its_process_gets_sigterm_before_the_worker(
     server: FakeServer, start_worker: StartWorker, tmp_path: Path
 ) -> None:
@@ -326,7 +310,6 @@ def test_a_job_is_given_back_if_its_process_gets_sigterm_before_the_worker(
     assert server.failed[job]["interrupted"] is True
 
 
-@pytest.mark.slow
 def test_a_worker_announces_its_labels_and_claims_its_kinds_only(server: FakeServer, start_worker: StartWorker) -> None:
     start_worker("--label", "gpu=a100", "--label", "site=", "--kind", "add")
     server.submit("misbehave", {"how": "sleep"})
@@ -343,14 +326,12 @@ def test_a_label_without_a_value_is_refused(
     assert "argument --label: 'gpu' is not a label; write it like site=lyon" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_on_sigterm_an_idle_worker_exits_with_success(server: FakeServer, start_worker: StartWorker) -> None:
     worker = start_worker()
     server.ended(server.submit("add", {"a": 1, "b": 1}))
     assert worker.stop() == 0
 
 
-@pytest.mark.slow
 def test_a_worker_stops_when_whoever_started_it_has_gone(server: FakeServer, start_worker: StartWorker) -> None:
     worker = start_worker()
     server.ended(server.submit("add", {"a": 1, "b": 1}))
@@ -358,7 +339,6 @@ def test_a_worker_stops_when_whoever_started_it_has_gone(server: FakeServer, sta
     assert worker.process.wait(30) == 0
 
 
-@pytest.mark.slow
 def test_children_do_not_outlive_a_worker_that_was_killed(
     server: FakeServer, start_worker: StartWorker, tmp_path: Path
 ) -> None:
@@ -372,7 +352,6 @@ def test_children_do_not_outlive_a_worker_that_was_killed(
     server.until(lambda: not any(alive(pid) for pid in children))
 
 
-@pytest.mark.slow
 def test_slots_run_jobs_at_the_same_time(server: FakeServer, start_worker: StartWorker, tmp_path: Path) -> None:
     start_worker("--slots", "2")
     jobs = []
@@ -435,7 +414,6 @@ def test_a_result_is_not_shared_if_something_could_not_be_read(shared_server: Fa
     assert end("have-no-mapping") == ("", True)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("point", ["worker.after_claim", "worker.before_complete", "worker.after_complete"])
 def test_fault_points_kill_the_worker_where_they_say(server: FakeServer, start_worker: StartWorker, point: str) -> None:
     worker = start_worker(env={"MAREY_FAULT": f"{point}:kill"})

@@ -13,7 +13,6 @@ def test_a_worker_without_a_terminal_logs_json_unless_told_otherwise() -> None:
     assert _form_named("text") == "text"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("form", ["json", "text"])
 def test_a_worker_logs_in_the_form_that_its_environment_names(
     server: FakeServer, start_worker: StartWorker, form: str
