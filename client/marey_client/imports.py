@@ -74,8 +74,8 @@ class FoundFiles:
 
     @property
     def motions_left_out(self) -> tuple[Path, ...]:
-        """Files among those left out that contain motion, by their endings."""
-        return tuple(path for path in self.left_out if path.name.lower().endswith((*IMPORTED_ENDINGS, *OTHER_MOTION)))
+        """Files among those left out that contain motion, by their endings, and folders that contain such files."""
+        return tuple(path for path in self.left_out if _is_motion(path.name) or path.is_dir())
 
 
 def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
@@ -99,7 +99,8 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
             raise NothingToUpload(f"{place} does not exist")
         folder = ReturningFolder.at(place)
         returning += [folder] if folder is not None else []
-        for path in _files_below(place):
+        visible, hidden = _files_below(place)
+        for path in visible:
             below = path.relative_to(place).as_posix()
             if folder is not None and below in folder.own_files:
                 continue
@@ -107,7 +108,7 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
                 _add(files, below if folder is None else folder.name_of(below), path)
             else:
                 left_out.append(path)
-        left_out += _hidden_motions(place)
+        left_out += hidden
     if not files:
         reasons = "".join(f"; {line}" for line in left_out_texts(left_out))
         raise NothingToUpload(f"no motion files ({', '.join(IMPORTED_ENDINGS)}) in {_listed(searched)}{reasons}")
@@ -120,23 +121,33 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
     )
 
 
-def _files_below(folder: Path) -> list[Path]:
-    """Return the files in a folder and below, sorted, without hidden files and folders."""
+def _files_below(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the files in a folder and below, sorted, and what is left out although it seems to contain motion.
+
+    Left out are hidden files, links that lead nowhere, and hidden or linked folders; not the notes of macOS.
+    """
     found: list[Path] = []
+    left_out: list[Path] = []
     for parent, folders, names in os.walk(folder, onerror=_raise):
-        folders[:] = (name for name in folders if not name.startswith("."))
-        found += (Path(parent, name) for name in names if not name.startswith("."))
-    return sorted(path for path in found if path.is_file())
+        apart = [name for name in folders if name.startswith(".") or Path(parent, name).is_symlink()]
+        left_out += (Path(parent, name) for name in apart if _has_motion(Path(parent, name)))
+        folders[:] = (name for name in folders if name not in apart)
+        for name in names:
+            path = Path(parent, name)
+            if not name.startswith(".") and path.is_file():
+                found.append(path)
+            elif _is_motion(name) and not name.startswith("._") and (name.startswith(".") or path.is_symlink()):
+                left_out.append(path)
+    return sorted(found), sorted(left_out)
 
 
-def _hidden_motions(folder: Path) -> list[Path]:
-    """Return the hidden motion files in a folder and below, outside hidden folders, without notes of macOS."""
-    found: list[Path] = []
-    for parent, folders, names in os.walk(folder, onerror=_raise):
-        folders[:] = (name for name in folders if not name.startswith("."))
-        hidden = (name for name in names if name.startswith(".") and not name.startswith("._"))
-        found += (Path(parent, name) for name in hidden if name.lower().endswith((*IMPORTED_ENDINGS, *OTHER_MOTION)))
-    return sorted(found)
+def _is_motion(name: str) -> bool:
+    return name.lower().endswith((*IMPORTED_ENDINGS, *OTHER_MOTION))
+
+
+def _has_motion(folder: Path) -> bool:
+    """Return whether a folder, or a folder below it, contains a file that seems to be motion."""
+    return any(_is_motion(name) for _, _, names in os.walk(folder) for name in names)
 
 
 def _raise(error: OSError) -> None:
@@ -309,6 +320,10 @@ def left_out_texts(paths: Sequence[Path]) -> list[str]:
 def _reason(path: Path) -> str:
     ending = path.suffix.lower()
     kind = ending[1:].upper() or "without ending"
+    if path.is_dir():
+        return f"{'hidden' if path.name.startswith('.') else 'linked'} folder with motion: name it to import it"
+    if not path.exists():
+        return f"{kind}: a link that leads nowhere"
     if path.name.startswith("."):
         return f"hidden {kind}: name them to import them"
     if ending in OTHER_MOTION:

@@ -31,7 +31,7 @@ def test_folders_are_searched_and_other_files_are_named_as_left_out(tmp_path: Pa
         (tmp_path / name).write_text("x")
     found = find_files([tmp_path])
     assert [file.name for file in found.files] == ["a/01.asf", "a/01_01.AMC", "b/walk.bvh"]
-    assert [path.name for path in found.left_out] == ["notes.txt", ".y.bvh"]
+    assert [path.name for path in found.left_out] == ["notes.txt", ".hidden", ".y.bvh"]
 
 
 def test_what_is_left_out_is_named_by_kind_and_in_full(tmp_path: Path) -> None:
@@ -55,6 +55,29 @@ def test_a_file_named_itself_is_taken_whatever_it_is(tmp_path: Path) -> None:
     path = tmp_path / "odd.ending"
     path.write_text("x")
     assert [file.name for file in find_files([path]).files] == ["odd.ending"]
+
+
+def test_folders_and_links_that_are_not_followed_are_named_if_there_is_motion(tmp_path: Path) -> None:
+    takes, elsewhere = tmp_path / "takes", tmp_path / "elsewhere"
+    for path in (
+        takes / "walk.bvh",
+        takes / ".git" / "index",
+        takes / "b" / ".old" / "c" / "run.fbx",
+        elsewhere / "x.bvh",
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"x")
+    (takes / "more").symlink_to(elsewhere)
+    (takes / "same.bvh").symlink_to(elsewhere / "x.bvh")
+    (takes / "gone.bvh").symlink_to(elsewhere / "nothing.bvh")
+    found = find_files(takes)
+    assert [file.name for file in found.files] == ["same.bvh", "walk.bvh"]
+    assert left_out_texts(found.left_out) == [
+        "left out: 1 BVH: a link that leads nowhere (gone.bvh)",
+        "left out: 1 hidden folder with motion: name it to import it (.old)",
+        "left out: 1 linked folder with motion: name it to import it (more)",
+    ]
+    assert len(found.motions_left_out) == 3
 
 
 def test_files_that_would_get_one_name_are_refused_and_none_is_left_out_silently(tmp_path: Path) -> None:
