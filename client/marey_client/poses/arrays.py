@@ -78,10 +78,12 @@ class PosedItem(ItemHandle):
 def frames_text(frames: slice | None) -> str | None:
     """Return a slice as the query parameter `first:end`; return None for None, which means all frames.
 
-    Raises `ValueError` for a step other than 1, and for negative bounds.
+    Raises `ValueError` for anything else than a slice, for a step other than 1, and for negative bounds.
     """
     if frames is None:
         return None
+    if not isinstance(frames, slice):
+        raise ValueError(f"frames: give a range such as slice(0, 120), not {frames!r}")
     if frames.step not in (None, 1):
         raise ValueError(
             f"frames: only ranges with a step of 1 can be requested, not {frames.step}; request "

@@ -30,7 +30,8 @@ class MotionWindows:
 
     Parameters
     ----------
-    clips : handles of clips, such as `lab.clips` or `lab.clips.where("raw", query="subject = 02")`
+    clips : handles of clips of one frame rate, such as `lab.clips` or `lab.clips.where("raw", query="subject = 02")`;
+        without `joints`, all with the same number of joints
     frames : number of frames of a window
     stride : number of frames between the beginnings of windows; default: `frames`, so that windows do not overlap
     content : what a window contains. poses: root translation and local rotations, (frames, 3 + 4 * joints); rotations:
@@ -55,6 +56,11 @@ class MotionWindows:
         if content not in Content.__args__:  # type: ignore[attr-defined]
             raise ValueError(f"content: {content!r} is none of {', '.join(Content.__args__)}")  # type: ignore[attr-defined]
         self.frames, self.content, self.joints, self.seed = frames, content, joints, seed
+        clips = tuple(clips)
+        _require_one("frame rate", {clip.path: clip.frame_rate_hz for clip in clips}, "choose clips of one frame rate")
+        if joints is None:
+            counts = {clip.path: clip.item.summary["joints"] for clip in clips}
+            _require_one("number of joints", counts, "name the joints, or choose clips of one skeleton")
         self.windows = [
             MotionWindow(clip, first) for clip in clips for first in range(0, clip.frames - frames + 1, stride)
         ]
@@ -86,7 +92,7 @@ class MotionWindows:
         windows. `by="clip"` keeps only the windows of a clip together. Raises `ValueError` if a clip has no subject or
         take, or if there are fewer groups than parts.
         """
-        if not shares or min(shares.values()) <= 0:
+        if not shares or not all(0 < share < float("inf") for share in shares.values()):
             raise ValueError(f"shares: every part needs a share above 0, not {dict(shares)}")
         groups: dict[str, list[MotionWindow]] = {}
         for window in self.windows:
@@ -111,6 +117,14 @@ class MotionWindows:
         part = MotionWindows((), frames=self.frames, content=self.content, joints=self.joints, seed=self.seed)
         part.windows = [window for window in self.windows if window in chosen]  # in the order of this dataset
         return part
+
+
+def _require_one(what: str, values: Mapping[str, float], remedy: str) -> None:
+    """Raise `ValueError` if clips, named by their paths, have different values, so that windows do not fit together."""
+    examples = {value: path for path, value in reversed(list(values.items()))}
+    if len(examples) > 1:
+        told = ", ".join(f"{value:g} in {path!r}" for value, path in sorted(examples.items())[:4])
+        raise ValueError(f"the clips have more than one {what}: {told}; {remedy}")
 
 
 def _group_of(clip: PosesHandle, by: SplitBy) -> str:
