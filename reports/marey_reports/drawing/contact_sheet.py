@@ -112,6 +112,14 @@ class _SheetRow:
         )
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 
+    @property
+    def reach_m(self) -> float:
+        """Greatest distance of a drawn point from the middle of its figure, to the left or right of the picture."""
+        return max(
+            float(np.abs(self.camera.seen(stances.points[:, body.bones.ravel()])[..., 0]).max(initial=0.0))
+            for body, stances in self.actors
+        )
+
 
 def _staged(take: TakePair, moments: int) -> _SheetRow:
     clips = (take.source, take.result)
@@ -173,9 +181,9 @@ def _draw_row(axes: Axes, row: _SheetRow, top: float, cell: float) -> None:
     """Draw a title, then one cell with the figures of source and result for each time. `top` is in inches."""
     _draw_titles(axes, row, top)
     low, high = row.extent_m
-    scale = 0.80 * STAGE / max(high - low, 1e-6)
-    bottom = top - TITLE - STAGE
     width = 0.5 * cell
+    scale = min(0.80 * STAGE / max(high - low, 1e-6), 0.44 * width / max(row.reach_m, 1e-6))
+    bottom = top - TITLE - STAGE
     for moment, time_s in enumerate(row.times_s):
         left = MARGIN + moment * cell
         _write(axes, (left + width, bottom - 0.21), f"{time_s:.2f} s", 9.5, QUIET, ha="center")

@@ -88,6 +88,16 @@ def test_source_and_result_are_drawn_at_one_scale(walk: Clip) -> None:
     assert height(1) == pytest.approx(0.9 / 1.78 * height(0), rel=0.1)
 
 
+def test_outstretched_arms_stay_in_their_cell() -> None:
+    rest = still(studio_skeleton(), frames=6)
+    pixels = pixels_of(contact_sheet([TakePair("", rest, rest)], moments=6))
+    for column in range(12):
+        figure = cell(pixels, 0, column, 12)
+        sides = np.concatenate((figure[:, :4], figure[:, -4:]), axis=1)
+        assert share_of(figure, BLUE) > 0.002
+        assert share_of(sides, BLUE) == share_of(sides, ORANGE) == 0
+
+
 def test_a_title_is_taken_literally_and_a_long_one_is_cut(walk: Clip) -> None:
     contact_sheet([TakePair(r"cost $5 and \frac{1}{0} ^_ {", walk, walk), TakePair("x" * 5000, walk, walk)])
 
