@@ -18,9 +18,9 @@ FLOORS = {
     "marey_schemas": 86,
     "marey_versions": 92,
     "marey_motion": 86,
-    "marey_reports": 74,
+    "marey_reports": 73,
     "marey": 90,
-    "marey_client": 39,
+    "marey_client": 38,
     "marey_server": 83,
     "marey_worker": 55,
 }
