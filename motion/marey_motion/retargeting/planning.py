@@ -181,8 +181,9 @@ def plan_retarget(
         sources[joint] = source.index_of(pair.source)
         axes = _axes_of(source_axes, pair.source, "source"), _axes_of(target_axes, pair.target, "target")
         corrections[joint] = quaternions.from_matrix(axes[0] @ axes[1].T)
+    bodies = _upright(pairs, source, source_axes, target, target_axes)
     if scale is None:
-        scale = _hip_height_ratio(pairs, source, source_axes, target, target_axes)
+        scale = _hip_height_ratio(bodies)
     if not (np.isfinite(scale) and scale > 0):
         raise MappingError(f"the scale must be a positive number, not {scale}", code="scale-invalid", where="scale")
     followed = {pair.target for pair in pairs}
@@ -199,7 +200,7 @@ def plan_retarget(
         missing=tuple(name for name in STANDARD_JOINTS if name in unshared),
         sources=sources,
         corrections=corrections,
-        anchors=_anchors(pairs, source, source_axes, target, target_axes),
+        anchors=_anchors(pairs, bodies),
         limbs=_limbs(pairs, target, target_mapping, target_axes),
     )
 
@@ -258,20 +259,14 @@ def _axes_of(axes: Mapping[str, JointAxes], joint: str, which: str) -> NDArray[n
     return np.stack([column / np.linalg.norm(column) for column in columns], axis=-1)
 
 
-def _hip_height_ratio(
-    pairs: tuple[JointPair, ...],
-    source: Skeleton,
-    source_axes: Mapping[str, JointAxes],
-    target: Skeleton,
-    target_axes: Mapping[str, JointAxes],
-) -> float:
+def _hip_height_ratio(bodies: tuple[_Upright, ...]) -> float:
     """Compute the height of the target's pelvis above its toes, divided by the same height of the source.
 
     The heights are those of upright bodies, computed as sums of bone lengths, because the rest pose of many files is
     not upright. If a part of the height is known for only one of the skeletons, both sums omit this part.
     """
     parts = []
-    for skeleton, joints, up in _upright(pairs, source, source_axes, target, target_axes):
+    for skeleton, joints, up in bodies:
         parts.append(np.mean([_heights(skeleton, joints, up, side) for side in SIDES], axis=0))
     known = np.isfinite(parts[0]) & np.isfinite(parts[1])
     heights = [float(np.sum(part[known])) for part in parts]
@@ -352,13 +347,7 @@ def _shows_drop(skeleton: Skeleton, joints: Mapping[str, int], up: NDArray[np.fl
     return float((positions[hip] - ankle) @ _trunk(skeleton, pelvis, up)) > STANDING * leg
 
 
-def _anchors(
-    pairs: tuple[JointPair, ...],
-    source: Skeleton,
-    source_axes: Mapping[str, JointAxes],
-    target: Skeleton,
-    target_axes: Mapping[str, JointAxes],
-) -> tuple[JointPair, ...]:
+def _anchors(pairs: tuple[JointPair, ...], bodies: tuple[_Upright, ...]) -> tuple[JointPair, ...]:
     """Choose the joints whose middle travels as in the source.
 
     A drop from the pelvis to the hips that a rest pose does not show is not part of the scale, so the pelvis would be
@@ -366,7 +355,6 @@ def _anchors(
     """
     paired = {pair.standard: pair for pair in pairs}
     hips = [paired[f"{side}_hip"] for side in SIDES if f"{side}_hip" in paired]
-    bodies = _upright(pairs, source, source_axes, target, target_axes)
     if len(hips) < len(SIDES) or all(_shows_drop(*body, side) for body in bodies for side in SIDES):
         return (paired["pelvis"],)
     return tuple(hips)

@@ -1,4 +1,4 @@
-"""Feet of edited motion: they keep their contacts and stay above the floor; parameters that do not fit are told."""
+"""Edited motion: feet keep their contacts and stay above the floor, and unsuitable parameters give a warning."""
 
 from typing import Any
 
@@ -119,7 +119,7 @@ def test_soles_come_to_the_ground_and_not_joints() -> None:
     assert 0.03 < used < 0.05
 
 
-def test_what_does_not_fit_the_motion_is_told() -> None:
+def test_parameters_that_do_not_suit_the_motion_give_a_warning() -> None:
     walk = make_walk(seconds=2.0)
 
     def warnings(command: dict[str, Any], **sources: Clip) -> list[str]:
