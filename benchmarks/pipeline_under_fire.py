@@ -26,7 +26,7 @@ from marey_client import Marey
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
-from marey_client.requests import plan_model
+from marey_client.submitting.requests import plan_model
 from marey_motion.clip import Clip
 from marey_motion.formats import write_motion
 from marey_motion.gait import game_skeleton, generate_gait

@@ -12,7 +12,7 @@ from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.versions import DatasetHandle
 from marey_client.jobs import Jobs, OnProgress
 from marey_client.project_items import ProjectItems
-from marey_client.requests import evaluate_request
+from marey_client.submitting.requests import evaluate_request
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.documents.replicates import mean_interval
