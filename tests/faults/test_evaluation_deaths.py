@@ -28,6 +28,7 @@ LONG: dict[str, Any] = {
     "turn_rates_deg_s": (-75.0, -50.0, -25.0, 0.0, 25.0, 50.0, 75.0, 100.0),
     "duration_s": 60.0 if is_soak() else 12.0,
     "baseline": False,
+    "replicates": 1,
     "report": False,
 }
 """Arguments of an evaluation of 80 trials in 10 tasks. A task takes longer than two questions of `wait_until`."""
@@ -122,7 +123,7 @@ def test_a_worker_killed_at_four_fifths_costs_only_the_tasks_it_was_at(
 def test_one_worker_and_two_make_the_same_bytes(
     marey: Marey, lab: ProjectHandle, start_worker: Callable[[str], WorkerProcess]
 ) -> None:
-    options = {**LONG, "speeds_m_s": (1.0, 1.5), "duration_s": 10.0, "baseline": True}
+    options = {**LONG, "speeds_m_s": (1.0, 1.5), "duration_s": 5.0, "baseline": True, "replicates": 2}
     start_worker("one")
     alone = digests(lab.evaluation(lab.evaluate("walks", **options)))
     start_worker("two")

@@ -87,6 +87,7 @@ def children_of(server: ServerProcess) -> list[str]:
 
 def test_a_server_that_does_not_warm_up_starts_children_when_a_request_needs_them(tmp_path: Path) -> None:
     server = ServerProcess(tmp_path)
+    server.own_children = True
     server.start()
     try:
         assert children_of(server) == []

@@ -185,7 +185,7 @@ class Load:
             if writer % 2:
                 client.close()
                 client = self.server.one_connection()
-            time.sleep(0.01)  # leave the processor to the processes that start
+            time.sleep(0.05)  # leave the processor to the processes that start
         client.close()
 
     def __enter__(self) -> Self:

@@ -17,7 +17,7 @@ from hatch_build import SOURCES
 from tests.support.database_fixtures import copied_sqlite
 from tests.support.rest_server import Server, running
 from tests.support.studying import analysis_of, files_of
-from tests.support.tiers import chromium
+from tests.support.tiers import chromium, is_soak
 from tests.support.web_cases import write_cases
 
 from marey_client import Marey
@@ -191,6 +191,7 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
     shown: tuple[Server, httpx.Client], tmp_path: Path
 ) -> None:
     server, owner = shown
+    trials = 10 if is_soak() else 4
     takes = [_upload(owner, file) for file in _takes(tmp_path)]
     for number in range(7):
         file = tmp_path / f"gait {number}.bvh"
@@ -201,7 +202,7 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
         studies, clips = marey.project("lab").studies, list(marey.project("lab").clips.list())
         gaits = [clip for clip in clips if clip.item.name not in takes]
         calm = studies.design(
-            "Walks", gaits, consent_text="I take part.\nI may stop at any time.", trials=10, seconds=120
+            "Walks", gaits, consent_text="I take part.\nI may stop at any time.", trials=trials, seconds=120
         )
         hurried = studies.design("Hurried", clips, consent_text="I take part.", trials=1, seconds=1)
         codes = [link.code for study, count in ((calm, 3), (hurried, 1)) for link in study.invite(count).links]
@@ -211,7 +212,7 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
             "chromium": chromium(),
             "page": f"{server.address}/s/",
             "codes": dict(zip(("whole", "withdrawn", "slow", "hurried"), codes, strict=True)),
-            "trials": 10,
+            "trials": trials,
             "conductor": _study_page(server, owner, calm.id),
             "reader": _study_page(server, server.client(rita), calm.id),
             "api": server.api,
@@ -230,10 +231,10 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
         assert [(one.number, list(one.shown), list(one.chosen or ())) for one in recorded] == [
             (one["number"], one["shown"], one["chosen"]) for one in answers
         ]
-        assert [one.number for one in recorded] == list(range(1, 11))
+        assert [one.number for one in recorded] == list(range(1, trials + 1))
         assert {(one.client_fps, one.timeouts_before) for one in recorded} == {(60.0, 0)}
         progress = calm.progress()
-        assert (progress.finished, progress.withdrawn, progress.answered, progress.timeouts) == (1, 1, 10, 0)
+        assert (progress.finished, progress.withdrawn, progress.answered, progress.timeouts) == (1, 1, trials, 0)
         assert "p2" not in judged
         assert (hurried.progress().answered, hurried.progress().timeouts) == (0, 1)
 

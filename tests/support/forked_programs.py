@@ -25,13 +25,15 @@ import threading
 from collections.abc import Mapping, Sequence
 from typing import BinaryIO
 
+from tests.support.forked_children import FORKS, LONGEST_ORDER, fork_children
+from tests.support.forked_children import MODULES as CHILDREN_RUN
+
 MODULES = (
     "marey_client.cli.app", "marey_client.embedded", "marey_server.app", "marey_server.commands",
-    "marey_worker.commands", "psycopg", "sqlalchemy.dialects.postgresql", "sqlalchemy.dialects.sqlite", "uvloop",
+    "marey_worker.commands", *CHILDREN_RUN, "psycopg", "sqlalchemy.dialects.postgresql", "sqlalchemy.dialects.sqlite",
+    "uvloop",
 )  # fmt: skip
-"""Modules of a server and a worker, and those that they import when they open a database or start their event loop."""
-LONGEST_ORDER = 1 << 16
-"""Greatest size of an order, in bytes; it contains all environment variables."""
+"""Modules of servers, workers and their children, and those that these import when they open a database or start."""
 _PID, _STATUS = struct.Struct("<q"), struct.Struct("<i")
 
 
@@ -106,10 +108,26 @@ class Nursery:
         return self._process.pid
 
     def start(
-        self, arguments: Sequence[str], environment: Mapping[str, str], *, output: int, with_stdin: bool
+        self,
+        arguments: Sequence[str],
+        environment: Mapping[str, str],
+        *,
+        output: int,
+        with_stdin: bool,
+        own_children: bool = False,
     ) -> ForkedProgram:
-        """Start `python -m` with `arguments`; the output is written to the descriptor `output`."""
-        order = json.dumps({"arguments": arguments, "environment": dict(environment), "folder": os.getcwd()}).encode()
+        """Start `python -m` with `arguments`; the output is written to the descriptor `output`.
+
+        With `own_children`, the program starts its child processes as new processes, instead of forking them.
+        """
+        order = json.dumps(
+            {
+                "arguments": arguments,
+                "environment": dict(environment),
+                "folder": os.getcwd(),
+                "own_children": own_children,
+            }
+        ).encode()
         assert len(order) < LONGEST_ORDER
         ended, ending = os.pipe()
         taken, given = os.pipe() if with_stdin else (os.open(os.devnull, os.O_RDONLY), None)
@@ -133,13 +151,14 @@ def nursery() -> Nursery:
 
 def load_modules() -> None:
     """Import the modules of a server and of a worker."""
+    from marey_schemas.processes.forking import require_one_thread
     from marey_schemas.processes.memory import loading_modules
 
     with loading_modules():
         for name in MODULES:
             importlib.import_module(name)
-    if (threads := len(os.listdir("/proc/self/task"))) > 1:
-        raise RuntimeError(f"only a process with one thread may fork programs, but this one has {threads}")
+        importlib.import_module("marey_server.motions.reading").load_kernels()
+    require_one_thread()
 
 
 def main() -> list[str]:
@@ -190,17 +209,24 @@ def tell_statuses(running: dict[int, int]) -> None:
             os.close(descriptor)
 
 
-def adopt(arguments: list[str], environment: dict[str, str], folder: str) -> list[str]:
-    """Take on the environment and the folder of a program, and read what modules read when they are imported."""
+def adopt(arguments: list[str], environment: dict[str, str], folder: str, own_children: bool) -> list[str]:
+    """Take on the environment and the folder of a program; unless it starts its own children, give it a cradle."""
+    os.chdir(folder)
+    take_on(environment)
+    if FORKS and not own_children:
+        fork_children()
+    return arguments
+
+
+def take_on(environment: dict[str, str]) -> None:
+    """Take on the environment of a program, and read what modules read when they are imported."""
     from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
     from marey_server import faults
 
     os.environ.clear()
     os.environ.update(environment)
-    os.chdir(folder)
     sys.path[1:1] = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path not in sys.path]
     faults.plan(environment.get(FAULT_VARIABLE, ""))
-    return arguments
 
 
 if __name__ == "__main__":

@@ -35,6 +35,9 @@ QUICK_LEASES = {"MAREY_LEASE_TTL_S": "3", "MAREY_HEARTBEAT_S": "0.5", "MAREY_CAN
 class MareyProcess:
     """A process with its own environment; `log` is the file of its output."""
 
+    own_children = False
+    """Whether its child processes are new ones, whose arguments `/proc` shows, instead of forked ones."""
+
     def __init__(self, log: Path) -> None:
         self.log = log
         self.process: ForkedProgram | None = None
@@ -44,7 +47,11 @@ class MareyProcess:
         surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
         with self.log.open("ab") as log:
             self.process = nursery().start(
-                arguments, surroundings | environment, output=log.fileno(), with_stdin=stdin is not None
+                arguments,
+                surroundings | environment,
+                output=log.fileno(),
+                with_stdin=stdin is not None,
+                own_children=self.own_children,
             )
         if stdin is not None:
             assert self.process.stdin is not None

@@ -171,13 +171,8 @@ class ChildProcess(ConnectedChild):
         self._reaping = threading.Lock()
         ours, theirs = socket.socketpair()
         with theirs:
-            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                [sys.executable, "-m", module, str(theirs.fileno()), *arguments],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                start_new_session=True,
-                env=clean_environment(threads=threads) | (thread_limits(threads) if at_most else {}),
-            )
+            environment = clean_environment(threads=threads) | (thread_limits(threads) if at_most else {})
+            self._process = start_module(module, arguments, theirs.fileno(), environment)
         super().__init__(ours)
 
     @property
@@ -220,6 +215,19 @@ class ChildProcess(ConnectedChild):
         super()._close()
         with self._reaping:
             self._process.wait()
+
+
+def start_module(
+    module: str, arguments: Sequence[str], descriptor: int, environment: dict[str, str]
+) -> subprocess.Popen[bytes]:
+    """Start `python -m module <descriptor> <arguments>` in a session of its own; it inherits the descriptor."""
+    return subprocess.Popen(  # noqa: S603 - our own interpreter and module
+        [sys.executable, "-m", module, str(descriptor), *arguments],
+        pass_fds=[descriptor],
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,
+        env=environment,
+    )
 
 
 def exit_status(pid: int) -> int | None:

@@ -230,16 +230,21 @@ class ForkedChild(ConnectedChild):
         self._server.release(self._pid)
 
 
+def require_one_thread() -> None:
+    """Wait until other threads of this process have ended; raises `RuntimeError` if that takes too long."""
+    deadline = time.monotonic() + THREADS_END_S
+    while (threads := len(os.listdir("/proc/self/task"))) > 1:
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"only a process with one thread may fork others, but this process has {threads}")
+        time.sleep(0.002)
+
+
 def fork_children(pipe: Connection, serve: Callable[[Connection], None]) -> None:
     """Fork a child for each socket that the parent sends, until the parent closes the pipe; `serve` runs in the child.
 
     Raises `RuntimeError` if this process keeps more than one thread.
     """
-    deadline = time.monotonic() + THREADS_END_S
-    while (threads := len(os.listdir("/proc/self/task"))) > 1:
-        if time.monotonic() > deadline:
-            raise RuntimeError(f"a fork server must have one thread, but this process has {threads}")
-        time.sleep(0.002)
+    require_one_thread()
     woken, wake = socket.socketpair()
     woken.setblocking(False)
     wake.setblocking(False)

@@ -36,7 +36,7 @@ WORDS = ("--speeds", "1", "--turns=-50,50", "--duration", "3", "--no-baseline")
 """The options of `GRID` on the command line."""
 BISECT_WITHOUT_LIMIT = ("dataset", "bisect", "lab/gaits", "--good", "v1", "--metric", "offset_mean_m", *WORDS)
 BISECT = (*BISECT_WITHOUT_LIMIT, "--half-way")
-LONG = ("--speeds", "1:3:0.5", "--duration", "100")
+LONG = ("--speeds", "1:3:0.5", "--duration", "20")
 """Options that make an evaluation take so long that it can be interrupted."""
 LEFT_TURNS = [f"raw/walk {speed} 60" for speed in ("1", "1.5", "2")]
 
