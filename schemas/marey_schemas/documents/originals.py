@@ -18,10 +18,11 @@ CONTENT = {
     "model": (
         "name", "joints", "frame_rate_hz", "spatial", "temporal", "temporal_weight", "mixture", "keyframes",
     ),
+    "time": ("temporal", "temporal_weight"),
     "tree": ("samples", "sizes", "children"),
     "graph": ("actions", "start"),
 }  # fmt: skip
-"""Names of the members whose values come from the imported file, by part."""
+"""Names of the members whose values come from the imported file, by part; `time` is the time function of a model."""
 
 
 class StoredOriginal(Request):

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.graphs import ModelGraph
-from marey_schemas.documents.models import checked_model, predecessor_origin
+from marey_schemas.documents.models import checked_model, predecessor_origin, predecessor_time
 from marey_schemas.documents.originals import StoredOriginal, content_digest
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.sample_trees import SampleTreeDocument
@@ -30,7 +30,8 @@ class PredecessorOptions:
     """Options of the file formats of Marey's predecessor.
 
     `end_index` and `form` apply to annotations, `layout` to models. By default, an unchanged model is exported as its
-    imported file; other models are written in layout 3. `part` selects the part of the item to export: for a model, its
+    imported file; other models are written in the layout that contains their time function exactly, or else in layout 3.
+    `part` selects the part of the item to export: for a model, its
     tree; for an aligned clip, its alignment. By default, the model or the motion of the clip is exported.
     """
 
@@ -100,7 +101,7 @@ def _written(
         return "_alignment.json", _alignment(parts["info"])
     if kind is Kind.MODEL and hierarchy is not None:
         if options.part != "tree":
-            return "_mm.json", _model(parts["model"], hierarchy, options.layout or "3")
+            return "_mm.json", _model(parts["model"], hierarchy, options.layout)
         if "tree" not in parts:
             raise NotFoundProblem(
                 "The model has no tree of samples to export; build it first, with `marey tree`.", code="no-part"
@@ -131,15 +132,23 @@ def _alignment(part: Mapping[str, Any]) -> bytes:
     return write_predecessor_alignment(info.time_function, list(pairwise(bounds)))
 
 
-def _model(part: Mapping[str, Any], hierarchy: Mapping[str, Any], layout: Literal["2", "3"]) -> bytes:
+def _model(part: Mapping[str, Any], hierarchy: Mapping[str, Any], layout: Literal["2", "3"] | None) -> bytes:
+    """Return the file of a model; without `layout`, in the layout that can contain its time function exactly."""
     from marey_motion.documents import skeleton_from_document
     from marey_motion.formats.predecessor.model_writer import write_predecessor_model
+    from marey_motion.formats.predecessor.time_functions import PredecessorTime
     from marey_motion.modelling.primitive_documents import primitive_from_tree
+    from marey_motion.modelling.splines import SplineBasis
 
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
     primitive = primitive_from_tree(checked_model(part).model_dump(by_alias=True), skeleton)
+    known, time = predecessor_time(part), None
+    if known is not None:
+        time = PredecessorTime(known.form, SplineBasis(known.knots, known.degree), known.mean, known.eigen)
+    if layout is None:
+        layout = "2" if known is not None and known.form == "increments" else "3"
     animated = predecessor_origin(part).animated_joints
-    return write_predecessor_model(primitive, layout=layout, animated_joints=animated)
+    return write_predecessor_model(primitive, layout=layout, animated_joints=animated, time=time)
 
 
 def _tree(model: Mapping[str, Any], part: Mapping[str, Any]) -> bytes:

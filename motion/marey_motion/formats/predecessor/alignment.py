@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from marey_motion.alignment.warp import LEAST_SLOPE
 from marey_motion.arrays import Floats
 from marey_motion.errors import FormatError
-from marey_motion.formats.document_fields import field_of, number_array
-from marey_motion.formats.predecessor.annotation import SECTIONS
+from marey_motion.formats.document_fields import number_array
 from marey_motion.formats.predecessor.encoding import decode_document, encode_document
+from marey_motion.formats.predecessor.sections import SECTIONS, section_range
 
 TIME_FUNCTION = "time_function"
 MOST_FRAME = 2**31 - 1
@@ -68,7 +68,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
         message = f"field {TIME_FUNCTION!r} decreases at canonical frame {place}"
         raise FormatError(message, code="time-function-invalid", file=file)
     sections = [
-        (field_of(one, "start_idx", int, file), field_of(one, "end_idx", int, file))
+        section_range(one, len(frames), "exclusive", file)
         for one in (_list(document, SECTIONS, file) if SECTIONS in document else [])
     ]
     for start, end in sections:
