@@ -36,6 +36,16 @@ from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import TreeOptions
 
 
+_NEEDED: dict[str, str] = {
+    "notes": "an annotation or alignment must be imported together with its motion, and be called like it: for "
+    "example, walk_sections.json needs walk.bvh or walk.bson.bz2; to annotate a clip that is already stored, use "
+    "`marey annotation import`",
+    "skeleton model": "a skeleton model must be imported together with its skeleton, and be called like it: for "
+    "example, body_skeleton_model.json needs body_skeleton.json or body.skeleton",
+}
+"""What to do with files that are only read together with others, by subject."""
+
+
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
     """Import a model, with its cluster tree if the file has one as a companion; or import a graph.
 
@@ -57,6 +67,8 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
         message = "a tree over samples of a model must be imported together with the file of that model"
         example = "for example, walk_cluster_tree.json needs walk_mm.json"
         raise FormatError(f"{message}; {example}", code="model-missing", file=name)
+    if source.subject in _NEEDED:
+        raise FormatError(_NEEDED[source.subject], code="companion-of-nothing", file=name)
     if source.subject == "graph":
         read = graph_of_document(source.document, name)
         graph = ImportedGraph(file.planned.item_name, file.collection, file.options.tags, read, name, file.digest)

@@ -56,7 +56,25 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
     ------
     FormatError    if a field is missing or invalid; the error names it
     """
-    document = decode_document(data, file)
+    return alignment_of_document(decode_document(data, file), file)
+
+
+def alignment_of_document(document: Mapping[str, Any], file: str) -> PredecessorAlignment:
+    """Read an alignment from a decoded document, as `read_predecessor_alignment` does.
+
+    Parameters
+    ----------
+    document : mapping    the document
+    file : str    name of the file, for messages
+
+    Returns
+    -------
+    PredecessorAlignment    time function and sections
+
+    Raises
+    ------
+    FormatError    if a field is missing or invalid; the error names it
+    """
     frames = number_array(_list(document, TIME_FUNCTION, file), file, TIME_FUNCTION)
     if frames.ndim != 1 or len(frames) < 2 or (frames != np.floor(frames)).any() or (frames < 0).any():
         raise FormatError(f"field {TIME_FUNCTION!r} must be a list of at least two frames", file=file)

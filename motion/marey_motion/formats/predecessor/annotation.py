@@ -107,6 +107,62 @@ def layer_of_document(
         raise FormatError(f"{error}{hint}", code=error.code, file=file) from error
 
 
+def layers_of_document(
+    document: Mapping[str, Any], file: str, frame_count: int, *, end_index: EndIndex | None = None
+) -> dict[str | None, Layer]:
+    """Read an annotation from a decoded document, whose sections of different labels may overlap.
+
+    Parameters
+    ----------
+    document : mapping    the document
+    file : str    name of the file, for messages
+    frame_count : int    frames of the clip
+    end_index : str, optional    "inclusive" or "exclusive"; by default, "exclusive" if the sections of a label overlap
+        or exceed the clip otherwise
+
+    Returns
+    -------
+    dict of str or None to Layer    one layer with all labels under None, or, if labels overlap, one for each label
+
+    Raises
+    ------
+    FormatError    if a section is invalid; the error names label and section
+    """
+    tried: tuple[EndIndex, ...] = (DEFAULT_END_INDEX, "exclusive") if end_index is None else (end_index,)
+    refused: FormatError | None = None
+    for meaning in tried:
+        try:
+            return {None: layer_of_document(document, file, frame_count, end_index=meaning)}
+        except FormatError as error:
+            refused = refused or error
+    by_label = document.get(SEMANTIC) if isinstance(document.get(SEMANTIC), Mapping) else document.get(SECTIONS)
+    if isinstance(by_label, Mapping) and len(by_label) > 1:
+        for meaning in tried:
+            try:
+                return {
+                    label: layer_of_document(document, file, frame_count, end_index=meaning, labels=[label])
+                    for label in by_label
+                }
+            except FormatError:
+                continue
+    assert refused is not None
+    raise refused
+
+
+def is_annotation(document: Mapping[str, Any]) -> bool:
+    """Check whether a document is an annotation or an alignment.
+
+    Parameters
+    ----------
+    document : mapping    the document
+
+    Returns
+    -------
+    bool    True for an annotation or an alignment
+    """
+    return (SECTIONS in document or SEMANTIC in document) and not {"poses", "frames"} & document.keys()
+
+
 def write_predecessor_annotation(
     layer: Layer, *, form: AnnotationForm = DEFAULT_FORM, end_index: EndIndex = DEFAULT_END_INDEX
 ) -> bytes:
