@@ -1,7 +1,8 @@
 """Documents of Marey's predecessor, written and read here without the readers and writers of Marey.
 
 Everything in this module is right-handed, in centimetres, with quaternions w, x, y, z. Documents of the predecessor's
-database are mirrored in x: a translation (x, y, z) is stored as (-x, y, z), a quaternion (w, x, y, z) as (-w, -x, y, z).
+database are mirrored in x: a translation (x, y, z) is stored as (-x, y, z), a quaternion (w, x, y, z) as (-w, -x, y,
+z).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import bson
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
+from tests.support import predecessor_models as models
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -27,8 +29,8 @@ class Node:
 
     name: str
     parent: str | None
-    offset: tuple[float, float, float]
-    rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    offset: tuple[float, ...]
+    rotation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
 
 
 _LEG = ((9.0, -4.0, 1.0), (0.5, -43.0, 0.0), (0.0, -41.0, -2.0), (0.0, -7.0, 13.0))
@@ -217,7 +219,8 @@ def read_clip(document: Mapping[str, Any]) -> tuple[tuple[str, ...], Array]:
     """Read a clip of either form; return its joints and its poses."""
     if "frames" in document:
         rows = [
-            [one["rootTranslation"][axis] for axis in "xyz"] + [turn[part] for turn in one["rotations"] for part in "wxyz"]
+            [one["rootTranslation"][axis] for axis in "xyz"]
+            + [turn[part] for turn in one["rotations"] for part in "wxyz"]
             for one in document["frames"]
         ]
         names = tuple(document["jointSequence"])
@@ -302,5 +305,101 @@ def decode(data: bytes) -> Document:
     """Decode a document in any of the three encodings."""
     if data.startswith(b"BZh"):
         data = bz2.decompress(data)
-    document: Document = json.loads(data) if data.lstrip().startswith(b"{") and data.rstrip()[-1:] == b"}" else bson.decode(data)
+    document: Document = (
+        json.loads(data) if data.lstrip().startswith(b"{") and data.rstrip()[-1:] == b"}" else bson.decode(data)
+    )
     return document
+
+
+# A folder with one of each
+
+
+def transitions(*places: tuple[str, str, str]) -> Document:
+    """Return the transitions to places; each is an action, the name of a model, and its id in the database."""
+    return {
+        f"{action}:{number}": {"action_name": action, "model_name": name, "model_id": number}
+        for action, name, number in places
+    }
+
+
+def graph() -> Document:
+    """Return a graph over the models of `folder`."""
+    return {
+        "nodes": {
+            "idle": {"21": {"name": "stand", "type": "idle",
+                            "transitions": transitions(("idle", "stand", "21"), ("walk", "begin", "22"))}},
+            "walk": {
+                "22": {"name": "begin", "type": "start", "transitions": transitions(("walk", "left", "23"))},
+                "23": {"name": "left", "type": "standard",
+                       "transitions": transitions(("walk", "right", "24"), ("walk", "old", "25"))},
+                "24": {"name": "right", "type": "standard", "transitions": transitions(("walk", "left", "23"))},
+                "25": {"name": "old", "type": "end", "transitions": transitions(("idle", "stand", "21"))},
+            },
+        },
+        "start_node": ["idle", "stand"],
+    }  # fmt: skip
+
+
+TIME_FUNCTION = [min(47, int(1.2 * place)) for place in range(40)]
+"""Source frame of each canonical frame of the aligned clip."""
+SECTIONS: dict[str, Document] = {
+    "walk_sections.json": {"sections": [{"start_idx": 0, "end_idx": 19}, {"start_idx": 20, "end_idx": -1}]},
+    "turn_sections.json": {
+        "sections": {"left": [{"start_idx": 0, "end_idx": 10}, {"start_idx": 20, "end_idx": 40}],
+                     "right": [{"start_idx": 10, "end_idx": 20}]},
+    },
+    "run_sections.json": {"semantic_annotation": {"contact": [3, 4, 5, 11], "swing": [5, 6, 7]}},
+    "walk_aligned_alignment.json": {
+        "sections": [{"start_idx": 0, "end_idx": 20}, {"start_idx": 20, "end_idx": -1}],
+        "time_function": json.dumps(TIME_FUNCTION),
+    },
+}  # fmt: skip
+"""Notes of the clips of `folder`.
+
+Those of `walk` are inclusive, those of `turn` exclusive; labels of `run` overlap.
+"""
+
+
+def cluster_tree() -> Document:
+    """Return a tree whose root lists no samples, as the predecessor's builder writes it."""
+    tree = models.tree()
+    tree["root"]["indices"] = None
+    return tree
+
+
+def clips() -> dict[str, Document]:
+    """Return a clip in each form, by the name of its file."""
+    return {
+        "walk.bson.bz2": clip(poses_of(40, 1)),
+        "turn.bson": clip(poses_of(40, 2), tips=5),
+        "run.json": engine_clip(poses_of(40, 3)),
+        "walk_aligned.bson.bz2": clip(poses_of(40, 4)),
+    }
+
+
+def primitives() -> dict[str, Document]:
+    """Return a model in each layout, by the name of its file."""
+    joints = joints_of(RIG)
+    on_rig = {"skeleton": file_skeleton()}
+    ends = {"contact0": 20, "contact1": 48, "contact2": -1, "contact3": 60}
+    return {
+        "begin_mm.json": models.layout_3(1, joints) | on_rig | {"keyframes": ends},
+        "left_quaternion_mm.bson.bz2": models.layout_2(2, joints) | on_rig,
+        "right_mm.json": models.layout_2(3, joints, by_columns=False) | on_rig,
+        "old_mm.bson": models.layout_1(4, joints) | on_rig,
+        "stand_mm.json": models.static(5, joints) | on_rig,
+    }
+
+
+def folder() -> dict[str, bytes]:
+    """Return the files of a folder with a document of each kind, layout and odd form."""
+    documents = {
+        "body.skeleton": file_skeleton(),
+        "body_skeleton_model.json": {"name": "body", "model": skeleton_model()},
+        **clips(),
+        **SECTIONS,
+        **primitives(),
+        "begin_cluster_tree.json": cluster_tree(),
+        "steps.json": graph(),
+    }
+    return {name: encode(document, name) for name, document in documents.items()}

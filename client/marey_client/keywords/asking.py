@@ -34,6 +34,10 @@ class ImportKeywords(TypedDict, total=False):
     trust_options: bool
     """Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise such files are
     refused."""
+    end_index: Literal["inclusive", "exclusive"] | None
+    """Whether a section of an annotation in a file of Marey's predecessor includes its frame `end_idx`, as in the
+    predecessor's editor, or ends before this frame, as in its time warping. Absent: exclusive if sections would overlap
+    otherwise, else inclusive."""
     trim_rest_pose: bool
     """Remove rest poses at the beginning and at the end of each clip."""
     tags: list[str] | tuple[str, ...]

@@ -35,7 +35,6 @@ from marey_schemas.imports import skeleton_output
 from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import TreeOptions
 
-
 _NEEDED: dict[str, str] = {
     "notes": "an annotation or alignment must be imported together with its motion, and be called like it: for "
     "example, walk_sections.json needs walk.bvh or walk.bson.bz2; to annotate a clip that is already stored, use "

@@ -70,7 +70,9 @@ def described_skeleton(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
         if place != name and file.companion_digest is not None:
             original["model"] = original_of("mapping", mapping, place, file.companion_digest)
     elif place != name:
-        raise FormatError("the file is no skeleton model: it has no field 'joints'", code="document-unknown", file=place)
+        raise FormatError(
+            "the file is no skeleton model: it has no field 'joints'", code="document-unknown", file=place
+        )
     return replace(item, parts={**item.parts, "mapping": {**mapping, "predecessor": original}})
 
 

@@ -80,9 +80,9 @@ def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
                 files = [(name, path) for name, path in folder.items() if path not in described]
                 paired = _pairings_of_predecessor(files) if row is _PREDECESSOR else _pairings(row, files)
                 found |= {one.file: one for one in paired}
-        for path, note in notes.items():
-            pairing = found.get(path, Pairing(path, None, ()))
-            found[path] = replace(pairing, notes=note, beside=(*pairing.beside, note))
+        for file, note in notes.items():
+            pairing = found.get(file, Pairing(file, None, ()))
+            found[file] = replace(pairing, notes=note, beside=(*pairing.beside, note))
         pairings += found.values()
     return tuple(pairings)
 
@@ -165,7 +165,9 @@ def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
             yield Pairing(path, trees[model], (trees[model],))
         elif skeletons and model == stem and (bare == stem or bare not in models):
             found, beside = _best(stem, skeletons)
-            named = [joint_models[one] for one, skeleton in skeletons.items() if skeleton == found and one in joint_models]
+            named = [
+                joint_models[one] for one, skeleton in skeletons.items() if skeleton == found and one in joint_models
+            ]
             yield Pairing(path, found, (*beside, *named), shared=True)
 
 

@@ -116,7 +116,8 @@ def file_order(
 ) -> bytes:
     """Return the packed message that asks a child process to read a file, with the files that are read with it.
 
-    `sources` are the files that `PlannedFile.together` names. `sibling_axis` is the upward axis that other files with the same skeleton show.
+    `sources` are the files that `PlannedFile.together` names. `sibling_axis` is the upward axis that other files with
+    the same skeleton show.
     """
     with LOADING:
         from marey_server.motions.reading import FileOrder, packed_skeleton

@@ -73,7 +73,8 @@ def test_the_time_of_layout_3_is_a_spline_whose_coefficients_are_added_up_expone
     coefficients = np.cumsum(np.exp(np.array(part["mean"]) + scores @ np.array(part["eigen"])), axis=1) - 1.0
     theirs = BSpline(part["knots"], coefficients.T, 3)(np.arange(models.FRAMES)).T
     ours = found.primitive.time_functions(latents)
-    assert found.time is not None and found.time.form == "coefficients"
+    assert found.time is not None
+    assert found.time.form == "coefficients"
     assert 0.0 < found.time_error_frames < 1.0
     assert np.abs(ours - (theirs - theirs[:, :1])).max() < found.time_error_frames + 0.5
     assert found.primitive.frame_rate_hz == pytest.approx(72.0)
@@ -94,7 +95,8 @@ def test_time_parameters_of_layout_2_are_read_whichever_trainer_wrote_them() -> 
 
 def test_layout_1_tells_time_as_layout_3_does() -> None:
     found = read(models.layout_1())
-    assert found.time is not None and found.time.form == "coefficients"
+    assert found.time is not None
+    assert found.time.form == "coefficients"
     assert found.primitive.temporal.count == models.TEMPORAL
 
 

@@ -55,9 +55,7 @@ def is_skeleton_model(document: Mapping[str, Any]) -> bool:
     return isinstance(inner.get(JOINTS), Mapping) and not {"root", "jointDescs", "sspm"} & inner.keys()
 
 
-def skeleton_model_of_document(
-    document: Mapping[str, Any], skeleton: Skeleton, file: str
-) -> PredecessorSkeletonModel:
+def skeleton_model_of_document(document: Mapping[str, Any], skeleton: Skeleton, file: str) -> PredecessorSkeletonModel:
     """Read a skeleton model.
 
     Parameters
@@ -82,7 +80,8 @@ def skeleton_model_of_document(
         if joint is not None:
             joints[standard] = _known(joint, skeleton, JOINTS, file)
     found = PredecessorSkeletonModel(joints, rest={k: v for k, v in inner.items() if k not in (JOINTS, AXES)})
-    swings, twists = {}, {}
+    swings: dict[str, Floats] = {}
+    twists: dict[str, Floats] = {}
     for joint, axes in (field_of(inner, AXES, dict, file) if inner.get(AXES) is not None else {}).items():
         _known(joint, skeleton, AXES, file)
         for name, directions in (("x", swings), ("y", twists)):
@@ -103,7 +102,10 @@ def skeleton_model_document(model: PredecessorSkeletonModel) -> dict[str, Any]:
     dict    the document; standard joints that the skeleton does not have are null
     """
     axes = {
-        joint: {name: None if joint not in given else given[joint].tolist() for name, given in (("x", model.swings), ("y", model.twists))}
+        joint: {
+            name: None if joint not in given else given[joint].tolist()
+            for name, given in (("x", model.swings), ("y", model.twists))
+        }
         for joint in {**model.twists, **model.swings}
     }
     return {**model.rest, JOINTS: {name: model.joints.get(name) for name in STANDARD_JOINTS}, AXES: axes}
