@@ -32,7 +32,7 @@ class ImportOptions(Options):
     skeleton: str | None = Field(
         None,
         description="Item id of the skeleton that the clips must use; absent: an equal skeleton of the project, or a "
-        "new one.",
+        "new one. The command also accepts project/folder/name.",
     )
     unit: LengthUnit | None = Field(
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."
