@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from marey_schemas.queue.jobs import JobCreate
 
 pytestmark = pytest.mark.timeout(300)
 
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "move-in-from-the-predecessor.md"
 OFFSET_CM = np.array(old.RIG[0].offset)
 PARTS = {
     "body_skeleton_model.json": ("body.skeleton", "skeleton_model"),
@@ -131,11 +135,10 @@ def test_a_folder_with_one_of_each_goes_in_with_one_command_and_out_byte_for_byt
         owner, part = PARTS.get(name, (name, None))
         kind = "model" if "_mm" in owner else "clip"
         item = found[items.get(owner) or f"{kind} {owner.split('.')[0].removesuffix('_mm')}"]
-        written = item.export(tmp_path / "sdk", format="predecessor", part=part)
+        written = item.export(tmp_path / "out", format="predecessor", part=part)
         assert (written.name, written.read_bytes()) == (name, data)
-        options = [] if part is None else ["--part", part]
-        run("download", f"lab/{item.path}", "--format", "predecessor", *options, "-o", tmp_path / "command")
-        assert (tmp_path / "command" / name).read_bytes() == data
+    again = json.loads(run("upload", folder, "--project", "lab", "--collection", "old", "--json").stdout)
+    assert {entry["status"] for entry in again} == {"unchanged", "companion"}
 
 
 def test_a_job_imports_the_same_as_a_request(marey: Marey, lab: ProjectHandle, folder: Path, tmp_path: Path) -> None:
@@ -155,69 +158,27 @@ def test_a_job_imports_the_same_as_a_request(marey: Marey, lab: ProjectHandle, f
         assert found[key].export(tmp_path, format="predecessor", part=part).read_bytes() == old.folder()[name]
 
 
-def test_what_was_changed_is_written_so_that_the_predecessor_reads_it(
-    lab: ProjectHandle, run: CommandLine, folder: Path, tmp_path: Path
-) -> None:
-    run("upload", folder, "--project", "lab")
-    found = items_of(lab)
-
-    def written(item: Any, **options: str) -> dict[str, Any]:
-        return old.decode(item.export(tmp_path / "out", format="predecessor", **options).read_bytes())
-
-    for layout in ("database", "file"):
-        rig = old.rig_of(written(found["skeleton hik"], layout=layout))
-        theirs = {node.name: node for node in old.RIG if node.name in old.joints_of(old.RIG)}
-        for node in rig:
-            if node.name in theirs:
-                assert node.parent == theirs[node.name].parent
-                np.testing.assert_allclose(node.offset, theirs[node.name].offset, atol=1e-9)
-                np.testing.assert_allclose(node.rotation, theirs[node.name].rotation, atol=1e-9)
-    for name, document in old.primitives().items():
-        model = found[f"model {name.split('_')[0]}"]
-        model.put_part("model", {**model.part("model"), "verdict": "seen", "keyframes": {"contact0": 3}})
-        for layout in (None, "2", "3"):
-            if name.startswith(("stand", "old")):
-                continue
-            again = written(model, **({} if layout is None else {"layout": layout}))
-            scores = np.random.default_rng(4).normal(size=old.models.SPATIAL)
-            time = np.random.default_rng(5).normal(size=old.models.TEMPORAL)
-            np.testing.assert_allclose(old.model_poses(again, scores), old.model_poses(document, scores), atol=1e-9)
-            error = np.abs(old.model_times(again, time) - old.model_times(document, time)).max()
-            print(name, layout, error)
-            assert error < (1e-9 if layout is None else 0.05)
-            assert again["keyframes"] == {"contact0": 3}
-    for layout in ("2", "3"):
-        again = written(found["model stand"], layout=layout)
-        means = again["gmm"]["means"] if layout == "3" else again["gmm_means"]
-        assert np.shape(means) == (1, 1)
-        np.testing.assert_allclose(
-            old.model_poses(again, np.ones(1)),
-            BSpline(old.primitives()["stand_mm.json"]["knots"], old.primitives()["stand_mm.json"]["spatial_coeffs"], 3)(
-                np.arange(old.models.FRAMES)
-            ),
-            atol=1e-9,
-        )
-        np.testing.assert_allclose(old.model_times(again, np.zeros(0)), np.arange(old.models.FRAMES), atol=1e-6)
-    graph = found["graph steps"]
-    part = graph.part("graph")
-    part["actions"]["walk"]["primitives"]["begin"]["type"] = "standard"
-    graph.put_part("graph", part)
-    again = written(graph)
-    assert again["start_node"] == again["startNode"] == ["idle", "stand"]
-    clip = found["clip walk"]
-    motion = clip.part("motion")
-    clip.put_part("motion", {**motion, "poses": np.ascontiguousarray(motion["poses"][5:35])})
-    names, poses = old.read_clip(written(clip))
-    np.testing.assert_allclose(poses, old.read_clip(old.clips()["walk.bson.bz2"])[1][5:35], atol=1e-4)
-    assert names == old.joints_of(old.RIG)
-
-
-def test_a_clip_is_imported_on_a_skeleton_of_the_project(lab: ProjectHandle, run: CommandLine, folder: Path) -> None:
+def test_the_commands_of_the_page_run(lab: ProjectHandle, run: CommandLine, folder: Path, tmp_path: Path) -> None:
     refused = run("upload", folder / "walk.bson.bz2", "--project", "lab", status=1)
-    assert "--skeleton" in refused.stdout + refused.stderr
-    run("upload", folder / "body.skeleton", "--project", "lab")
-    run("upload", folder / "walk.bson.bz2", "--project", "lab", "--skeleton", "lab/skeletons/hik")
-    (clip,) = lab.clips.list()
+    assert "name a skeleton of the project with --skeleton" in refused.stdout + refused.stderr
+    (tmp_path / "body.skeleton").write_bytes((folder / "body.skeleton").read_bytes())
+    blocks = re.findall(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    commands = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
+    for command in commands:
+        run(*command[1:])
+    for name in ("walk.bson.bz2", "begin_cluster_tree.json", "walk_aligned_alignment.json"):
+        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
+    (clip,) = lab.clips.list(path="walk")
     names, poses = old.read_clip(old.clips()["walk.bson.bz2"])
     places = old.positions(old.RIG, names, poses)
     np.testing.assert_allclose(clip.positions(joints=["LeftHand"])[:, 0] * 100, places["LeftHand"], atol=2e-3)
+    layout_2 = old.decode((tmp_path / "begin_mm.json").read_bytes())
+    scores = np.random.default_rng(6).normal(size=old.models.TEMPORAL)
+    expected = old.model_times(old.primitives()["begin_mm.json"], scores)
+    np.testing.assert_allclose(old.model_times(layout_2, scores), expected, atol=1e-9)
+    model = old.decode((tmp_path / "hik.skeleton").read_bytes())["skeleton_model"]
+    assert model["joints"] == {**dict.fromkeys(model["joints"]), **old.skeleton_model()["joints"]}
+    assert model["cos_map"]["LeftArm"] == {"x": [0.0, 0.0, 1.0], "y": [1.0, 0.0, 0.0]}
+    assert model["joint_constraints"] == old.skeleton_model()["joint_constraints"]
+    frames = old.decode((tmp_path / "walk imported_sections.json").read_bytes())["semantic_annotation"]
+    assert frames == {"section 1": list(range(20)), "section 2": list(range(20, 40))}
