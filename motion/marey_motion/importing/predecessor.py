@@ -127,7 +127,7 @@ def noted_items(file: FileToImport, imported: ImportedMotion, motion: Tree, clip
     name = file.planned.notes
     document = decode_document(bytes(file.notes), name)
     if TIME_FUNCTION in document:
-        return [_aligned_item(file, document, motion, imported.clip.frame_rate_hz)]
+        return [_aligned_item(file, document, motion, imported)]
     layers = layers_of_document(document, name, imported.clip.frame_count, end_index=file.options.end_index)
     return [clip, *(_annotation(file, name, layer, label) for label, layer in layers.items())]
 
@@ -138,12 +138,14 @@ def _annotation(file: FileToImport, notes: str, layer: Layer, label: str | None)
     named = IMPORTED_LAYER if label is None else label
     part = layer_to_document(layer, ref, named).model_dump(mode="json", by_alias=True, exclude_none=True)
     part["original"] = original_of("annotation", part, notes, str(file.notes_digest))
-    item_name = f"{file.planned.item_name} {named}"[:MAX_NAME_LENGTH]
+    item_name = f"{file.planned.item_name} {named.replace('/', '_')}"[:MAX_NAME_LENGTH]
     item = main_item(file, Kind.ANNOTATION, item_name, {"annotation": part})
     return replace(item, name=notes_output(file.planned.name, named), tags=())
 
 
-def _aligned_item(file: FileToImport, document: Mapping[str, Any], motion: Tree, frame_rate_hz: float) -> ImportedItem:
+def _aligned_item(
+    file: FileToImport, document: Mapping[str, Any], motion: Tree, imported: ImportedMotion
+) -> ImportedItem:
     """Make the item of an aligned clip; the number of frames of its source is known from its time function alone."""
     name = str(file.planned.notes)
     found = alignment_of_document(document, name)
@@ -156,16 +158,16 @@ def _aligned_item(file: FileToImport, document: Mapping[str, Any], motion: Tree,
         "schema": "marey/alignment@1",
         "name": file.planned.item_name,
         "subject": file.options.subject,
-        "frame_rate_hz": frame_rate_hz,
+        "frame_rate_hz": motion["frame_rate_hz"],
         "source_frames": source_frames,
         "time_function": as_increasing(found.frames, source_frames),
         "keyframes": {f"contact{number}": end for number, end in enumerate(ends)},
     }
     info = {key: value for key, value in info.items() if value is not None}
-    info["predecessor"] = {
-        "motion": original_of("motion", motion, file.planned.name, file.digest),
-        "alignment": original_of("alignment", info, name, str(file.notes_digest)),
-    }
+    origin = {"alignment": original_of("alignment", info, name, str(file.notes_digest))}
+    if motion_content(file, imported, motion) is not None:
+        origin["motion"] = original_of("motion", motion, file.planned.name, file.digest)
+    info["predecessor"] = origin
     AlignmentInfo.model_validate(info)
     return main_item(file, Kind.PROCESSED, file.planned.item_name, {"motion": motion, "info": info})
 

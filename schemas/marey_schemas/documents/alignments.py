@@ -42,7 +42,9 @@ class AlignedPlacement(Request):
 class PredecessorAlignedOrigin(Request):
     """Files of Marey's predecessor that an aligned clip was imported from."""
 
-    motion: StoredOriginal
+    motion: StoredOriginal | None = Field(
+        None, description="The file of the motion; absent for files in other formats."
+    )
     alignment: StoredOriginal
 
 

@@ -66,6 +66,10 @@ def test_sections_are_inclusive_unless_they_would_overlap_or_the_user_knows_bett
 def test_labels_that_overlap_become_one_annotation_each() -> None:
     both = {"semantic_annotation": {"left": [0, 1, 2], "right": [2, 3]}}
     assert segments(both) == {"walk left": [("left", 0, 3)], "walk right": [("right", 2, 4)]}
+    many = {"semantic_annotation": {f"label {number}": [0, 1] for number in range(65)}}
+    assert (
+        "only 64 labels may become one annotation each" in refusal({**CLIP, "walk_sections.json": many}, "walk.bson")[1]
+    )
 
 
 def test_an_aligned_clip_is_told_by_the_time_function_in_its_notes() -> None:

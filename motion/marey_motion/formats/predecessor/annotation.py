@@ -21,13 +21,15 @@ from typing import Any
 import numpy as np
 
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
-from marey_motion.errors import AnnotationError, FormatError
+from marey_motion.errors import AnnotationError, FormatError, FormatLimit
 from marey_motion.formats.document_fields import field_of, number_array
 from marey_motion.formats.predecessor.encoding import decode_document, encode_document
 from marey_motion.formats.predecessor.sections import SECTIONS, section_range
 from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationForm, EndIndex
 
 SEMANTIC, KEYFRAMES = "semantic_annotation", "keyframes"
+MOST_LAYERS = 64
+"""Greatest number of annotations that one document may become."""
 
 
 def read_predecessor_annotation(
@@ -136,6 +138,9 @@ def layers_of_document(
         except FormatError as error:
             refused = refused or error
     by_label = document.get(SEMANTIC) if isinstance(document.get(SEMANTIC), Mapping) else document.get(SECTIONS)
+    assert refused is not None
+    if isinstance(by_label, Mapping) and len(by_label) > MOST_LAYERS:
+        raise FormatLimit(f"{refused.message}; only {MOST_LAYERS} labels may become one annotation each", file=file)
     if isinstance(by_label, Mapping) and len(by_label) > 1:
         for meaning in tried:
             try:
@@ -145,7 +150,6 @@ def layers_of_document(
                 }
             except FormatError:
                 continue
-    assert refused is not None
     raise refused
 
 
