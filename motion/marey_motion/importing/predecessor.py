@@ -19,6 +19,7 @@ from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor.alignment import TIME_FUNCTION, alignment_of_document, as_increasing
 from marey_motion.formats.predecessor.annotation import layers_of_document
 from marey_motion.formats.predecessor.encoding import decode_document
+from marey_motion.formats.predecessor.skeleton import FORMAT
 from marey_motion.formats.predecessor.skeleton_model import (
     PredecessorSkeletonModel,
     across,
@@ -56,7 +57,7 @@ def described_skeleton(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
     FormatError    if the skeleton model does not fit the skeleton
     """
     item = skeleton_item(file, skeleton)
-    mapping = anatomy_of(skeleton).mapping_part(None)
+    mapping = dict(anatomy_of(skeleton).mapping_part(None))  # a copy: equal skeletons share the document
     name, companion = file.planned.name, file.planned.companion
     own = decode_document(bytes(file.data), name)
     document, place = own.get("skeleton_model"), name
@@ -186,6 +187,6 @@ def motion_content(file: FileToImport, imported: ImportedMotion, motion: Tree) -
     str or None    the digest
     """
     options, source = file.options, imported.source
-    unchanged = source.format == "predecessor" and source.trimmed_frames == (0, 0) and source.floor_shift_m == 0.0
+    unchanged = source.format == FORMAT and source.trimmed_frames == (0, 0) and source.floor_shift_m == 0.0
     given = options.frame_rate_hz or options.metres_per_unit or options.up_axis or options.handedness != "right"
     return content_digest("motion", motion) if unchanged and not given else None

@@ -120,6 +120,8 @@ def test_a_skeleton_model_decides_joints_and_axes_wherever_it_is_stored() -> Non
         assert np.dot(axes["twist"], axes["swing"]) == pytest.approx(0.0, abs=1e-9)
         assert np.linalg.norm(axes["swing"]) == pytest.approx(1.0)
     assert beside["axes"]["RightArm"]["twist"] == [-1.0, 0.0, 0.0]
+    plain = import_all({"body.skeleton": old.file_skeleton()})["body.skeleton"].items[0].parts["mapping"]
+    assert (plain["method"], plain["predecessor"].keys()) == ("names", {"skeleton"})
     lone = mapping({**model, "cos_map": {"LeftHand": {"x": [0.0, 3.0, 0.0], "y": None}}})
     assert lone["axes"]["LeftHand"]["swing"] == [0.0, 1.0, 0.0]
 
