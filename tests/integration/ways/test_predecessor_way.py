@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 from tests.support import predecessor_documents as old
+from tests.support import predecessor_models as models
 from tests.support.command_line import CommandLine
 
 from marey_client import Marey
@@ -89,7 +90,7 @@ def require_same_numbers(found: dict[str, Any]) -> None:
 def require_same_model(model: dict[str, Any], document: dict[str, Any]) -> None:
     """Compare a stored model with its document at random scores."""
     space = model["spatial"]
-    frames = np.arange(old.models.FRAMES)
+    frames = np.arange(models.FRAMES)
     scores = np.random.default_rng(3).normal(size=len(space["directions"]))
     coefficients = space["mean"] + np.tensordot(scores, space["directions"], axes=1)
     ours = BSpline(space["knots"], coefficients, space["degree"])(frames)
@@ -173,7 +174,7 @@ def test_the_commands_of_the_page_run(lab: ProjectHandle, run: CommandLine, fold
     places = old.positions(old.RIG, names, poses)
     np.testing.assert_allclose(clip.positions(joints=["LeftHand"])[:, 0] * 100, places["LeftHand"], atol=2e-3)
     layout_2 = old.decode((tmp_path / "begin_mm.json").read_bytes())
-    scores = np.random.default_rng(6).normal(size=old.models.TEMPORAL)
+    scores = np.random.default_rng(6).normal(size=models.TEMPORAL)
     expected = old.model_times(old.primitives()["begin_mm.json"], scores)
     np.testing.assert_allclose(old.model_times(layout_2, scores), expected, atol=1e-9)
     model = old.decode((tmp_path / "hik.skeleton").read_bytes())["skeleton_model"]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 from tests.support import predecessor_documents as old
+from tests.support import predecessor_models as models
 
 from marey_motion.clip import Clip
 from marey_motion.documents import skeleton_from_document
@@ -28,7 +29,7 @@ from marey_server.motions.predecessor_exports import (
 
 DIGEST = f"sha256:{'1' * 64}"
 BESIDE = f"sha256:{'2' * 64}"
-FRAMES = np.arange(old.models.FRAMES)
+FRAMES = np.arange(models.FRAMES)
 TIMED = [name for name in old.primitives() if not name.startswith(("stand", "old"))]
 """Models that the independent reader reads: it does not know layout 1."""
 
@@ -101,9 +102,9 @@ def test_changed_models_have_the_poses_and_the_time_that_they_had(
     key, document = f"model {name.split('_')[0]}", old.primitives()[name]
     changed = {**imported[key].parts["model"], "keyframes": {"contact0": 3}}
     _, again = written(imported, key, PredecessorOptions(layout=layout), model=changed)
-    scores = np.random.default_rng(4).normal(size=old.models.SPATIAL)
+    scores = np.random.default_rng(4).normal(size=models.SPATIAL)
     np.testing.assert_allclose(old.model_poses(again, scores), old.model_poses(document, scores), atol=1e-9)
-    times = np.random.default_rng(5).normal(size=(20, old.models.TEMPORAL))
+    times = np.random.default_rng(5).normal(size=(20, models.TEMPORAL))
     error = max(np.abs(old.model_times(again, one) - old.model_times(document, one)).max() for one in times)
     assert error < (0.02 if layout == "3" and name.startswith("left") else 1e-9)  # frames; `left` steps by increments
     assert again["keyframes"] == {"contact0": 3}
@@ -165,7 +166,7 @@ def test_annotations_and_clips_that_were_changed_are_read_again(imported: Mappin
     poses = imported["clip run"].parts["motion"]["poses"][5:35]
     names, expected = old.read_clip(old.clips()["run.json"])
     for form in ("poses", "frames"):
-        again = old.decode(write_clip(Clip(skeleton, 30.0, poses), form=form))  # type: ignore[arg-type]
+        again = old.decode(write_clip(Clip(skeleton, 30.0, poses), form=form))
         assert old.read_clip(again)[0] == names
         np.testing.assert_allclose(old.read_clip(again)[1], expected[5:35], atol=2e-5)
 

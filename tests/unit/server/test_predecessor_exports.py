@@ -30,6 +30,8 @@ def test_unchanged_parts_are_given_back_as_their_files(
     parts, _ = stored
     model = unchanged_original(Kind.MODEL, parts, PredecessorOptions())
     tree = unchanged_original(Kind.MODEL, parts, PredecessorOptions(part="tree"))
+    assert model is not None
+    assert tree is not None
     assert (model.name, model.blob) == ("walk_mm.json", FILE)
     assert (tree.name, tree.blob) == ("walk_cluster_tree.json", TREE_FILE)
 
