@@ -63,6 +63,11 @@ def skeleton_output(file_name: str) -> str:
     return f"{file_name}#skeleton"
 
 
+def notes_output(file_name: str, layer: str) -> str:
+    """Return the name that an import job gives to its output with an annotation of a file's clip."""
+    return f"{file_name}#notes {layer}"
+
+
 class ImportAnswer(Answer):
     """One entry per file, in the order sent."""
 

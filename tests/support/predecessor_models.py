@@ -90,21 +90,21 @@ def flat(seed: int = 1, joints: tuple[str, ...] = ANIMATED) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def layout_2(seed: int = 1, *, by_columns: bool = True) -> dict[str, Any]:
+def layout_2(seed: int = 1, joints: tuple[str, ...] = ANIMATED, *, by_columns: bool = True) -> dict[str, Any]:
     """Return a document of layout 2. With `by_columns`, components of time are columns, as in the oldest files."""
     mean, vectors = time(np.random.default_rng(seed + 100))
     if by_columns:
         mean = (0.02 * np.random.default_rng(seed).normal(size=TIME_COEFFICIENTS)).tolist()
         vectors = np.transpose(vectors).tolist()
-    return flat(seed) | {
+    return flat(seed, joints) | {
         "eigen_vectors_time": vectors, "mean_time_vector": mean, "n_basis_time": TIME_COEFFICIENTS,
         "b_spline_knots_time": knots(TIME_COEFFICIENTS),
     }  # fmt: skip
 
 
-def layout_1(seed: int = 1) -> dict[str, Any]:
+def layout_1(seed: int = 1, joints: tuple[str, ...] = ANIMATED) -> dict[str, Any]:
     mean, vectors = time(np.random.default_rng(seed + 100))
-    return flat(seed) | {
+    return flat(seed, joints) | {
         "npc_spatial": SPATIAL, "eigen_vectors_temporal_semantic": vectors, "mean_temporal_semantic_vector": mean,
         "n_basis_temporal_semantic": TIME_COEFFICIENTS, "n_dim_temporal_semantic": 1,
         "b_spline_knots_temporal_semantic": knots(TIME_COEFFICIENTS), "npc_temporal_semantic": TEMPORAL,
@@ -112,8 +112,8 @@ def layout_1(seed: int = 1) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def static(seed: int = 1) -> dict[str, Any]:
-    mean, _ = space(np.random.default_rng(seed), SKELETON.joint_names)
+def static(seed: int = 1, joints: tuple[str, ...] = SKELETON.joint_names) -> dict[str, Any]:
+    mean, _ = space(np.random.default_rng(seed), joints)
     return {
         "name": "idle", "spatial_coeffs": np.reshape(mean, (COEFFICIENTS, -1)).tolist(), "knots": knots(COEFFICIENTS),
         "n_canonical_frames": FRAMES, "skeleton": skeleton_document(SKELETON, form="file"),

@@ -18,7 +18,8 @@ class ImportKeywords(TypedDict, total=False):
     collection: str
     """Folder of the project that receives the clips."""
     skeleton: str | None
-    """Item id of the skeleton that the clips must use; absent: an equal skeleton of the project, or a new one."""
+    """Item id of the skeleton that the clips must use; absent: an equal skeleton of the project, or a new one. The
+    command also accepts project/folder/name."""
     unit: Literal["mm", "cm", "inch", "cmu", "dm", "ft", "m"] | None
     """Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."""
     unit_scale_m: float | None
@@ -34,6 +35,10 @@ class ImportKeywords(TypedDict, total=False):
     trust_options: bool
     """Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise such files are
     refused."""
+    end_index: Literal["inclusive", "exclusive"] | None
+    """Whether a section of an annotation in a file of Marey's predecessor includes its frame `end_idx`, as in the
+    predecessor's editor, or ends before this frame, as in its time warping. Absent: exclusive if sections would overlap
+    otherwise, else inclusive."""
     trim_rest_pose: bool
     """Remove rest poses at the beginning and at the end of each clip."""
     tags: list[str] | tuple[str, ...]

@@ -18,6 +18,7 @@ from marey_motion.formats.detection import detect_format
 from marey_motion.formats.npz import write_npz
 from marey_motion.formats.predecessor import write_predecessor, write_predecessor_skeleton
 from marey_motion.importing.source import ImportedMotion, SourceDocument, SourceInfo, SourceMotion
+from marey_motion.skeleton import Skeleton
 from marey_schemas.formats import MOTION_FORMATS, FileFormat
 from marey_schemas.options.imports import ImportOptions
 
@@ -88,6 +89,7 @@ def read_source(
     companion: bytes | memoryview | None,
     companion_name: str,
     options: ImportOptions,
+    skeleton: Skeleton | None = None,
 ) -> SourceMotion | SourceDocument:
     """Detect the format of a file and read it in its own unit and axes.
 
@@ -98,6 +100,8 @@ def read_source(
     companion : bytes or None    content of the companion file, such as the ASF of an AMC
     companion_name : str    name of the companion file
     options : ImportOptions    facts about the file, such as its unit; they have precedence over the content
+    skeleton : Skeleton, optional    skeleton of motions in a format whose files do not contain one; it has precedence
+        over the companion
 
     Returns
     -------
@@ -118,6 +122,8 @@ def read_source(
         given["frame_rate_hz"] = options.frame_rate_hz
     if row.companion is not None and companion is not None:
         given |= {"companion": bytes(companion), "companion_name": companion_name}
+    if row.companion == row.name and skeleton is not None:
+        given["skeleton"] = skeleton
     source: SourceMotion | SourceDocument = reader_of(row)(content, name, **given)
     return source
 

@@ -22,6 +22,7 @@ CODES = {
     # What the file says, and what was made of it.
     "frame-count-mismatch": "The file has more or fewer frames than its header declares; all were imported.",
     "frames-wrapped": "Frames are divided into several lines; the lines were joined by counting values.",
+    "keyframes-at-end": "Keyframes at the end of the motion were moved from after the last frame to the last frame.",
     "no-frames": "The file contains no motion; only its skeleton was imported.",
     "frame-time-snapped": "The frame time in the file is rounded; the nearest usual frame rate was used.",
     "frame-rate-unusual": "The frame rate is close to a usual one, but not equal to it; it was not changed.",

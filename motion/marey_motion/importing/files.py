@@ -16,6 +16,7 @@ from marey_motion.documents import clip_from_document, clip_to_tree, skeleton_fr
 from marey_motion.errors import AmbiguousUnits, FormatError, MotionError
 from marey_motion.formats import read_source
 from marey_motion.formats.conversion import convert
+from marey_motion.formats.predecessor.skeleton import FORMAT as PREDECESSOR
 from marey_motion.importing.anatomy import anatomy_of
 from marey_motion.importing.items import (
     FileToImport,
@@ -27,6 +28,7 @@ from marey_motion.importing.items import (
     skeleton_item,
 )
 from marey_motion.importing.plan import PlannedFile
+from marey_motion.importing.predecessor import described_skeleton, motion_content, noted_items
 from marey_motion.importing.siblings import AxisFinding
 from marey_motion.importing.source import ImportedMotion, SourceDocument
 from marey_motion.skeleton import SAME_OFFSET_M, Skeleton
@@ -108,6 +110,7 @@ def _imported(file: FileToImport) -> ImportedFile:
         companion=file.companion,
         companion_name=file.planned.companion or "the companion",
         options=file.options,
+        skeleton=None if file.skeleton is None else given_skeleton(file.skeleton),
     )
     if isinstance(source, SourceDocument):
         from marey_motion.importing.models import import_document
@@ -127,12 +130,15 @@ def _imported(file: FileToImport) -> ImportedFile:
     if file.skeleton is not None and imported.clip is not None:
         imported = _on_skeleton(imported, imported.clip, given_skeleton(file.skeleton), file.planned.name)
         reference = file.skeleton.ref
+    elif imported.clip is None and imported.source.format == PREDECESSOR:
+        items.append(described_skeleton(file, imported.skeleton))
     else:
         items.append(skeleton_item(file, imported.skeleton))
     if (clip := imported.clip) is not None:
         motion = clip_to_tree(clip, reference)
-        parts = {"motion": motion, "info": _info(imported, file, checks)}
-        items.append(main_item(file, Kind.CLIP, file.planned.item_name, parts))
+        parts = {"motion": motion, "info": _info(imported, file, checks, motion)}
+        item = main_item(file, Kind.CLIP, file.planned.item_name, parts)
+        items += [item] if file.notes is None else noted_items(file, imported, motion, item)
     frames = None if clip is None else clip.frame_count
     return ImportedFile(file.planned.name, tuple(items), checks, frames, axis=axis)
 
@@ -162,7 +168,7 @@ def _check_document(warning: Tree) -> Tree:
     return {key: value for key, value in warning.items() if value is not None}
 
 
-def _info(imported: ImportedMotion, file: FileToImport, checks: tuple[Tree, ...]) -> Tree:
+def _info(imported: ImportedMotion, file: FileToImport, checks: tuple[Tree, ...], motion: Tree) -> Tree:
     details = {key: value for key, value in imported.source.as_dict().items() if key not in ("format", "file")}
     companion = file.planned.companion
     source = {
@@ -170,6 +176,7 @@ def _info(imported: ImportedMotion, file: FileToImport, checks: tuple[Tree, ...]
         "file_name": base_name(file.planned.name),
         "companion": file.companion_digest,
         "companion_name": None if companion is None else base_name(companion),
+        "content": motion_content(file, imported, motion),
         "format": imported.source.format,
         "details": details,
     }

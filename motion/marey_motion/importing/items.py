@@ -46,6 +46,7 @@ class FileToImport:
     data, digest : bytes of the file and their digest, which is recorded as the origin of a clip
     companion, companion_digest : bytes and digest of the companion file that the plan names
     options : import options given by the user
+    notes, notes_digest : bytes and digest of the file with the annotation or alignment of the motion
     skeleton : stored skeleton that the clips must use
     sibling_axis : upward axis of other files with this skeleton; None in the first look at a file
     """
@@ -58,6 +59,8 @@ class FileToImport:
     companion_digest: str | None = None
     skeleton: GivenSkeleton | None = None
     sibling_axis: UpAxis | None = None
+    notes: bytes | memoryview | None = None
+    notes_digest: str | None = None
 
     @property
     def collection(self) -> str:
@@ -100,7 +103,7 @@ class ImportedFile:
     Parameters
     ----------
     items : a skeleton, a clip or a model, or else a skeleton followed by a clip or model that uses it. The skeleton has
-        no document `mapping` yet: see `mapping_part`
+        no document `mapping` yet, except that of a file of the predecessor's: see `mapping_part`
     checks : findings about the motion, as documents
     frames : number of frames of the clip
     graph : content of a file that holds a graph instead of items

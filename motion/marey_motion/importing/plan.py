@@ -28,6 +28,7 @@ class PlannedFile:
     role : `motion` for a file to import, `skeleton` for one with which other files are read, too, `companion` for a
         file that is only read with another file, or `refused`
     companion : name of the companion file that this file needs; None if it needs none
+    notes : name of the file with the annotation or the alignment of this file's motion; None if there is none
     folder, item_name : path below the collection that receives the import, and name of the clip
     reason : reason why the file is refused; empty for other roles
     """
@@ -37,8 +38,31 @@ class PlannedFile:
     folder: str = ""
     item_name: str = ""
     companion: str | None = None
+    notes: str | None = None
     code: str = ""
     reason: str = ""
+
+    @property
+    def together(self) -> tuple[str, ...]:
+        """Names of the files that are read together: this file, its companion and its notes."""
+        return tuple(name for name in (self.name, self.companion, self.notes) if name is not None)
+
+
+def reading_order(plan: Sequence[PlannedFile]) -> list[int]:
+    """Return the places of the files of a plan in the order in which they must be imported.
+
+    Skeletons come first. The file of a skeleton says more about it than a clip of the skeleton does, and the first file
+    that contains a skeleton creates its item.
+
+    Parameters
+    ----------
+    plan : sequence of PlannedFile    the plan
+
+    Returns
+    -------
+    list of int    every place once
+    """
+    return sorted(range(len(plan)), key=lambda place: plan[place].role != "skeleton")
 
 
 def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
@@ -56,6 +80,7 @@ def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
     """
     pairings = {pairing.file: pairing for pairing in pair_companions(names)}
     companions = {one.companion: one.shared for one in pairings.values() if one.companion is not None}
+    companions |= dict.fromkeys((one.notes for one in pairings.values() if one.notes is not None), False)
     taken: set[tuple[str, str]] = set()
     seen: set[str] = set()
     planned = []
@@ -65,11 +90,12 @@ def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
         if name in seen:
             one = replace(one, role="refused", code="name-repeated", reason="another file of the upload has this name")
         elif one.role == "motion" and name in companions:
-            one = replace(one, role="skeleton" if companions[name] else "companion")
+            own = pairing.companion if pairing is not None and companions[name] else None
+            one = replace(one, role="skeleton" if companions[name] else "companion", companion=own)
         elif one.role == "motion" and pairing is not None and pairing.code:
             one = replace(one, role="refused", code=pairing.code, reason=pairing.reason)
         elif one.role == "motion" and pairing is not None:
-            one = replace(one, companion=pairing.companion)
+            one = replace(one, companion=pairing.companion, notes=pairing.notes)
         if one.role == "motion":
             taken.add((one.folder, one.item_name))
         seen.add(name)

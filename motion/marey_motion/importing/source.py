@@ -16,7 +16,7 @@ from marey_motion.importing.checks import CheckWarning
 from marey_motion.skeleton import Skeleton
 from marey_schemas.options.imports import Handedness, UpAxis
 
-Subject = Literal["model", "tree", "graph"]
+Subject = Literal["model", "tree", "graph", "notes", "skeleton model"]
 
 
 @dataclass(eq=False)
@@ -83,7 +83,10 @@ class SourceMotion:
 
 @dataclass(frozen=True)
 class SourceDocument:
-    """A decoded file that holds no motion: a model, a tree over the samples of a model, or a graph of models."""
+    """A decoded file that holds no motion: a model, a tree over the samples of a model, or a graph of models.
+
+    Other subjects are notes about a motion (an annotation or an alignment), and the skeleton model of a skeleton.
+    """
 
     subject: Subject
     document: Mapping[str, Any]

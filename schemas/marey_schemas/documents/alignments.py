@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.documents.metrics import MetricIdentity
+from marey_schemas.documents.originals import StoredOriginal
 from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import Digest, JointName, Label
 from marey_schemas.queue.job_params import AlignParams
@@ -36,6 +37,15 @@ class AlignedPlacement(Request):
     y: Metres = Field(0.0, allow_inf_nan=False, description="Height that was subtracted from the clip, in metres.")
     z: Metres = 0.0
     joint: JointName | None = Field(None, description="The joint whose position is given; default: the root.")
+
+
+class PredecessorAlignedOrigin(Request):
+    """Files of Marey's predecessor that an aligned clip was imported from."""
+
+    motion: StoredOriginal | None = Field(
+        None, description="The file of the motion; absent for files in other formats."
+    )
+    alignment: StoredOriginal
 
 
 class AlignmentInfo(Request):
@@ -80,6 +90,7 @@ class AlignmentInfo(Request):
         None, description="Perceptual metric whose distance of poses was the cost; costs of other metrics differ."
     )
     options: AlignParams | None = Field(None, description="Options of the alignment; absent if unknown.")
+    predecessor: PredecessorAlignedOrigin | None = None
 
     @model_validator(mode="after")
     def _check_times(self) -> Self:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Request
+from marey_schemas.documents.originals import StoredOriginal
 from marey_schemas.documents.references import OutputRef as OutputRef
 from marey_schemas.documents.references import RevisionRef as RevisionRef
 
@@ -44,6 +45,7 @@ class Annotation(Request):
     made_by: Literal["person", "algorithm"] = "person"
     segments: tuple[SegmentDocument, ...] = Field((), description="Segments in the order of their frames.")
     keyframes: tuple[KeyframeDocument, ...] = Field((), description="Keyframes in the order of their frames.")
+    original: StoredOriginal | None = Field(None, description="The file that the annotation was imported from.")
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:

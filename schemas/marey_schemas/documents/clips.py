@@ -86,6 +86,11 @@ class ClipSource(Request):
         None, description="A second file that the format needs, such as the ASF of an AMC."
     )
     companion_name: str | None = None
+    content: Digest | None = Field(
+        None,
+        description="Digest of what the motion took from a file of Marey's predecessor; absent if the import changed "
+        "the motion.",
+    )
     format: str | None = None
     details: dict[str, Any] = Field(
         default_factory=dict,

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.documents.originals import StoredOriginal
+from marey_schemas.documents.originals import StoredOriginal, content_digest
 from marey_schemas.documents.references import OutputRef, RevisionRef
 from marey_schemas.encoding.arrays import ArrayOf
-from marey_schemas.names import ItemName, JointName
+from marey_schemas.names import Digest, ItemName, JointName
 
 MOST_JOINTS = 4096
 MOST_KEYFRAMES = 1000
@@ -95,6 +95,23 @@ class Noted(Request):
     model_config = ConfigDict(extra="allow")
 
 
+class PredecessorTimeDocument(Request):
+    """Time function of a model as its file contains it; it depends on k temporal scores of a latent vector.
+
+    Marey's own form of time functions is less general, so that `temporal` only approximates some time functions.
+    """
+
+    form: Literal["coefficients", "increments"] = Field(
+        description="coefficients: the spline coefficients are cumsum(exp(mean + g·eigen)) - 1. increments: the "
+        "exponential of the spline is the number of frames that pass in each step."
+    )
+    knots: Vector
+    degree: int = Field(ge=1, lt=10)
+    mean: Vector = Field(description="[n] mean coefficients.")
+    eigen: Matrix = Field(description="[k, n] change of the coefficients per unit of each score.")
+    content: Digest = Field(description="Digest of the members of the model that were converted from this function.")
+
+
 class PredecessorOrigin(Noted):
     """Origin of a model that was imported from Marey's predecessor."""
 
@@ -103,6 +120,7 @@ class PredecessorOrigin(Noted):
     )
     original: StoredOriginal | None = Field(None, description="The imported file of the model.")
     tree: StoredOriginal | None = Field(None, description="The imported file of the model's tree.")
+    time: PredecessorTimeDocument | None = Field(None, description="The imported time function.")
 
 
 class ModelProvenance(Noted):
@@ -208,11 +226,34 @@ def checked_model(part: Mapping[str, Any]) -> MotionPrimitiveDocument:
 
 
 def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
-    """Return the origin of a model imported from Marey's predecessor, from its part `model`; empty if not recorded."""
+    """Return the origin of a model imported from Marey's predecessor, from its part `model`; empty if not recorded.
+
+    The time function is left out, so that the arrays of the part may be references.
+    """
     try:
-        return ModelProvenance.model_validate(model.get("provenance", {})).predecessor or PredecessorOrigin()
+        provenance = ModelProvenance.model_validate(_without_time(model.get("provenance", {})))
     except ValidationError:
         return PredecessorOrigin()
+    return provenance.predecessor or PredecessorOrigin()
+
+
+def _without_time(provenance: Any) -> Any:
+    if not (isinstance(provenance, Mapping) and isinstance(provenance.get("predecessor"), Mapping)):
+        return provenance
+    return {**provenance, "predecessor": {**provenance["predecessor"], "time": None}}
+
+
+def predecessor_time(model: Mapping[str, Any]) -> PredecessorTimeDocument | None:
+    """Return the time function of a model as it was imported from Marey's predecessor.
+
+    Return None if it is not recorded, or if the time function of the part `model` was changed since.
+    """
+    try:
+        origin = ModelProvenance.model_validate(model.get("provenance", {})).predecessor
+    except ValidationError:
+        return None
+    time = None if origin is None else origin.time
+    return time if time is not None and time.content == content_digest("time", model) else None
 
 
 def log_likelihoods(model: Mapping[str, Any]) -> tuple[float, ...]:

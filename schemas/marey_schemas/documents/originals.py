@@ -1,4 +1,4 @@
-"""Imported files of models, trees and graphs.
+"""Imported files in the formats of Marey's predecessor.
 
 A file is exported again byte for byte as long as the part that the import created from it is unchanged.
 """
@@ -18,10 +18,19 @@ CONTENT = {
     "model": (
         "name", "joints", "frame_rate_hz", "spatial", "temporal", "temporal_weight", "mixture", "keyframes",
     ),
+    "time": ("temporal", "temporal_weight"),
     "tree": ("samples", "sizes", "children"),
     "graph": ("actions", "start"),
+    "hierarchy": ("joints", "end_sites"),
+    "mapping": ("joints", "axes"),
+    "motion": ("joints", "frame_rate_hz", "poses", "translations", "translated_joints"),
+    "alignment": ("time_function", "source_frames", "frame_rate_hz", "keyframes"),
+    "annotation": ("segments", "keyframes"),
 }  # fmt: skip
-"""Names of the members whose values come from the imported file, by part."""
+"""Names of the members whose values come from the imported file, by part.
+
+`time` is the time function of a model, `alignment` the part `info` of an aligned clip.
+"""
 
 
 class StoredOriginal(Request):

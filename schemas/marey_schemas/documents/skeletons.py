@@ -5,11 +5,12 @@ Lengths are in metres. Quaternions are w,x,y,z. Axes are right-handed with Y up 
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
+from marey_schemas.documents.originals import StoredOriginal
 from marey_schemas.documents.references import OutputRef as OutputRef
 from marey_schemas.documents.references import RevisionRef as RevisionRef
 from marey_schemas.names import JointName
@@ -68,6 +69,17 @@ class JointAxesDocument(Request):
     swing: Vector3
 
 
+class PredecessorSkeletonOrigin(Request):
+    """Files of Marey's predecessor that a skeleton was imported from."""
+
+    skeleton: StoredOriginal | None = Field(None, description="The file of the hierarchy.")
+    model: StoredOriginal | None = Field(None, description="The file of the skeleton model: joints and axes.")
+    rest: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Members of the skeleton model that have no counterpart here, such as limits of joints.",
+    )
+
+
 class SkeletonMapping(Request):
     """Part `mapping` of a skeleton, which users can edit: the joint for each standard joint, and the axes of joints."""
 
@@ -80,3 +92,4 @@ class SkeletonMapping(Request):
     )
     axes: dict[JointName, JointAxesDocument] = Field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    predecessor: PredecessorSkeletonOrigin | None = None

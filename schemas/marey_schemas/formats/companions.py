@@ -1,13 +1,15 @@
 """Files that an import reads together, found by their names. Client and server must pair files in the same way.
 
-An AMC needs its ASF. In the format of Marey's predecessor, a clip needs its skeleton, and a model may have a tree.
+An AMC needs its ASF. In the format of Marey's predecessor, a clip needs its skeleton, and a model may have a tree, a
+skeleton a skeleton model (joint mapping and axes). A motion file of any format may have notes: the predecessor's
+annotation of the motion, or the alignment of an aligned clip.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import PurePosixPath
 
@@ -18,18 +20,21 @@ _PREDECESSOR = format_named("predecessor")
 _ENDINGS = sorted((*_PREDECESSOR.endings, *_PREDECESSOR.other_endings), key=len, reverse=True)
 _MODEL_ENDINGS = ("_quaternion_mm", "_mm")
 _TREE_ENDINGS = ("_quaternion_cluster_tree", "_cluster_tree", "_tree")
+_NOTES_ENDINGS = ("_sections", "_annotations", "_annotation", "_alignment")
 _SKELETON = "skeleton"
+_SKELETON_MODEL = "skeleton_model"
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """A file that needs a companion, or that may have one.
+    """A file that needs a companion, or that may have one, or notes.
 
     Parameters
     ----------
     file : name of the file
     companion : name of its companion; None if there is none
     beside : names of the files that an import must contain besides `file`, so that it pairs the file in this way
+    notes : name of the file with its annotation or alignment; None if there is none
     shared : whether the companion is also imported on its own
     code, reason : why the file is refused without a companion; empty if it has one or can do without
     """
@@ -37,6 +42,7 @@ class Pairing:
     file: str
     companion: str | None
     beside: tuple[str, ...]
+    notes: str | None = None
     shared: bool = False
     code: str = ""
     reason: str = ""
@@ -56,19 +62,47 @@ def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
 
     The name of a skeleton of the predecessor ends in `skeleton` (walk_skeleton.json, walk.skeleton), and its stem is
     the text before this word; without such a text (skeleton.json), it matches every file. A tree has the name of its
-    model with another ending (walk_cluster_tree.json for walk_mm.json).
+    model with another ending (walk_cluster_tree.json for walk_mm.json), a skeleton model that of its skeleton
+    (walk_skeleton_model.json for walk_skeleton.json or walk.skeleton), and notes that of their motion
+    (walk_sections.json or walk_alignment.json for walk.bson.bz2 or walk.bvh).
     """
     folders: defaultdict[str, dict[str, str]] = defaultdict(dict)
     for name in sorted(names):
         path = PurePosixPath(name.replace("\\", "/"))
         folders[path.parent.as_posix()][path.name] = name
     pairings: list[Pairing] = []
-    for row in FORMATS:
-        if row.companion is not None:
-            for folder in folders.values():
-                files = list(folder.items())
-                pairings += _pairings_of_predecessor(files) if row is _PREDECESSOR else _pairings(row, files)
+    for folder in folders.values():
+        notes = _notes_of(folder)
+        described = set(notes.values())
+        found: dict[str, Pairing] = {}
+        for row in FORMATS:
+            if row.companion is not None:
+                files = [(name, path) for name, path in folder.items() if path not in described]
+                paired = _pairings_of_predecessor(files) if row is _PREDECESSOR else _pairings(row, files)
+                found |= {one.file: one for one in paired}
+        for file, note in notes.items():
+            pairing = found.get(file, Pairing(file, None, ()))
+            found[file] = replace(pairing, notes=note, beside=(*pairing.beside, note))
+        pairings += found.values()
     return tuple(pairings)
+
+
+def _notes_of(folder: Mapping[str, str]) -> dict[str, str]:
+    """Map the files of motions in a folder to the files with their notes; `folder` maps names of files to paths.
+
+    If several files have the same stem, the first one has the notes.
+    """
+    stems = {stem_of(name): path for name, path in folder.items() if _PREDECESSOR.names(name)}
+    found: dict[str, str] = {}
+    for name, path in folder.items():
+        row = next((one for one in FORMATS if one.names(name)), None)
+        if row is None or "motion" not in row.reads or is_skeleton_name(name):
+            continue
+        stem = stem_of(name)
+        note = next((stems[stem + end] for end in _NOTES_ENDINGS if stem + end in stems), None)
+        if note is not None and note not in found.values():
+            found[path] = note
+    return found
 
 
 def stem_of(name: str) -> str:
@@ -116,17 +150,30 @@ def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
     """
     known = [(stem_of(name), path) for name, path in files if _PREDECESSOR.names(name)]
     skeletons = {_skeleton_stem(stem).lower(): path for stem, path in known if is_skeleton_name(path)}
-    others = [(stem, path) for stem, path in known if not is_skeleton_name(path)]
+    joint_models = {_skeleton_stem(stem.removesuffix("_model")).lower(): path for stem, path in known if _maps(stem)}
+    others = [(stem, path) for stem, path in known if not is_skeleton_name(path) and not _maps(stem)]
     models: dict[str, str] = {}
     for stem, path in sorted(others, key=lambda one: model_name(one[0]) == one[0]):  # first those called models
         models.setdefault(model_name(stem), path)
     trees = {_without(stem, _TREE_ENDINGS): path for stem, path in others if _without(stem, _TREE_ENDINGS) != stem}
+    for stem, path in skeletons.items():
+        if stem in joint_models:
+            yield Pairing(path, joint_models[stem], (joint_models[stem],))
     for stem, path in others:
         model, bare = model_name(stem), _without(stem, _TREE_ENDINGS)
         if model in trees and models[model] == path:
             yield Pairing(path, trees[model], (trees[model],))
         elif skeletons and model == stem and (bare == stem or bare not in models):
-            yield Pairing(path, *_best(stem, skeletons), shared=True)
+            found, beside = _best(stem, skeletons)
+            named = [
+                joint_models[one] for one, skeleton in skeletons.items() if skeleton == found and one in joint_models
+            ]
+            yield Pairing(path, found, (*beside, *named), shared=True)
+
+
+def _maps(stem: str) -> bool:
+    """Return whether a file with this stem has the name of a skeleton model."""
+    return stem.lower().endswith(_SKELETON_MODEL)
 
 
 def _skeleton_stem(stem: str) -> str:

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from marey_schemas.base import Options
-from marey_schemas.formats import UNITS_M, LengthUnit
+from marey_schemas.formats import UNITS_M, EndIndex, LengthUnit
 from marey_schemas.names import MOST_TAGS, CollectionPath, Tag
 
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -32,7 +32,7 @@ class ImportOptions(Options):
     skeleton: str | None = Field(
         None,
         description="Item id of the skeleton that the clips must use; absent: an equal skeleton of the project, or a "
-        "new one.",
+        "new one. The command also accepts project/folder/name.",
     )
     unit: LengthUnit | None = Field(
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."
@@ -54,6 +54,12 @@ class ImportOptions(Options):
         False,
         description="Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise such "
         "files are refused.",
+    )
+    end_index: EndIndex | None = Field(
+        None,
+        description="Whether a section of an annotation in a file of Marey's predecessor includes its frame `end_idx`, "
+        "as in the predecessor's editor, or ends before this frame, as in its time warping. Absent: exclusive if "
+        "sections would overlap otherwise, else inclusive.",
     )
     trim_rest_pose: bool = Field(False, description="Remove rest poses at the beginning and at the end of each clip.")
     tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS, description="Tags that every clip gets.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Literal
 
 from pydantic import Field
 
@@ -28,7 +27,7 @@ from marey_server.http.streaming import BlobSender, attachment
 from marey_server.motions import exporting
 from marey_server.motions.child import ComputedFile
 from marey_server.motions.exporting import ExportTime
-from marey_server.motions.predecessor_exports import PredecessorOptions
+from marey_server.motions.predecessor_exports import ExportLayout, ExportPart, PredecessorOptions
 from marey_server.store import items
 
 """Cache control of exports: whether an export is allowed, and what it contains, may change."""
@@ -39,25 +38,28 @@ class ExportQuery(ConsentOverride):
 
     format: ExportFormat = Field("original", description="File format; original: the file exactly as it was imported.")
     unit: WrittenUnit = Field(DEFAULT_UNIT, description="Unit of length of a BVH file.")
-    end_index: EndIndex = Field(
-        DEFAULT_END_INDEX,
-        description="For annotations in the predecessor's format: whether a segment includes its frame `end_idx`.",
+    end_index: EndIndex | None = Field(
+        None,
+        description="For annotations in the predecessor's format: whether a segment includes its frame `end_idx`. "
+        f"Absent: the imported file, if the annotation was not changed since; otherwise {DEFAULT_END_INDEX}.",
     )
-    form: AnnotationForm = Field(
-        DEFAULT_FORM,
+    form: AnnotationForm | None = Field(
+        None,
         description="For annotations in the predecessor's format: layout of the file. `labels`: the segments of each "
-        "label. `list`: one list of all segments, without labels. `frames`: the frames of each label.",
+        "label. `list`: one list of all segments, without labels. `frames`: the frames of each label. Absent: the "
+        f"imported file, if the annotation was not changed since; otherwise {DEFAULT_FORM}.",
     )
-    part: Literal["model", "tree", "alignment"] | None = Field(
+    part: ExportPart | None = Field(
         None,
-        description="Part to export. For models: `tree`. For aligned clips in the predecessor's format: `alignment`, "
-        "which contains the source frame at each canonical frame, and the sections. Absent: the model or the clip "
-        "itself.",
+        description="Part to export. For models: `tree`. In the predecessor's format also, for aligned clips: "
+        "`alignment`, which contains the source frame at each canonical frame, and the sections; for skeletons: "
+        "`skeleton_model`, which contains the joint mapping and the axes. Absent: the model, clip or skeleton itself.",
     )
-    layout: Literal["2", "3"] | None = Field(
+    layout: ExportLayout | None = Field(
         None,
-        description="For models in the predecessor's format: version of the layout. Absent: the imported file, if the "
-        "model was not changed since; otherwise layout 3.",
+        description="In the predecessor's format, for models: version of the layout, 2 or 3; for skeletons: `database` "
+        "or `file`. Absent: the imported file, if the item was not changed since; otherwise the layout that contains "
+        "the model's time function exactly, or 3; for skeletons `database`.",
     )
     time: ExportTime = Field(
         "canonical",
@@ -83,10 +85,10 @@ class Export(BlobSender):
     async def get(self, project: str, kind: str, item: str, query: ExportQuery) -> Rendered | Reply | None:
         """Return an item as a file; if it was imported from a file, the original can be returned.
 
-        Clips and aligned clips can be returned as bvh, npz, predecessor and json. Annotations, models with their trees,
-        and graphs can be returned as predecessor and json; items of other kinds only as json. The format `predecessor`
-        stands for the file formats of Marey's predecessor. If a model, tree or graph was imported from such a file and
-        not changed since, the answer is this file, unless `layout` is given.
+        Clips and aligned clips can be returned as bvh, npz, predecessor and json. Skeletons, annotations, models with
+        their trees, and graphs can be returned as predecessor and json; items of other kinds only as json. The format
+        `predecessor` stands for the file formats of Marey's predecessor. If an item was imported from such a file and
+        not changed since, the answer is this file, unless `layout`, `form` or `end_index` is given.
 
         If the consent for a clip has ended, the export is refused (409, `consent-expired`). The last day of the consent
         is in the take record of the clip's newest revision; an aligned clip has the consent of its source clip.
@@ -94,15 +96,15 @@ class Export(BlobSender):
         """
         place = (project, kind_of(kind), item, query.revision)
         options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)
-        options.require_part_of(place[1])
+        options.require_fit(place[1])
         permitted = query.allow_expired_consent and await self.change(items.permit_export, *place[:3], query)
         if query.format == "original":
             original = await self.look_up(exporting.find_original, *place, options, permitted=permitted)
             return await self.send_blob(
                 original.digest, disposition=attachment(original.name), cache_control=REVALIDATED
             )
-        if query.format == "predecessor":
-            unchanged = await self.look_up(exporting.find_unchanged_original, *place, options)
+        if query.format == "predecessor" and query.time == "canonical":
+            unchanged = await self.look_up(exporting.find_unchanged_original, *place, options, permitted=permitted)
             if unchanged is not None:
                 return await self.send_blob(
                     unchanged.digest, disposition=attachment(unchanged.name), cache_control=REVALIDATED

@@ -168,12 +168,12 @@ class ProjectImports(Resource):
         skeleton = None
         if options.skeleton is not None:
             skeleton = await self.look_up(importing.read_skeleton, project, options.skeleton)
-        plans = await self.compute(importing.plan, [file.name for file in self.files])
+        plans, order = await self.compute(importing.plan, [file.name for file in self.files])
         by_name = {file.name: file for file in reversed(self.files)}
         prepare = partial(self._prepare, by_name, options, skeleton)
         aside = PutAside()
         entries = await self._import_all(
-            project, ((place, partial(prepare, planned, None)) for place, planned in enumerate(plans)), aside
+            project, ((place, partial(prepare, plans[place], None)) for place in order), aside
         )
         entries |= await self._import_all(
             project,
@@ -239,8 +239,7 @@ class ProjectImports(Resource):
     ) -> PreparedImport:
         if (entry := importing.planned_entry(planned)) is not None:
             return entry
-        names = [planned.name] if planned.companion is None else [planned.name, planned.companion]
-        sources = [await self._with_bytes(by_name[name]) for name in names]
+        sources = [await self._with_bytes(by_name[name]) for name in planned.together]
         try:
             return await self.compute_in_child(
                 importing.READ_FILE,

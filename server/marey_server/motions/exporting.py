@@ -11,7 +11,12 @@ from marey_schemas.item_files import ItemToExport, OriginalFile, item_as_json, o
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import ComputedFile, Message, pack_tree, unpack_tree
-from marey_server.motions.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
+from marey_server.motions.predecessor_exports import (
+    DOCUMENTS_OF,
+    PredecessorOptions,
+    unchanged_original,
+    write_predecessor,
+)
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
@@ -83,21 +88,32 @@ def read_source(
 
 
 def find_unchanged_original(
-    tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
+    tx: Transaction,
+    project: str,
+    kind: Kind,
+    item_id: str,
+    revision: int | None,
+    options: PredecessorOptions,
+    *,
+    permitted: bool,
 ) -> OriginalFile | None:
-    """Return the file that a model, a tree or a graph was imported from; return None if the item was changed since.
+    """Return the file of Marey's predecessor that an item was imported from; None if the item was changed since.
 
-    Also return None for an item of another kind, and if `options` names a layout. Raises `NotFoundProblem` if the item
-    or the revision does not exist.
+    Also return None for an item of another kind or format, and if `options` name a form of the file. Raises
+    `NotFoundProblem` if the item or the revision does not exist. Raises `ConflictProblem` if the consent for the clip
+    has ended, unless the caller has `permitted` the export.
     """
-    if kind not in (Kind.MODEL, Kind.GRAPH):
+    if kind not in DOCUMENTS_OF:
         return None
     found = items.read_item(tx, project, kind, item_id)
+    if kind in WITH_MOTION and not permitted:
+        items.require_consent(items.find_ended_consents(tx, [item_id]).values())
     number = found.revision if revision is None else revision
     held = items.read_revision(tx, project, kind, item_id, number).parts
-    wanted = [part for part in held if part in ("model", "graph", options.part)]
     parts = {
-        part: items.read_part(tx, project, kind, item_id, part, revision=number, arrays="none").tree for part in wanted
+        part: items.read_part(tx, project, kind, item_id, part, revision=number, arrays="none").tree
+        for part in DOCUMENTS_OF[kind]
+        if part in held
     }
     original = unchanged_original(kind, parts, options)
     return None if original is None else OriginalFile(original.name or found.name, original.blob)
@@ -113,22 +129,21 @@ def find_original(
     *,
     permitted: bool,
 ) -> OriginalFile:
-    """Return the file that a clip, a model, a model's tree or a graph was imported from.
+    """Return the file that an item was imported from; what is not a clip must be unchanged since.
 
-    Raises `NotFoundProblem` if the item was not imported from a file, or if a model, tree or graph was changed since.
-    Raises `ConflictProblem` if the consent for the clip has ended, unless the caller has `permitted` the export.
+    Raises `NotFoundProblem` if the item was not imported from a file, or was changed since. Raises `ConflictProblem` if
+    the consent for the clip has ended, unless the caller has `permitted` the export.
     """
-    if kind in (Kind.MODEL, Kind.GRAPH):
-        asked = PredecessorOptions(part=options.part)  # in whatever layout it came
-        unchanged = find_unchanged_original(tx, project, kind, item_id, revision, asked)
-        if unchanged is not None:
-            return unchanged
     if kind is Kind.CLIP:
         info = items.read_part(tx, project, kind, item_id, "info", revision=revision, arrays="none").tree
         if not permitted:
             items.require_consent(items.find_ended_consents(tx, [item_id]).values())
-        if (original := original_of_clip(item_id, info)) is not None:
-            return original
+        original = original_of_clip(item_id, info)
+    else:
+        asked = PredecessorOptions(part=options.part)  # in whatever layout it came
+        original = find_unchanged_original(tx, project, kind, item_id, revision, asked, permitted=permitted)
+    if original is not None:
+        return original
     raise NotFoundProblem(
         "The item has no original file, because it was not imported from a file or was changed since; request another "
         "format, such as json, or bvh for a clip.",

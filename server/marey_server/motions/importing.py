@@ -33,6 +33,9 @@ if TYPE_CHECKING:  # numeric modules take a second to load, so they are loaded o
 REFUSED_ALTOGETHER = (401, 403, 404, 499, 503, 507)
 """HTTP status codes of errors that concern the whole request and not a single file."""
 
+MAIN_KINDS = (Kind.CLIP, Kind.PROCESSED, Kind.MODEL, Kind.GRAPH, Kind.SKELETON)
+"""Kinds of items that files contain, in the order in which the item of an answer's entry is chosen."""
+
 READ_FILE = "marey_server.motions.reading:read_file"
 FIND_MAPPING = "marey_server.motions.reading:find_mapping"
 """Function that child processes run, like the functions above."""
@@ -80,12 +83,16 @@ def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
     return GivenSkeleton(item_id, part.revision, part.tree)
 
 
-def plan(names: Sequence[str]) -> list[PlannedFile]:
-    """Decide for each file of a batch whether it is imported, read together with another file, or refused."""
-    with LOADING:
-        from marey_motion.importing.plan import plan_imports
+def plan(names: Sequence[str]) -> tuple[list[PlannedFile], list[int]]:
+    """Decide for each file of a batch whether it is imported, read together with another file, or refused.
 
-    return plan_imports(names)
+    Also return the places of the files in the order in which they are imported.
+    """
+    with LOADING:
+        from marey_motion.importing.plan import plan_imports, reading_order
+
+    plans = plan_imports(names)
+    return plans, reading_order(plans)
 
 
 def planned_entry(planned: PlannedFile) -> PreparedImport | None:
@@ -107,14 +114,18 @@ def file_order(
     skeleton: GivenSkeleton | None,
     sibling_axis: UpAxis | None,
 ) -> bytes:
-    """Return the packed message that asks a child process to read a file, with its companion file if it has one.
+    """Return the packed message that asks a child process to read a file, with the files that are read with it.
 
-    `sibling_axis` is the upward axis that other files with the same skeleton show.
+    `sources` are the files that `PlannedFile.together` names. `sibling_axis` is the upward axis that other files with
+    the same skeleton show.
     """
     with LOADING:
         from marey_server.motions.reading import FileOrder, packed_skeleton
 
-    file, companion = sources[0], sources[1] if len(sources) > 1 else None
+    named = {source.name: source for source in sources}
+    file = named[planned.name]
+    companion = None if planned.companion is None else named[planned.companion]
+    notes = None if planned.notes is None else named[planned.notes]
     return FileOrder(
         planned=planned,
         content=file.read(),
@@ -124,6 +135,8 @@ def file_order(
         companion_digest=None if companion is None else companion.digest,
         skeleton=packed_skeleton(skeleton),
         sibling_axis=sibling_axis,
+        notes=None if notes is None else notes.read(),
+        notes_digest=None if notes is None else notes.digest,
     ).pack()
 
 
@@ -222,7 +235,7 @@ def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedD
     """Add `mapping` to the skeleton with the given digest in each file that has this skeleton; return all files."""
 
     def with_mapping(draft: Draft) -> Draft:
-        if draft.kind is not Kind.SKELETON:
+        if draft.kind is not Kind.SKELETON or "mapping" in draft.parts:
             return draft
         return replace(draft, parts={**draft.parts, "mapping": mapping})
 
@@ -364,9 +377,10 @@ def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
 
 def _entry(file: PreparedImport, published: Sequence[Published]) -> ImportEntry:
     made = {one.kind: one for one in published}
-    kinds = [kind for kind in (Kind.CLIP, Kind.MODEL, Kind.GRAPH, Kind.SKELETON) if kind in made]
+    kinds = [kind for kind in MAIN_KINDS if kind in made]
     if not kinds:  # a StopIteration of `next` would not be stored in the future, so the request would never end
-        raise RuntimeError(f"no clip, model, graph or skeleton was created from {file.name!r}; this is a server error")
+        wanted = ", ".join(MAIN_KINDS)
+        raise RuntimeError(f"none of {wanted} was created from {file.name!r}; this is a server error")
     main = made[kinds[0]]
     skeleton = made.get(Kind.SKELETON)
     return ImportEntry(

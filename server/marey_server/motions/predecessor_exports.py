@@ -1,75 +1,120 @@
-"""Export of annotations, models with their trees, and graphs to the file formats of Marey's predecessor."""
+"""Export of items other than clips to the file formats of Marey's predecessor, and unchanged files of any item."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.graphs import ModelGraph
-from marey_schemas.documents.models import checked_model, predecessor_origin
+from marey_schemas.documents.models import checked_model, predecessor_origin, predecessor_time
 from marey_schemas.documents.originals import StoredOriginal, content_digest
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.sample_trees import SampleTreeDocument
-from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationForm, EndIndex
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem, NotFoundProblem
 
+if TYPE_CHECKING:  # numeric modules take a second to load
+    from marey_motion.formats.predecessor.skeleton import SkeletonForm
+
 Parts = Mapping[str, dict[str, Any]]
 
-PARTS_OF: dict[Kind, tuple[str, ...]] = {Kind.MODEL: ("model", "tree"), Kind.PROCESSED: ("alignment",)}
+PARTS_OF: dict[Kind, tuple[str, ...]] = {
+    Kind.MODEL: ("model", "tree"),
+    Kind.PROCESSED: ("alignment",),
+    Kind.SKELETON: ("skeleton", "skeleton_model"),
+}
 """Parts of items that are separate files in the predecessor's formats, by kind."""
+LAYOUTS_OF: dict[Kind, tuple[str, ...]] = {Kind.MODEL: ("2", "3"), Kind.SKELETON: ("database", "file")}
+"""Layouts in which the predecessor has files of a kind."""
+DOCUMENTS_OF: dict[Kind, tuple[str, ...]] = {
+    Kind.SKELETON: ("hierarchy", "mapping"),
+    Kind.CLIP: ("motion", "info"),
+    Kind.PROCESSED: ("motion", "info"),
+    Kind.ANNOTATION: ("annotation",),
+    Kind.MODEL: ("model", "tree"),
+    Kind.GRAPH: ("graph",),
+}
+"""Parts of items that are read to find the file that an item was imported from."""
+
+ExportPart = Literal["model", "tree", "alignment", "skeleton", "skeleton_model"]
+ExportLayout = Literal["2", "3", "database", "file"]
 
 
 @dataclass(frozen=True, slots=True)
 class PredecessorOptions:
     """Options of the file formats of Marey's predecessor.
 
-    `end_index` and `form` apply to annotations, `layout` to models. By default, an unchanged model is exported as its
-    imported file; other models are written in layout 3. `part` selects the part of the item to export: for a model, its
-    tree; for an aligned clip, its alignment. By default, the model or the motion of the clip is exported.
+    `end_index` and `form` apply to annotations, `layout` to models and skeletons. If none of them is given, what is
+    unchanged since its import is exported as its imported file. Models are otherwise written in the layout that
+    contains their time function exactly, or else in layout 3. `part` selects the part of the item to export: for a
+    model, its tree; for an aligned clip, its alignment; for a skeleton, its skeleton model. By default, the model, the
+    motion of the clip or the skeleton is exported.
     """
 
-    end_index: EndIndex = DEFAULT_END_INDEX
-    form: AnnotationForm = DEFAULT_FORM
-    part: Literal["model", "tree", "alignment"] | None = None
-    layout: Literal["2", "3"] | None = None
+    end_index: EndIndex | None = None
+    form: AnnotationForm | None = None
+    part: ExportPart | None = None
+    layout: ExportLayout | None = None
 
-    def require_part_of(self, kind: Kind) -> None:
-        """Raise `InvalidProblem` if items of the kind do not have the requested part."""
+    def require_fit(self, kind: Kind) -> None:
+        """Raise `InvalidProblem` if items of the kind do not have the requested part or layout."""
         if self.part is not None and self.part not in PARTS_OF.get(kind, ()):
             held = " or ".join(PARTS_OF.get(kind, ())) or "none"
             detail = f"In the predecessor's format, a {kind} has no file for the part {self.part!r}; it has {held}."
             raise InvalidProblem(detail, code="no-part")
+        if self.layout is not None and self.layout not in LAYOUTS_OF.get(kind, ()):
+            held = " or ".join(LAYOUTS_OF.get(kind, ())) or "none; leave it out"
+            detail = f"In the predecessor's format, a {kind} has no layout {self.layout!r}; it has {held}."
+            raise InvalidProblem(detail, code="no-layout")
 
 
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
-    """Return the file that a model, a tree or a graph was imported from, or None if the requested part was changed.
+    """Return the file of the predecessor that an item was imported from, or None if the requested part was changed.
 
-    Also return None for an item of another kind, and if `options` specifies a layout, because the imported file may
-    have another layout. The documents in `parts` may contain references to stored arrays in place of the arrays.
+    Also return None for an item of another kind, and if `options` specify the form of the file, because the imported
+    file may have another form. The documents in `parts` may contain references to stored arrays in place of the arrays.
     """
-    if options.layout is not None:
+    if options.layout is not None or options.form is not None or options.end_index is not None:
         return None
     if kind is Kind.GRAPH:
-        known = parts["graph"].get("original")
-        return _if_unchanged("graph", parts["graph"], None if known is None else StoredOriginal.model_validate(known))
+        return _if_unchanged("graph", parts["graph"], parts["graph"].get("original"))
+    if kind is Kind.ANNOTATION:
+        return _if_unchanged("annotation", parts["annotation"], parts["annotation"].get("original"))
     if kind is Kind.MODEL:
         origin = predecessor_origin(parts["model"])
         if options.part == "tree":
             return _if_unchanged("tree", parts.get("tree"), origin.tree)
         return _if_unchanged("model", parts["model"], origin.original)
+    if kind is Kind.CLIP:
+        source = parts.get("info", {}).get("source") or {}
+        known = {"name": source.get("file_name", ""), "blob": source.get("file"), "content": source.get("content")}
+        return _if_unchanged("motion", parts["motion"], known if known["content"] is not None else None)
+    if kind is Kind.PROCESSED:
+        files = parts["info"].get("predecessor") or {}
+        if options.part == "alignment":
+            return _if_unchanged("alignment", parts["info"], files.get("alignment"))
+        return _if_unchanged("motion", parts["motion"], files.get("motion"))
+    if kind is Kind.SKELETON:
+        files = parts.get("mapping", {}).get("predecessor") or {}
+        if options.part == "skeleton_model":
+            return _if_unchanged("mapping", parts.get("mapping"), files.get("model"))
+        return _if_unchanged("hierarchy", parts["hierarchy"], files.get("skeleton"))
     return None
 
 
-def _if_unchanged(part: str, document: Mapping[str, Any] | None, known: StoredOriginal | None) -> StoredOriginal | None:
-    if document is None or known is None or known.content != content_digest(part, document):
+def _if_unchanged(
+    part: str, document: Mapping[str, Any] | None, known: StoredOriginal | Mapping[str, Any] | None
+) -> StoredOriginal | None:
+    if document is None or known is None:
         return None
-    return known
+    original = StoredOriginal.model_validate(known)
+    return original if original.content == content_digest(part, document) else None
 
 
 def write_predecessor(
@@ -83,24 +128,26 @@ def write_predecessor(
     from marey_motion.errors import MotionError
 
     try:
-        ending, data = _written(kind, parts, hierarchy, options)
+        ending, data = _written(kind, name, parts, hierarchy, options)
     except MotionError as error:
         raise InvalidProblem(str(error), code="cannot-be-exported") from error
     return f"{name}{ending}", data
 
 
 def _written(
-    kind: Kind, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
+    kind: Kind, name: str, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
 ) -> tuple[str, bytes]:
     if kind is Kind.ANNOTATION:
         return "_sections.json", _annotation(parts["annotation"], options)
     if kind is Kind.GRAPH:
         return ".json", _graph(parts["graph"])
+    if kind is Kind.SKELETON:
+        return _skeleton(name, parts, options)
     if kind is Kind.PROCESSED:
         return "_alignment.json", _alignment(parts["info"])
     if kind is Kind.MODEL and hierarchy is not None:
         if options.part != "tree":
-            return "_mm.json", _model(parts["model"], hierarchy, options.layout or "3")
+            return "_mm.json", _model(parts["model"], hierarchy, options)
         if "tree" not in parts:
             raise NotFoundProblem(
                 "The model has no tree of samples to export; build it first, with `marey tree`.", code="no-part"
@@ -116,7 +163,9 @@ def _annotation(part: Mapping[str, Any], options: PredecessorOptions) -> bytes:
     annotation = Annotation.model_validate(part)
     ends = [segment.end for segment in annotation.segments] + [one.frame + 1 for one in annotation.keyframes]
     layer = layer_from_document(annotation, max(ends, default=1))
-    return write_predecessor_annotation(layer, form=options.form, end_index=options.end_index)
+    return write_predecessor_annotation(
+        layer, form=options.form or DEFAULT_FORM, end_index=options.end_index or DEFAULT_END_INDEX
+    )
 
 
 def _alignment(part: Mapping[str, Any]) -> bytes:
@@ -131,15 +180,22 @@ def _alignment(part: Mapping[str, Any]) -> bytes:
     return write_predecessor_alignment(info.time_function, list(pairwise(bounds)))
 
 
-def _model(part: Mapping[str, Any], hierarchy: Mapping[str, Any], layout: Literal["2", "3"]) -> bytes:
+def _model(part: Mapping[str, Any], hierarchy: Mapping[str, Any], options: PredecessorOptions) -> bytes:
+    """Return the file of a model; without a layout, in the layout that can contain its time function exactly."""
     from marey_motion.documents import skeleton_from_document
     from marey_motion.formats.predecessor.model_writer import write_predecessor_model
+    from marey_motion.formats.predecessor.time_functions import PredecessorTime
     from marey_motion.modelling.primitive_documents import primitive_from_tree
+    from marey_motion.modelling.splines import SplineBasis
 
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
     primitive = primitive_from_tree(checked_model(part).model_dump(by_alias=True), skeleton)
+    known, time = predecessor_time(part), None
+    if known is not None:
+        time = PredecessorTime(known.form, SplineBasis(known.knots, known.degree), known.mean, known.eigen)
+    is_flat = options.layout == "2" or (options.layout is None and known is not None and known.form == "increments")
     animated = predecessor_origin(part).animated_joints
-    return write_predecessor_model(primitive, layout=layout, animated_joints=animated)
+    return write_predecessor_model(primitive, layout="2" if is_flat else "3", animated_joints=animated, time=time)
 
 
 def _tree(model: Mapping[str, Any], part: Mapping[str, Any]) -> bytes:
@@ -149,6 +205,38 @@ def _tree(model: Mapping[str, Any], part: Mapping[str, Any]) -> bytes:
     document = SampleTreeDocument.model_validate(part)
     tree = sample_tree_from_tree(document.model_dump())
     return write_predecessor_tree(tree, len(checked_model(model).spatial.directions), document.options.branching)
+
+
+def _skeleton(name: str, parts: Parts, options: PredecessorOptions) -> tuple[str, bytes]:
+    """Return the ending of the name and the content of the file of a skeleton or of its skeleton model."""
+    from marey_motion.documents import skeleton_from_document
+    from marey_motion.formats.predecessor.encoding import encode_document
+    from marey_motion.formats.predecessor.skeleton import skeleton_document
+
+    model = _skeleton_model(parts["mapping"]) if "mapping" in parts else None
+    if options.part == "skeleton_model":
+        if model is None:
+            raise NotFoundProblem(
+                "The skeleton has no joint mapping to export; map its joints first, with `marey skeleton map`.",
+                code="no-part",
+            )
+        return "_skeleton_model.json", encode_document({"name": name, "model": model}, "json")
+    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(parts["hierarchy"]))
+    form: SkeletonForm = "file" if options.layout == "file" else "database"
+    data = encode_document(skeleton_document(skeleton, form=form, model=model), "json")
+    return ".skeleton" if form == "file" else "_skeleton.json", data
+
+
+def _skeleton_model(part: Mapping[str, Any]) -> dict[str, Any]:
+    import numpy as np
+
+    from marey_motion.formats.predecessor.skeleton_model import PredecessorSkeletonModel, skeleton_model_document
+
+    mapping = SkeletonMapping.model_validate(part)
+    swings = {joint: np.array(axes.swing) for joint, axes in mapping.axes.items()}
+    twists = {joint: np.array(axes.twist) for joint, axes in mapping.axes.items()}
+    rest = {} if mapping.predecessor is None else mapping.predecessor.rest
+    return skeleton_model_document(PredecessorSkeletonModel(mapping.joints, swings, twists, rest))
 
 
 def _graph(part: Mapping[str, Any]) -> bytes:

@@ -26,7 +26,7 @@ _SKELETONS_KEPT = 64
 
 
 class FileOrder(Message):
-    """Message that asks a child process to read a file, together with its companion file if it has one."""
+    """Message that asks a child process to read a file, together with its companion and its notes if it has them."""
 
     planned: PlannedFile
     content: bytes
@@ -37,6 +37,8 @@ class FileOrder(Message):
     skeleton: tuple[str, int, bytes] | None = None
     """Item, revision and hierarchy of the skeleton that the clips must use."""
     sibling_axis: UpAxis | None = None
+    notes: bytes | None = None
+    notes_digest: str | None = None
 
     def file(self) -> FileToImport:
         """Return the file with everything that is needed to import it."""
@@ -46,7 +48,7 @@ class FileOrder(Message):
             given = GivenSkeleton(item, revision, decode_tree(hierarchy, MSGPACK))
         return FileToImport(
             self.planned, self.content, self.digest, self.options, self.companion, self.companion_digest, given,
-            self.sibling_axis,
+            self.sibling_axis, self.notes, self.notes_digest,
         )  # fmt: skip
 
 

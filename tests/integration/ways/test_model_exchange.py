@@ -157,7 +157,7 @@ def test_a_graph_finds_its_models_by_name_and_comes_out_as_it_was(lab: ProjectHa
     graph.put_part("graph", part)
     written = json.loads(graph.export(tmp_path / "changed", format="predecessor").read_bytes())
     assert written["nodes"]["walk"]["8"]["type"] == "standard"
-    assert written["start_node"] == written["startNode"] == ["idle", "7"]
+    assert written["start_node"] == written["startNode"] == ["idle", "stand"]
     part["actions"]["walk"]["primitives"]["walk_left"]["model"] = {"item": "model_gone", "revision": 1}
     with pytest.raises(RequestFailed, match="no model 'model_gone'"):
         graph.put_part("graph", part)

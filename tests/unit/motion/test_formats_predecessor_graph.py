@@ -50,7 +50,7 @@ def test_a_graph_that_was_written_is_read_as_the_same_and_begins_under_both_name
     graph = graph_of_document(DOCUMENT, "g.json")
     written = json.loads(write_predecessor_graph(graph))
     assert graph_of_document(written, "again.json") == graph
-    assert written["start_node"] == written["startNode"] == ["idle", "11"]
+    assert written["start_node"] == written["startNode"] == ["idle", "stand"]
     assert json.loads(write_predecessor_graph(graph_of_document(written, "again.json"))) == written
 
 

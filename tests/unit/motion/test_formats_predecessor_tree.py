@@ -55,6 +55,18 @@ def test_a_tree_that_was_written_is_read_again_and_written_the_same() -> None:
     assert all(len(node["indices"]) == 1 for node in walk(document["root"]) if not node["children"])
 
 
+@pytest.mark.parametrize("empty", ["root", "inner nodes"])
+def test_nodes_that_list_no_samples_have_those_of_their_children(empty: str) -> None:
+    document = models.tree()
+    for node in [document["root"]] if empty == "root" else walk(document["root"]):
+        if node["children"]:
+            node["indices"] = None
+    assert is_tree(document)
+    found, expected = read(document), read(models.tree())
+    np.testing.assert_array_equal(found.samples, expected.samples)
+    np.testing.assert_array_equal(found.sizes, expected.sizes)
+
+
 @pytest.mark.parametrize(
     ("path", "value", "told"),
     [
@@ -65,6 +77,7 @@ def test_a_tree_that_was_written_is_read_again_and_written_the_same() -> None:
         (["root", "indices"], [*range(39), 40], "root: each number in the field `indices` must be from 0 to 39"),
         (["root", "children", 0, "indices"], [], "root.0: the field `indices` must contain at least one sample"),
         (["root", "children", 0, "indices"], [0, 0.5], "root.0"),
+        (["root", "children", 0, "children", 0, "children", 0, "indices"], None, "'indices' must be list"),
         (["root", "children", 1, "indices"], [0], "must together have all samples"),
         (["root", "children", 0, "children", 0], 3, r"root\.0\.0: a node must be an object"),
     ],

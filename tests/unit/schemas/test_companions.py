@@ -96,3 +96,19 @@ def test_only_documents_of_the_predecessor_are_skeletons() -> None:
     assert is_skeleton_name("x/My_Skeleton.json")
     assert not is_skeleton_name("skeleton.bvh")
     assert not is_skeleton_name("skeleton/walk.json")
+
+
+def test_motions_have_notes_and_skeletons_have_models_with_their_names() -> None:
+    names = "walk.bson walk_sections.json take.bvh take_alignment.json 07_1.amc 07.asf 07_1_sections.json body.skeleton"
+    found = {
+        one.file: one for one in pair_companions([*names.split(), "body_skeleton_model.json", "lost_sections.json"])
+    }
+    assert {file: one.notes for file, one in found.items() if one.notes} == {
+        "walk.bson": "walk_sections.json",
+        "take.bvh": "take_alignment.json",
+        "07_1.amc": "07_1_sections.json",
+    }
+    assert found["body.skeleton"].companion == "body_skeleton_model.json"
+    assert found["walk.bson"].beside == ("body.skeleton", "body_skeleton_model.json", "walk_sections.json")
+    assert found["take.bvh"].companion is None
+    assert found["lost_sections.json"].companion == "body.skeleton"  # as any document whose content is not known yet

@@ -30,6 +30,8 @@ def test_unchanged_parts_are_given_back_as_their_files(
     parts, _ = stored
     model = unchanged_original(Kind.MODEL, parts, PredecessorOptions())
     tree = unchanged_original(Kind.MODEL, parts, PredecessorOptions(part="tree"))
+    assert model is not None
+    assert tree is not None
     assert (model.name, model.blob) == ("walk_mm.json", FILE)
     assert (tree.name, tree.blob) == ("walk_cluster_tree.json", TREE_FILE)
 
@@ -127,11 +129,11 @@ def test_a_tree_whose_nodes_are_none_is_refused(stored: tuple[Mapping[str, Any],
 )
 def test_a_part_that_items_of_a_kind_do_not_have_is_refused(kind: Kind, part: Part) -> None:
     with pytest.raises(InvalidProblem, match=f"{kind} has no file for the part '{part}'") as refused:
-        PredecessorOptions(part=part).require_part_of(kind)
+        PredecessorOptions(part=part).require_fit(kind)
     assert refused.value.error_code == "no-part"
-    PredecessorOptions().require_part_of(kind)
+    PredecessorOptions().require_fit(kind)
 
 
 @pytest.mark.parametrize(("kind", "part"), [(Kind.MODEL, "model"), (Kind.MODEL, "tree"), (Kind.PROCESSED, "alignment")])
 def test_a_part_that_items_of_a_kind_have_may_be_asked_for(kind: Kind, part: Part) -> None:
-    PredecessorOptions(part=part).require_part_of(kind)
+    PredecessorOptions(part=part).require_fit(kind)

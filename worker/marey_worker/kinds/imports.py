@@ -1,4 +1,4 @@
-"""Kind `import`: imports stored files as skeletons, clips, models and graphs."""
+"""Kind `import`: imports stored files as skeletons, clips, annotations, aligned clips, models and graphs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from marey_motion.errors import MotionError
 from marey_motion.importing.files import import_file, mapping_part, planned_entry, refusal_of
 from marey_motion.importing.graphs import FEW, NamedModel, graph_item
 from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
-from marey_motion.importing.plan import PlannedFile, plan_imports
+from marey_motion.importing.plan import PlannedFile, plan_imports, reading_order
 from marey_motion.importing.siblings import AxisFinding, axes_of_skeletons, axis_of_siblings
 from marey_schemas.documents.clips import Check
 from marey_schemas.encoding.canonical import canonical_json
@@ -44,15 +44,14 @@ class _Importing:
     def run(self) -> dict[str, Any]:
         """Import all files in order, and return the result of the job."""
         plan = plan_imports([file.name for file in self._params.files])
-        findings: list[AxisFinding | None] = []
-        made: list[ImportEntry | None] = []
-        for done, planned in enumerate(plan):
+        findings: list[AxisFinding | None] = [None] * len(plan)
+        made: list[ImportEntry | None] = [None] * len(plan)
+        for done, place in enumerate(reading_order(plan)):
+            planned = plan[place]
             self._context.progress(done, len(plan), f"importing {planned.name}")
-            entry, finding = planned_entry(planned), None
-            if entry is None:
-                entry, finding = self._import(planned)
-            made.append(entry)
-            findings.append(finding)
+            made[place] = planned_entry(planned)
+            if made[place] is None:
+                made[place], findings[place] = self._import(planned)
         axes = axes_of_skeletons(findings)
         entries = []
         for planned, entry, finding in zip(plan, made, findings, strict=True):
@@ -99,6 +98,7 @@ class _Importing:
     def _read(self, planned: PlannedFile, sibling_axis: UpAxis | None) -> ImportedFile:
         digest = self._digests[planned.name]
         beside = None if planned.companion is None else self._digests[planned.companion]
+        notes = None if planned.notes is None else self._digests[planned.notes]
         return import_file(
             FileToImport(
                 planned,
@@ -109,6 +109,8 @@ class _Importing:
                 companion_digest=beside,
                 skeleton=self._skeleton,
                 sibling_axis=sibling_axis,
+                notes=None if notes is None else self._context.blob(notes),
+                notes_digest=notes,
             )
         )
 
@@ -139,7 +141,7 @@ class _Importing:
 
     def _stage(self, item: ImportedItem, found: ImportedFile) -> None:
         parts = dict(item.parts)
-        if item.kind is Kind.SKELETON:
+        if item.kind is Kind.SKELETON and "mapping" not in parts:
             content = canonical_json(parts["hierarchy"])
             if content not in self._mappings:
                 self._mappings[content] = mapping_part(found)

@@ -259,21 +259,25 @@ def export_annotation(
     place: Place,
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     form: Annotated[
-        AnnotationForm,
+        AnnotationForm | None,
         typer.Option(
             help="Layout of the file. labels: the segments of each label. list: one list of all segments, without "
-            "labels. frames: the frames of each label."
+            f"labels. frames: the frames of each label. Default: {DEFAULT_FORM}."
         ),
-    ] = DEFAULT_FORM,
+    ] = None,
     end_index: Annotated[
-        EndIndex,
+        EndIndex | None,
         typer.Option(
             help="Meaning of end_idx in the file. inclusive: the last frame of a segment, as in the editor of Marey's "
-            "predecessor. exclusive: the frame after the last frame."
+            f"predecessor. exclusive: the frame after the last frame. Default: {DEFAULT_END_INDEX}."
         ),
-    ] = DEFAULT_END_INDEX,
+    ] = None,
 ) -> None:
-    """Write an annotation to a file for Marey's predecessor, the older programs that Marey replaces."""
+    """Write an annotation to a file for Marey's predecessor, the older programs that Marey replaces.
+
+    Without `--form` and `--end-index`, an annotation that was imported from a file and not changed since is written as
+    this file.
+    """
     with connect(context) as marey:
         found = annotation_at(marey, place)
         typer.echo(found.export(output, format="predecessor", form=form, end_index=end_index))

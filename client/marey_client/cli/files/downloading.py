@@ -46,6 +46,20 @@ def download(
     format: Annotated[str, typer.Option(help=f"{one_of(EXPORT_FORMATS)}.")] = "original",  # noqa: A002
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
+    part: Annotated[
+        str | None,
+        typer.Option(
+            help="Part to write in the predecessor's format: tree (of a model), alignment (of an aligned clip), or "
+            "skeleton_model (of a skeleton)."
+        ),
+    ] = None,
+    layout: Annotated[
+        str | None,
+        typer.Option(
+            help="Layout in the predecessor's format: 2 or 3 for models, database or file for skeletons. Default: the "
+            "imported file, if the item is unchanged."
+        ),
+    ] = None,
     restored: Annotated[
         bool, typer.Option(help="Export aligned clips with the timing and position of their source clips.")
     ] = False,
@@ -55,8 +69,8 @@ def download(
     """Write clips to files: one clip, or all clips in a folder and below.
 
     Aligned clips are written only if the folder contains no other clips. After `@`, name a revision of the clip, or a
-    version of the dataset. Other items, such as edits and evaluations, are written with `--format json`. For models and
-    annotations, there is also `--format predecessor`.
+    version of the dataset. Other items, such as edits and evaluations, are written with `--format json`. For models,
+    graphs, skeletons and annotations, there is also `--format predecessor`.
 
     An existing file is replaced; if several clips would have the same file name, later clips get a number.
     """
@@ -65,6 +79,7 @@ def download(
     address = Address.parse(place)
     with connect(context) as marey:
         options = {"format": format, "unit": unit, "allow_expired_consent": allow_expired_consent}
+        options |= {"part": part, "layout": layout}
         options |= {"time": "source"} if restored else {}
         written, refused = _download_all(_exported_at(marey, address), output, options)
     if as_json:

@@ -17,6 +17,7 @@ from marey_schemas.wording import counted
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from marey_client.marey import Marey
     from marey_schemas.imports import ImportEntry
 
 
@@ -59,6 +60,8 @@ def upload(
     with connect(context) as marey:
         to = marey.project(project)
         to.read()  # a missing project is an error before any bytes are sent
+        if "/" in options.get("skeleton", ""):
+            options["skeleton"] = _skeleton_at(marey, project, options["skeleton"])
         try:
             with progress() as advance:
                 report = upload_found(to, found, ImportOptions.model_validate(options), advance)
@@ -74,6 +77,17 @@ def upload(
         _print_restored(report.restored, found.changed_tables, f"{project}/{options.get('collection', '')}".rstrip("/"))
     if found.motions_left_out or report.failed:
         raise Refused
+
+
+def _skeleton_at(marey: Marey, project: str, place: str) -> str:
+    """Return the id of the skeleton at an address, which must be in the project that receives the files."""
+    from marey_client.cli.addresses import Address, require_item
+    from marey_schemas.kinds import Kind
+
+    address = Address.parse(place)
+    if address.project != project:
+        raise WrongUsage(f"the skeleton {place} is not in the project {project}, which receives the files")
+    return str(require_item(marey, address, [Kind.SKELETON]).id)
 
 
 def _print_restored(restored: int, changed_tables: Sequence[Path], place: str) -> None:

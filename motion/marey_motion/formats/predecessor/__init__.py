@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from marey_motion.formats.predecessor.annotation import is_annotation
 from marey_motion.formats.predecessor.clips import motion_of_document, write_predecessor, write_predecessor_skeleton
 from marey_motion.formats.predecessor.encoding import decode_document
 from marey_motion.formats.predecessor.graph import is_graph
 from marey_motion.formats.predecessor.model_layouts import layout_of
+from marey_motion.formats.predecessor.skeleton_model import is_skeleton_model
 from marey_motion.formats.predecessor.tree import is_tree
 from marey_motion.importing.source import SourceDocument, SourceMotion, Subject
+from marey_motion.skeleton import Skeleton
 
 __all__ = ["read_predecessor", "write_predecessor", "write_predecessor_skeleton"]
 
@@ -21,6 +24,7 @@ def read_predecessor(
     *,
     companion: bytes | None = None,
     companion_name: str = "the skeleton document",
+    skeleton: Skeleton | None = None,
     frame_rate_hz: float | None = None,
 ) -> SourceMotion | SourceDocument:
     """Read a file of Marey's predecessor: a motion, which stays in its own unit and axes, or a document without motion.
@@ -31,6 +35,7 @@ def read_predecessor(
     file : str    name of the file, for messages
     companion : bytes, optional    the skeleton document of a clip
     companion_name : str    name of the file of the skeleton document, for messages
+    skeleton : Skeleton, optional    the skeleton of a clip, in place of the skeleton document
     frame_rate_hz : float, optional    replaces the document's rate
 
     Returns
@@ -46,7 +51,11 @@ def read_predecessor(
     if subject is not None:
         return SourceDocument(subject, document)
     return motion_of_document(
-        document, file, skeleton=companion, skeleton_file=companion_name, frame_rate_hz=frame_rate_hz
+        document,
+        file,
+        skeleton=companion if skeleton is None else skeleton,
+        skeleton_file=companion_name,
+        frame_rate_hz=frame_rate_hz,
     )
 
 
@@ -55,4 +64,8 @@ def _subject_of(document: Mapping[str, Any]) -> Subject | None:
         return "model"
     if is_tree(document):
         return "tree"
-    return "graph" if is_graph(document) else None
+    if is_graph(document):
+        return "graph"
+    if is_annotation(document):
+        return "notes"
+    return "skeleton model" if is_skeleton_model(document) else None

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from marey_motion.alignment.warp import LEAST_SLOPE
 from marey_motion.arrays import Floats
 from marey_motion.errors import FormatError
-from marey_motion.formats.document_fields import field_of, number_array
-from marey_motion.formats.predecessor.annotation import SECTIONS
+from marey_motion.formats.document_fields import number_array
 from marey_motion.formats.predecessor.encoding import decode_document, encode_document
+from marey_motion.formats.predecessor.sections import SECTIONS, section_range
 
 TIME_FUNCTION = "time_function"
 MOST_FRAME = 2**31 - 1
@@ -56,7 +56,25 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
     ------
     FormatError    if a field is missing or invalid; the error names it
     """
-    document = decode_document(data, file)
+    return alignment_of_document(decode_document(data, file), file)
+
+
+def alignment_of_document(document: Mapping[str, Any], file: str) -> PredecessorAlignment:
+    """Read an alignment from a decoded document, as `read_predecessor_alignment` does.
+
+    Parameters
+    ----------
+    document : mapping    the document
+    file : str    name of the file, for messages
+
+    Returns
+    -------
+    PredecessorAlignment    time function and sections
+
+    Raises
+    ------
+    FormatError    if a field is missing or invalid; the error names it
+    """
     frames = number_array(_list(document, TIME_FUNCTION, file), file, TIME_FUNCTION)
     if frames.ndim != 1 or len(frames) < 2 or (frames != np.floor(frames)).any() or (frames < 0).any():
         raise FormatError(f"field {TIME_FUNCTION!r} must be a list of at least two frames", file=file)
@@ -68,7 +86,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
         message = f"field {TIME_FUNCTION!r} decreases at canonical frame {place}"
         raise FormatError(message, code="time-function-invalid", file=file)
     sections = [
-        (field_of(one, "start_idx", int, file), field_of(one, "end_idx", int, file))
+        section_range(one, len(frames), "exclusive", file)
         for one in (_list(document, SECTIONS, file) if SECTIONS in document else [])
     ]
     for start, end in sections:

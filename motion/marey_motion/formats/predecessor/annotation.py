@@ -7,7 +7,8 @@ An annotation has one of three forms:
 * the frames of each label, `{"semantic_annotation": {label: [frames]}}`.
 
 In some programs of the predecessor, the last frame of a section is `end_idx`; in other programs, it is the frame before
-`end_idx`. The documents do not say which, so `read_predecessor_annotation` has the option `end_index`.
+`end_idx`. The documents do not say which, so `read_predecessor_annotation` has the option `end_index`. If `end_idx` is
+-1, the section goes to the end of the clip.
 """
 
 from __future__ import annotations
@@ -20,12 +21,15 @@ from typing import Any
 import numpy as np
 
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
-from marey_motion.errors import AnnotationError, FormatError
+from marey_motion.errors import AnnotationError, FormatError, FormatLimit
 from marey_motion.formats.document_fields import field_of, number_array
 from marey_motion.formats.predecessor.encoding import decode_document, encode_document
+from marey_motion.formats.predecessor.sections import SECTIONS, section_range
 from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationForm, EndIndex
 
-SECTIONS, SEMANTIC, KEYFRAMES = "sections", "semantic_annotation", "keyframes"
+SEMANTIC, KEYFRAMES = "semantic_annotation", "keyframes"
+MOST_LAYERS = 64
+"""Greatest number of annotations that one document may become."""
 
 
 def read_predecessor_annotation(
@@ -91,9 +95,10 @@ def layer_of_document(
         found = _frames_by_label(document[SEMANTIC], file)
     else:
         sections = document.get(SECTIONS)
-        found = _sections(_parsed(sections, file) if isinstance(sections, str) else sections, end_index, file)
+        given = _parsed(sections, file) if isinstance(sections, str) else sections
+        found = _sections(given, frame_count, end_index, file)
     keyframes = field_of(document, KEYFRAMES, dict, file) if KEYFRAMES in document else {}
-    marks = [Keyframe(label, frame) for label, given in keyframes.items() for frame in _frames(given, label, file)]
+    marks = [Keyframe(label, frame) for label, listed in keyframes.items() for frame in _frames(listed, label, file)]
     wanted = [one for one in found if labels is None or one.label in labels]
     try:
         return Layer(frame_count, tuple(wanted), tuple(marks))
@@ -102,6 +107,64 @@ def layer_of_document(
         if end_index == "inclusive" and _only_shares_ends(wanted):
             hint = "; each section ends where the next one starts: set end_index to exclusive"
         raise FormatError(f"{error}{hint}", code=error.code, file=file) from error
+
+
+def layers_of_document(
+    document: Mapping[str, Any], file: str, frame_count: int, *, end_index: EndIndex | None = None
+) -> dict[str | None, Layer]:
+    """Read an annotation from a decoded document, whose sections of different labels may overlap.
+
+    Parameters
+    ----------
+    document : mapping    the document
+    file : str    name of the file, for messages
+    frame_count : int    frames of the clip
+    end_index : str, optional    "inclusive" or "exclusive"; by default, "exclusive" if the sections of a label overlap
+        or exceed the clip otherwise
+
+    Returns
+    -------
+    dict of str or None to Layer    one layer with all labels under None, or, if labels overlap, one for each label
+
+    Raises
+    ------
+    FormatError    if a section is invalid; the error names label and section
+    """
+    tried: tuple[EndIndex, ...] = (DEFAULT_END_INDEX, "exclusive") if end_index is None else (end_index,)
+    refused: FormatError | None = None
+    for meaning in tried:
+        try:
+            return {None: layer_of_document(document, file, frame_count, end_index=meaning)}
+        except FormatError as error:
+            refused = refused or error
+    by_label = document.get(SEMANTIC) if isinstance(document.get(SEMANTIC), Mapping) else document.get(SECTIONS)
+    assert refused is not None
+    if isinstance(by_label, Mapping) and len(by_label) > MOST_LAYERS:
+        raise FormatLimit(f"{refused.message}; only {MOST_LAYERS} labels may become one annotation each", file=file)
+    if isinstance(by_label, Mapping) and len(by_label) > 1:
+        for meaning in tried:
+            try:
+                return {
+                    label: layer_of_document(document, file, frame_count, end_index=meaning, labels=[label])
+                    for label in by_label
+                }
+            except FormatError:
+                continue
+    raise refused
+
+
+def is_annotation(document: Mapping[str, Any]) -> bool:
+    """Check whether a document is an annotation or an alignment.
+
+    Parameters
+    ----------
+    document : mapping    the document
+
+    Returns
+    -------
+    bool    True for an annotation or an alignment
+    """
+    return (SECTIONS in document or SEMANTIC in document) and not {"poses", "frames"} & document.keys()
 
 
 def write_predecessor_annotation(
@@ -153,24 +216,19 @@ def _parsed(text: str, file: str) -> Any:
         raise FormatError(f"field {SECTIONS!r} cannot be read: {error}", code="document-damaged", file=file) from error
 
 
-def _sections(sections: Any, end_index: EndIndex, file: str) -> list[Segment]:
+def _sections(sections: Any, frame_count: int, end_index: EndIndex, file: str) -> list[Segment]:
     if isinstance(sections, list):
-        return [_section(one, f"section {number}", end_index, file) for number, one in enumerate(sections, start=1)]
-    if isinstance(sections, Mapping):
-        return [
-            _section(one, label, end_index, file) for label in sections for one in field_of(sections, label, list, file)
-        ]
-    raise FormatError(
-        f"the document must have either the field {SECTIONS!r}, which is a list or an object with labels as "
-        f"keys, or the field {SEMANTIC!r}, which is an object with labels as keys",
-        code="document-unknown",
-        file=file,
-    )
-
-
-def _section(section: Any, label: str, end_index: EndIndex, file: str) -> Segment:
-    start, end = (field_of(section, name, int, file) for name in ("start_idx", "end_idx"))
-    return Segment(label, start, end + (end_index == "inclusive"))
+        named = [(f"section {number}", one) for number, one in enumerate(sections, start=1)]
+    elif isinstance(sections, Mapping):
+        named = [(label, one) for label in sections for one in field_of(sections, label, list, file)]
+    else:
+        raise FormatError(
+            f"the document must have either the field {SECTIONS!r}, which is a list or an object with labels as "
+            f"keys, or the field {SEMANTIC!r}, which is an object with labels as keys",
+            code="document-unknown",
+            file=file,
+        )
+    return [Segment(label, *section_range(one, frame_count, end_index, file)) for label, one in named]
 
 
 def _frames_by_label(by_label: Mapping[str, Any], file: str) -> list[Segment]:

@@ -26,6 +26,7 @@ from marey_motion.formats.predecessor.skeleton import (
     SkeletonForm,
     read_skeleton_document,
     skeleton_document,
+    source_of_skeleton,
 )
 from marey_motion.formats.quaternion_rows import as_rotations
 from marey_motion.formats.unpacking import require_unpackable
@@ -39,7 +40,7 @@ def motion_of_document(
     document: dict[str, Any],
     file: str,
     *,
-    skeleton: bytes | None = None,
+    skeleton: bytes | Skeleton | None = None,
     skeleton_file: str = "the skeleton document",
     frame_rate_hz: float | None = None,
 ) -> SourceMotion:
@@ -49,7 +50,7 @@ def motion_of_document(
     ----------
     document : dict    the decoded document
     file : str    name of the file, for messages
-    skeleton : bytes, optional    content of the file with the skeleton document
+    skeleton : bytes or Skeleton, optional    content of the file with the skeleton document, or the skeleton
     skeleton_file : str    name of this file, for messages
     frame_rate_hz : float, optional    replaces the document's rate
 
@@ -66,11 +67,15 @@ def motion_of_document(
     if skeleton is None:
         raise FormatError(
             "a clip document contains no hierarchy of its joints; import it together with its skeleton document, whose "
-            "name must end in 'skeleton', such as skeleton.json",
+            "name must end in 'skeleton', such as skeleton.json or walk.skeleton, or name a skeleton of the project "
+            "with --skeleton (skeleton)",
             code="skeleton-missing",
             file=file,
         )
-    source = read_skeleton_document(decode_document(skeleton, skeleton_file), skeleton_file)
+    if isinstance(skeleton, Skeleton):
+        source = source_of_skeleton(skeleton)
+    else:
+        source = read_skeleton_document(decode_document(skeleton, skeleton_file), skeleton_file)
     names, poses, frame_time_s = _clip_fields(document, file)
     _fill_motion(source, names, poses, file)
     source.declared_frame_time_s = frame_time_s

@@ -96,7 +96,9 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
 
 
 def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "json") -> bytes:
-    """Write a graph; the start node is written under both names that programs read, `start_node` and `startNode`.
+    """Write a graph; the start node, an action and the name of a model, is written as `start_node` and `startNode`.
+
+    Some programs read the one field, others the other.
 
     Parameters
     ----------
@@ -121,8 +123,7 @@ def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "js
                 for other_action, other in node.transitions
             },
         }
-    action, name = graph.start
-    start = [action, graph.nodes[graph.start].model_id]
+    start = list(graph.start)  # by name: the predecessor's loader looks the start up by the name of the model
     return encode_document({"nodes": nodes, "start_node": start, "startNode": start}, encoding)
 
 

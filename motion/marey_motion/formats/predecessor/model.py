@@ -30,7 +30,6 @@ from marey_motion.formats.predecessor.time_functions import (
     DRAWN,
     SEED,
     PredecessorTime,
-    TimeForm,
     as_log_slopes,
     components_of,
 )
@@ -54,16 +53,19 @@ class PredecessorModel:
     primitive : the model in Marey's units and conventions
     layout : layout of the document
     animated_joints : joints whose rotations are in the document; all other joints keep their rest rotation
-    time_form : form of the document's time function (see `time_functions`); None if the document has no time function,
-        so that the model runs at constant speed
+    time : time function of the document (see `time_functions`), with those of its components that the mixture covers;
+        None if the document has no time function, so that the model runs at constant speed
     time_error_frames : largest difference between the time functions of `primitive` and of the document, in frames
+    moved_keyframes : labels of keyframes that the document places after the last frame; in `primitive`, they are at
+        the last frame
     """
 
     primitive: MotionPrimitive
     layout: Layout
     animated_joints: tuple[str, ...]
-    time_form: TimeForm | None
+    time: PredecessorTime | None
     time_error_frames: float
+    moved_keyframes: tuple[str, ...] = ()
 
 
 def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None = None) -> PredecessorModel:
@@ -145,14 +147,13 @@ def _read(parts: ModelParts, layout: Layout, skeleton: Skeleton, file: str) -> P
     spread = _variances(mixture)
     temporal, error = as_log_slopes(time, latents[:, len(spatial_vectors) :], spread[len(spatial_vectors) :], file)
     spatial = components_of(basis, spatial_mean, spatial_vectors, spread[: len(spatial_vectors)])
-    if odd := [label for label, frame in parts.keyframes.items() if frame >= frames]:
-        raise FormatError(
-            f"field 'keyframes': frame {odd[0]!r} is outside the {frames} canonical frames of the model", file=file
-        )
+    # A keyframe at the end of the last section has the number of frames, a greater number, or -1.
+    keyframes = {label: frame if 0 <= frame < frames else frames - 1 for label, frame in parts.keyframes.items()}
+    moved = tuple(label for label, frame in parts.keyframes.items() if keyframes[label] != frame)
     primitive = MotionPrimitive(
-        parts.name, skeleton, 1.0 / parts.frame_time_s, spatial, temporal, 1.0, mixture, parts.keyframes
+        parts.name, skeleton, 1.0 / parts.frame_time_s, spatial, temporal, 1.0, mixture, keyframes
     )
-    return PredecessorModel(primitive, layout, tuple(animated), time.form if parts.time else None, error)
+    return PredecessorModel(primitive, layout, tuple(animated), time if parts.time else None, error, moved)
 
 
 def _constant_speed(frames: int) -> PredecessorTime:

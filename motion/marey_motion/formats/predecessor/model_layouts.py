@@ -18,6 +18,7 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_motion.errors import FormatError
 from marey_motion.formats.document_fields import field_of, number_array, text_list
+from marey_motion.formats.predecessor.sections import LAST_FRAME
 from marey_motion.formats.predecessor.time_functions import TimeForm
 
 Layout = Literal["1", "2", "3", "static"]
@@ -175,8 +176,12 @@ def _keyframes(document: Document, file: str) -> dict[str, int]:
         return {}
     given = field_of(document, "keyframes", dict, file)
     for label, frame in given.items():
-        if not isinstance(frame, int) or isinstance(frame, bool) or frame < 0:
-            raise FormatError(f"field 'keyframes': {label!r} must be the number of a frame, not {frame!r}", file=file)
+        if not isinstance(frame, int) or isinstance(frame, bool) or frame < LAST_FRAME:
+            raise FormatError(
+                f"field 'keyframes': {label!r} must be the number of a frame, or {LAST_FRAME} for the last frame, not "
+                f"{frame!r}",
+                file=file,
+            )
     return dict(given)
 
 

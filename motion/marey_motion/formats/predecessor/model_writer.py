@@ -1,12 +1,14 @@
 """Writer of motion primitives in layouts 3 and 2 of Marey's predecessor.
 
 The documents are right-handed, with lengths in centimetres and times in canonical frames. The spatial
-part is written exactly. The time function is converted to a form of the predecessor (see `time_functions`), with an
-approximation error.
+part is written exactly. A time function that was read from a document of the predecessor, and that the document can
+contain, is written as it was read; other time functions are converted (see `time_functions`). Layout 2 contains both
+forms of time functions, layout 3 only the form `coefficients`.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +17,8 @@ from marey_motion.arrays import Floats
 from marey_motion.formats.predecessor.encoding import Encoding, encode_document
 from marey_motion.formats.predecessor.model import columns_of
 from marey_motion.formats.predecessor.skeleton import CENTIMETRE_M, skeleton_document
-from marey_motion.formats.predecessor.time_functions import as_coefficients, as_increments
+from marey_motion.formats.predecessor.time_functions import PredecessorTime, as_coefficients, as_increments
+from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.primitive import MotionPrimitive
 
 
@@ -24,15 +27,20 @@ def write_predecessor_model(
     *,
     layout: Literal["2", "3"] = "3",
     animated_joints: tuple[str, ...] = (),
+    time: PredecessorTime | None = None,
     encoding: Encoding = "json",
 ) -> bytes:
     """Write a primitive.
+
+    A primitive without components gets one that changes nothing, because the predecessor's reader rejects a mixture of
+    no dimensions.
 
     Parameters
     ----------
     primitive : MotionPrimitive    the model
     layout : str    "2" or "3"
     animated_joints : tuple of str    joints whose rotations are written; all joints if empty
+    time : PredecessorTime, optional    the time function from which that of the primitive was converted
     encoding : str    "json", "bson" or "bson.bz2"
 
     Returns
@@ -40,24 +48,30 @@ def write_predecessor_model(
     bytes    content of the file
     """
     joints = animated_joints or primitive.skeleton.joint_names
-    document = model_document(primitive, joints) if layout == "3" else _flat_document(primitive, joints)
+    written = primitive if primitive.dimensions else _with_idle_component(primitive)
+    document = (
+        _layered_document(written, joints, time if time is not None and time.form == "coefficients" else None)
+        if layout == "3"
+        else _flat_document(written, joints, time)
+    )
     return encode_document(document, encoding)
 
 
-def model_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> dict[str, Any]:
-    """Convert a primitive to layout 3.
+def _with_idle_component(primitive: MotionPrimitive) -> MotionPrimitive:
+    """Add a spatial component of zeros to a primitive that has no components."""
+    spatial, shape = primitive.spatial, (1, *primitive.spatial.mean.shape)
+    idle = replace(
+        spatial, directions=np.zeros(shape), projections=np.zeros(shape), variances=np.ones(1), energy=np.ones(1)
+    )
+    return replace(primitive, spatial=idle, mixture=LatentMixture(np.ones(1), np.zeros((1, 1)), np.ones((1, 1, 1))))
 
-    Parameters
-    ----------
-    primitive : MotionPrimitive    the model
-    animated_joints : tuple of str    joints whose rotations are written
 
-    Returns
-    -------
-    dict    the document
-    """
+def _layered_document(
+    primitive: MotionPrimitive, animated_joints: tuple[str, ...], time: PredecessorTime | None
+) -> dict[str, Any]:
+    """Convert a primitive to layout 3, with the time function in the form `coefficients` (see `time_functions`)."""
     mean, vectors = _space(primitive, animated_joints)
-    time = as_coefficients(primitive)
+    time = time or as_coefficients(primitive)
     frame_time_s = 1.0 / primitive.frame_rate_hz
     skeleton = {**skeleton_document(primitive.skeleton, form="file"), "frame_time": frame_time_s}
     return {
@@ -87,10 +101,16 @@ def model_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...])
     }
 
 
-def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> dict[str, Any]:
-    """Convert a primitive to layout 2, with the time function in the form `increments` (see `time_functions`)."""
+def _flat_document(
+    primitive: MotionPrimitive, animated_joints: tuple[str, ...], time: PredecessorTime | None
+) -> dict[str, Any]:
+    """Convert a primitive to layout 2; its time function has the form `increments`, unless one of the other is given.
+
+    The form follows from the components: they are columns of the form `increments`, and rows of the form
+    `coefficients`.
+    """
     mean, vectors = _space(primitive, animated_joints)
-    time = as_increments(primitive)
+    time = time or as_increments(primitive)
     mixture = {f"gmm_{name}": values for name, values in _mixture(primitive).items()}
     return {
         "name": primitive.name,
@@ -102,7 +122,7 @@ def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...])
         "n_basis_spatial": len(mean),
         "n_dim_spatial": mean.shape[1],
         "b_spline_knots_spatial": primitive.spatial.basis.knots.tolist(),
-        "eigen_vectors_time": time.directions.T.tolist(),
+        "eigen_vectors_time": (time.directions.T if time.form == "increments" else time.directions).tolist(),
         "mean_time_vector": time.mean.tolist(),
         "n_basis_time": time.basis.count,
         "b_spline_knots_time": time.basis.knots.tolist(),

@@ -52,14 +52,17 @@ def read_skeleton_document(document: Document, file: str) -> SourceMotion:
     else:
         raise FormatError(
             "the document is neither a clip, which has a field 'poses' or 'frames', nor a skeleton, which "
-            "has a field 'jointDescs' or 'root'",
+            "has a field 'jointDescs' or 'root'; of the predecessor's documents, Marey imports clips, skeletons, "
+            "skeleton models, annotations, aligned clips, models, their trees, and graphs",
             code="document-unknown",
             file=file,
         )
     return _source(nodes, mirrored, file)
 
 
-def skeleton_document(skeleton: Skeleton, *, form: SkeletonForm = "database") -> Document:
+def skeleton_document(
+    skeleton: Skeleton, *, form: SkeletonForm = "database", model: Document | None = None
+) -> Document:
     """Convert a skeleton to the form of the predecessor's database or files.
 
     Every leaf joint gets a tip as child, since a leaf of the document would be read as a tip.
@@ -68,13 +71,16 @@ def skeleton_document(skeleton: Skeleton, *, form: SkeletonForm = "database") ->
     ----------
     skeleton : Skeleton    J joints
     form : str    "database" or "file"
+    model : dict, optional    skeleton model, which the form "file" contains
 
     Returns
     -------
     dict    the document, in centimetres
     """
     tips = _tips(skeleton)
-    return _listed_document(skeleton, tips) if form == "database" else _nested_document(skeleton, tips)
+    if form == "database":
+        return _listed_document(skeleton, tips)
+    return {**_nested_document(skeleton, tips), "skeleton_model": model}
 
 
 # Reading
@@ -155,6 +161,30 @@ def _source(nodes: list[tuple[str, str | None, Document]], mirrored: bool, file:
         offsets=np.array(offsets),
         rest_rotations=np.array(rotations),
         end_sites=tuple(tips),
+        unit_scale_m=CENTIMETRE_M,
+        up_axis="y",
+    )
+
+
+def source_of_skeleton(skeleton: Skeleton) -> SourceMotion:
+    """Convert a skeleton to the content of a skeleton document.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+
+    Returns
+    -------
+    SourceMotion    in centimetres, without motion; joints have the names that they had in their file
+    """
+    return SourceMotion(
+        format=FORMAT,
+        joint_names=skeleton.joint_names,
+        display_names=skeleton.display_names or skeleton.joint_names,
+        parents=skeleton.parents,
+        offsets=skeleton.offsets / CENTIMETRE_M,
+        rest_rotations=skeleton.rest_rotations,
+        end_sites=tuple((site.joint, site.offset / CENTIMETRE_M) for site in skeleton.end_sites),
         unit_scale_m=CENTIMETRE_M,
         up_axis="y",
     )

@@ -29,7 +29,6 @@ DRAWN, SEED = 512, 0
 ODD_LOG_SLOPE = 20.0
 KNOTS_AT_MOST = 500
 """Maximum number of knots of a converted time function; no published model has as many canonical frames."""
-WRITTEN_COEFFICIENTS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,13 +140,14 @@ def as_coefficients(primitive: MotionPrimitive) -> PredecessorTime:
     PredecessorTime    the time function, which depends on the temporal scores in latent vectors of the primitive
     """
     scores, times = _drawn(primitive)
-    count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
-    basis = SplineBasis.clamped(primitive.frame_count, max(DEGREE + 1, count))
+    count = _written_count(primitive)
+    basis = SplineBasis.clamped(primitive.frame_count, count)
     coefficients = np.asarray(basis.fit(times[..., None]))[..., 0]
     coefficients[:, 0], coefficients[:, -1] = 0.0, times[:, -1]
     # A spline runs forward if its coefficients do.
     least = 1e-3 * times[:, -1:] / count
-    coefficients = np.maximum.accumulate(coefficients + least * np.arange(coefficients.shape[1]), axis=1)
+    rising = least * np.arange(coefficients.shape[1])
+    coefficients = np.maximum.accumulate(coefficients - rising, axis=1) + rising
     steps = np.diff(coefficients + 1.0, axis=1, prepend=0.0)
     mean, directions = _linear_fit(scores, np.log(np.maximum(steps, least)))
     return PredecessorTime("coefficients", basis, mean, directions)
@@ -164,13 +164,23 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
     -------
     PredecessorTime    the time function, which depends on the temporal scores in latent vectors of the primitive
     """
-    count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
-    basis = SplineBasis.clamped(primitive.frame_count, max(DEGREE + 1, count))
+    count = _written_count(primitive)
+    # With as many components as coefficients, a reader could not tell whether the components are rows or columns.
+    basis = SplineBasis.clamped(primitive.frame_count, count + (count == primitive.temporal.count))
     fitting = np.linalg.pinv(basis.at_frames[1:])
     slopes = primitive.temporal.basis.at_frames
     mean = fitting @ (slopes @ primitive.temporal.mean[:, 0])
     directions = primitive.temporal.directions[..., 0] @ slopes.T @ fitting.T / primitive.temporal_weight
     return PredecessorTime("increments", basis, np.asarray(mean), np.asarray(directions))
+
+
+def _written_count(primitive: MotionPrimitive) -> int:
+    """Return the number of spline coefficients of a written time function: one for each canonical frame, if possible.
+
+    With fewer coefficients, such as the eight that the predecessor's training uses, its two forms and Marey's form
+    represent different functions, and a time function would be up to a tenth of a frame off.
+    """
+    return max(DEGREE + 1, min(KNOTS_AT_MOST, primitive.frame_count))
 
 
 def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:

@@ -1,6 +1,7 @@
 """Cluster trees of Marey's predecessor: samples of a model in nested nodes. Conversion from and to Marey's trees.
 
-A document holds `data` (samples), `features`, `options` and `root`; a node is `{mean, indices, children}`. Marey's tree
+A document holds `data` (samples), `features`, `options` and `root`; a node is `{mean, indices, children}`, and the
+`indices` of a node with children, such as the root, may be null. Marey's tree
 contains the samples in the order of the tree, in single precision; Marey computes the means from the samples.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -133,9 +135,11 @@ def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, en
 def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]]:
     """List the samples of each node and its number of children, level by level from the root.
 
-    `count` is the number of samples in the document. The samples of a node include those of its children.
+    `count` is the number of samples in the document. The samples of a node include those of its children. The
+    predecessor's tree builder leaves the samples of the root out (`indices: null`); there, and in any other node with
+    children, they follow from the children.
     """
-    indices: list[Ints] = []
+    indices: list[Ints | None] = []
     children: list[int] = []
     waiting: deque[tuple[Node, str, int]] = deque([(root, "root", 0)])
     while waiting:
@@ -147,21 +151,43 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
             raise FormatError(f"{place}: the field `children` must be a list of nodes", file=file)
         if level > MOST_LEVELS:
             raise FormatError(f"{place}: the tree has more than {MOST_LEVELS} levels below its root", file=file)
-        held = number_array(field_of(node, "indices", list, file), file, f"{place}: indices")
-        if held.ndim != 1 or not len(held) or (held != np.floor(held)).any():
-            raise FormatError(f"{place}: the field `indices` must contain at least one sample", file=file)
-        if held.min() < 0 or held.max() >= count:
-            raise FormatError(f"{place}: each number in the field `indices` must be from 0 to {count - 1}", file=file)
-        indices.append(held.astype(np.int64))
+        indices.append(_held(node, place, count, file) if node.get("indices") is not None or not below else None)
         children.append(len(below))
         if len(indices) + len(waiting) + len(below) > MOST_NODES:
             raise FormatError(f"the tree has more than {MOST_NODES} nodes", code="format-limit", file=file)
         waiting.extend((child, f"{place}.{number}", level + 1) for number, child in enumerate(below))
-    if len(np.unique(indices[0])) != count or len(indices[0]) != count:
+    complete = _completed(indices, children)
+    if len(np.unique(complete[0])) != count or len(complete[0]) != count:
         raise FormatError(
             f"root: the field `indices` must contain the number of each of the {count} samples once", file=file
         )
-    return indices, children
+    return complete, children
+
+
+def _held(node: Node, place: str, count: int, file: str) -> Ints:
+    """Read the samples of a node; `place` is its path from the root, `count` the number of samples in the document."""
+    held = number_array(field_of(node, "indices", list, file), file, f"{place}: indices")
+    if held.ndim != 1 or not len(held) or (held != np.floor(held)).any():
+        raise FormatError(f"{place}: the field `indices` must contain at least one sample", file=file)
+    if held.min() < 0 or held.max() >= count:
+        raise FormatError(f"{place}: each number in the field `indices` must be from 0 to {count - 1}", file=file)
+    return held.astype(np.int64)
+
+
+def _completed(indices: list[Ints | None], children: list[int]) -> list[Ints]:
+    """Give nodes that do not list their samples the samples of their children, level by level from the root."""
+    firsts = _first_children(children)
+    complete: list[Ints] = [np.zeros(0, np.int64)] * len(indices)
+    for node in range(len(indices) - 1, -1, -1):
+        held = indices[node]
+        below = complete[firsts[node] : firsts[node] + children[node]]
+        complete[node] = np.concatenate(below) if held is None else held
+    return complete
+
+
+def _first_children(children: list[int]) -> list[int]:
+    """Return the number of the first child of each node, whose children would come there if it has none."""
+    return list(accumulate(children[:-1], initial=1))
 
 
 def _in_tree_order(indices: list[Ints], children: list[int]) -> Ints:
@@ -170,13 +196,13 @@ def _in_tree_order(indices: list[Ints], children: list[int]) -> Ints:
     Both lists have one element for each node, in the order of `_by_levels`: `indices` contains the samples of the node,
     `children` the number of its children.
     """
-    first = np.concatenate(([1], 1 + np.cumsum(children)[:-1]))
+    first = _first_children(children)
     order: list[Ints] = []
     path = [0]
     while path:
         node = path.pop()
         if children[node]:
-            path.extend(range(int(first[node]) + children[node] - 1, int(first[node]) - 1, -1))
+            path.extend(range(first[node] + children[node] - 1, first[node] - 1, -1))
         else:
             order.append(indices[node])
     return np.concatenate(order)
