@@ -66,7 +66,7 @@ Content = type[BaseModel] | type[Document] | type[Bytes]
 
 @dataclass(frozen=True, slots=True)
 class RequestBody:
-    """Body of a request: a model, a document, bytes or files.
+    """Body of a request: a model, a document, bytes or files with the form fields `fields`.
 
     `streamed` bodies are passed to the resource piece by piece while they are received. If `results` is true, the body
     contains results of a job. The arrays in these results may have up to `max_bytes` when decoded. If possible, they
@@ -76,6 +76,7 @@ class RequestBody:
     content: Content | type[Files]
     max_bytes: int = MIB
     alternative: type[Request] | None = None
+    fields: type[Request] | None = None
     streamed: bool = False
     required: bool = True
     results: bool = False

@@ -5,15 +5,14 @@ import re
 from typing import Any
 
 import pytest
+from tests.support.api_document import api_document, api_routes
 
 from marey_schemas.encoding.codecs import MEDIA_TYPES
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.http.docs_page import render_page
-from marey_server.http.openapi import build_document
 from marey_server.http.routes import RouteTable
 
-ROUTES = list(RouteTable(None, RESOURCES))
-DOCUMENT = build_document(ROUTES, "1.2.3")
+DOCUMENT = api_document()
 OPERATIONS = [
     (path, method, operation)
     for path, entry in DOCUMENT["paths"].items()
@@ -24,7 +23,7 @@ OPERATIONS = [
 
 def test_every_route_is_described_once_and_nothing_else_is() -> None:
     described = {(path, method.upper()) for path, method, _ in OPERATIONS}
-    assert described == {(route.template, route.operation.method) for route in ROUTES}
+    assert described == {(route.template, route.operation.method) for route in api_routes()}
     names = [operation["operationId"] for _, _, operation in OPERATIONS]
     assert len(set(names)) == len(names)
 
@@ -82,3 +81,39 @@ def test_the_page_shows_every_operation_and_asks_nobody_else() -> None:
 def test_no_two_resources_share_an_address() -> None:
     with pytest.raises(ValueError, match="two resources have the path"):
         RouteTable(None, [*RESOURCES, RESOURCES[0]])
+
+
+def test_every_body_and_answer_has_a_schema() -> None:
+    """Generators of clients leave out operations with content whose schema is missing."""
+    contents = [
+        (path, media)
+        for path, _, operation in OPERATIONS
+        for one in (operation.get("requestBody", {}), *operation["responses"].values())
+        for media, content in one.get("content", {}).items()
+        if not content.get("schema")
+    ]
+    assert contents == []
+
+
+def test_members_have_no_titles_that_would_name_the_classes_of_clients_twice() -> None:
+    schemas = DOCUMENT["components"]["schemas"]
+    titled = {
+        (name, member, inner["title"])
+        for name, schema in schemas.items()
+        for member, inner in schema.get("properties", {}).items()
+        if "title" in inner
+    }
+    assert titled == {
+        ("BatchCompletion", "result", "result by name"),
+        ("Item", "facets", "facets by name"),
+        ("SomeItem", "facets", "facets by name"),
+    }
+
+
+def test_defaults_are_told_but_not_sent_by_generated_clients() -> None:
+    """A token whose request names no time ends with the token that creates it; the default as a number is refused."""
+    expiry = DOCUMENT["components"]["schemas"]["TokenCreate"]["properties"]["expires_in_s"]
+    assert "default" not in expiry
+    assert expiry["description"].endswith("Default: 7776000.")
+    motion = DOCUMENT["components"]["schemas"]["MotionDocument"]["properties"]["schema"]
+    assert motion["default"] == motion["const"] == "marey/motion@1"
