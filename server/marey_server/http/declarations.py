@@ -145,6 +145,39 @@ class Operation:
         return self.precondition in ("create", "optional")
 
 
+_WHO = {
+    Access.ANYONE: "Needs no token",
+    Access.SIGNED_IN: "Needs a token",
+    Access.USER: "Needs the token of a user",
+    Access.ADMINISTRATOR: "Only for administrators of the server",
+    Access.WORKER: "Only for workers",
+    Access.ATTEMPT: "Needs the token of the attempt",
+    Access.PARTICIPANT: "Needs the link of a participant of a study",
+}
+
+
+def conditions_of(operation: Operation) -> str:
+    """Return sentences that say who may use an operation, and what repeated requests and pages do."""
+    role = operation.access.role
+    who = _WHO[operation.access] if role is None else f"Needs at least the role {role.value} in the project"
+    if operation.in_folders:
+        who += " or in the folder"
+    if operation.scope is not None:
+        who += f", and the scope `{operation.scope}`"
+    sentences = [who]
+    if role is Role.READER and operation.public:
+        sentences.append("In public projects, no token is needed")
+    if operation.precondition == "required":
+        sentences.append("The header If-Match must contain the ETag that you read, or `*`")
+    if operation.precondition == "create":
+        sentences.append("Send If-Match with the ETag that you read, or `If-None-Match: *` to create the resource")
+    if operation.idempotency == "key":
+        sentences.append("With Idempotency-Key, a repeated request gets the same answer")
+    if operation.paged:
+        sentences.append("The answer is one page; its `next_cursor` as `cursor` gives the next")
+    return " ".join(f"{one}." for one in sentences)
+
+
 def reads(
     *,
     access: Access,

@@ -13,7 +13,8 @@ from marey_schemas.formats import OCTETS
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.names import DIGEST_PATTERN
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM_TYPE
-from marey_server.http.declarations import Access, Bytes, Document, Files, Operation, RequestBody
+from marey_server.http.declarations import Access, Bytes, Document, Files, Operation, RequestBody, conditions_of
+from marey_server.http.examples import curl_command, example_of
 from marey_server.http.negotiation import DOCUMENT_FORMS
 from marey_server.http.openapi_models import REF, ApiModels, Schema, bytes_schema, form_schema, without_null
 from marey_server.http.routes import Route
@@ -87,6 +88,7 @@ def build_document(routes: Iterable[Route], version: str) -> Schema:
     for route in routes:
         entry = paths.setdefault(route.template, {"parameters": [_path_parameter(name) for name in route.variables]})
         entry[route.operation.method.lower()] = _operation(route, models)
+    _add_examples(paths, models.components)
     return {
         "openapi": "3.1.0",
         "info": {
@@ -121,11 +123,27 @@ def _operation(route: Route, models: ApiModels) -> Schema:
     }
     if operation.scope is not None:
         entry["x-scope"] = operation.scope
-    if operation.description:
-        entry["description"] = operation.description
+    entry["description"] = "\n\n".join(filter(None, (operation.description, conditions_of(operation))))
     if operation.body is not None:
         entry["requestBody"] = _request_body(operation.body, models)
     return entry
+
+
+def _add_examples(paths: dict[str, Schema], components: dict[str, Schema]) -> None:
+    """Give each parameter, each body and each answer in JSON an example, and each operation a command that sends it."""
+    for path, entry in paths.items():
+        shared = entry["parameters"]
+        for method, operation in entry.items():
+            if method == "parameters":
+                continue
+            for parameter in (*shared, *operation["parameters"]):
+                parameter.setdefault("example", example_of(parameter["schema"], components, parameter["name"]))
+            for holder in (operation.get("requestBody", {}), *operation["responses"].values()):
+                media = holder.get("content", {}).get("application/json")
+                if media is not None:
+                    media["example"] = example_of(media["schema"], components)
+            source = curl_command(method.upper(), path, operation, shared)
+            operation["x-codeSamples"] = [{"lang": "Shell", "label": "curl", "source": source}]
 
 
 def _snake(name: str) -> str:
