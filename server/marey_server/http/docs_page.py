@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -43,11 +44,11 @@ def _page(document: Schema) -> Iterator[str]:
     yield "<input id=token type=password autocomplete=off placeholder='marey_…'></label></div><nav>"
     for tag in document["tags"]:
         yield f"<a href='#{_anchor(tag['name'])}'>{escape(tag['name'])}</a>"
-    yield "<a href='#models'>Models</a><a href='#problems'>Problems</a></nav>"
+    yield "<a href='#schemas'>Schemas</a><a href='#problems'>Problems</a></nav>"
     for tag in document["tags"]:
         yield f"<h2 id='{_anchor(tag['name'])}'>{escape(tag['name'])}</h2>"
         yield from _operations(document, tag["name"])
-    yield "<h2 id=models>Models</h2>"
+    yield "<h2 id=schemas>Schemas</h2>"
     for name, schema in sorted(document["components"]["schemas"].items()):
         yield f"<details id='model-{escape(name)}'><summary><code>{escape(name)}</code> "
         yield f"{escape(_first_line(schema.get('description', '')))}</summary><div>"
@@ -71,7 +72,7 @@ def _operation(path: str, method: str, operation: Schema, shared: list[Schema]) 
     yield f"<code>{escape(path)}</code> {escape(operation['summary'])}"
     yield f"<span class=access>{escape(operation['x-access'].replace('_', ' '))}</span></summary><div>"
     for paragraph in operation["description"].split("\n\n"):
-        yield f"<p>{escape(paragraph)}</p>"
+        yield f"<p>{_with_code(paragraph)}</p>"
     parameters = [*shared, *operation["parameters"]]
     if parameters:
         yield "<table><tr class=head><th>Parameter<th>In<th>Type<th>Meaning"
@@ -80,7 +81,7 @@ def _operation(path: str, method: str, operation: Schema, shared: list[Schema]) 
             yield f"<tr data-name='{escape(parameter['name'])}' data-place={parameter['in']}"
             yield f" data-example='{escape(parameter['example'])}'{' data-required' if parameter['required'] else ''}>"
             yield f"<td><code>{escape(parameter['name'])}</code>{needed}<td>{parameter['in']}"
-            yield f"<td>{_type(parameter['schema'])}<td>{escape(parameter.get('description', ''))}"
+            yield f"<td>{_type(parameter['schema'])}<td>{_with_code(parameter.get('description', ''))}"
         yield "</table>"
     if "requestBody" in operation:
         yield from _body(operation["requestBody"]["content"])
@@ -89,6 +90,11 @@ def _operation(path: str, method: str, operation: Schema, shared: list[Schema]) 
             yield f"<p>{status}: {_content(response['content'])}</p>"
     yield from (f"<pre>{escape(sample['source'])}</pre>" for sample in operation["x-codeSamples"])
     yield "</div></details>"
+
+
+def _with_code(text: str) -> str:
+    """Return a text as HTML, with what is between backquotes as code."""
+    return re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text)))
 
 
 def _body(content: Schema) -> Iterator[str]:
@@ -125,9 +131,12 @@ def _problems() -> Iterator[str]:
         errors.ApiProblem,
         *sorted(_subclasses(errors.ApiProblem), key=lambda error: (error.status, error.code)),
     ]
+    named: set[str] = set()
     for error in known:
         code, title = escape(error.code), escape(_first_line(error.__doc__ or ""))
-        yield f"<tr id='problem-{code}'><td>{error.status}<td><code>{code}</code><td>{title}"
+        place = "" if code in named else f" id='problem-{code}'"
+        named.add(code)
+        yield f"<tr{place}><td>{error.status}<td><code>{code}</code><td>{title}"
 
 
 def _subclasses(base: type[errors.ApiProblem]) -> Iterator[type[errors.ApiProblem]]:

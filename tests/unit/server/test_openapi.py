@@ -86,6 +86,8 @@ def test_the_page_shows_every_operation_and_asks_nobody_else() -> None:
     assert base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() in POLICY
     assert not re.search("localStorage|sessionStorage|cookie\\.|innerHTML", script)
     assert "id='problem-precondition-required'" in page
+    names = re.findall(r" id='?([\w-]+)", page)
+    assert len(set(names)) == len(names)
 
 
 def test_no_two_resources_share_an_address() -> None:
