@@ -5,8 +5,9 @@ import os
 import subprocess
 
 import pytest
+from hatch_build import SOURCES as PAGE_SOURCES
 from tests.support.rest_server import Server
-from tests.support.tiers import PAGE_SOURCES, chromium
+from tests.support.tiers import chromium
 
 
 @pytest.mark.soak

@@ -46,7 +46,7 @@ _FORMATS = {
 def example_of(schema: Schema, components: Mapping[str, Schema], name: str = "", depth: int = 0) -> Any:
     """Return a value that a schema allows; `components` contains the schemas to which it refers by name."""
     if "$ref" in schema:
-        schema = components[schema["$ref"].rpartition("/")[2]] | {k: v for k, v in schema.items() if k != "$ref"}
+        schema = {**components[schema["$ref"].rpartition("/")[2]], **schema}
     for given in (schema.get("examples", ()), schema.get("enum", ())):
         if given:
             return given[0]
