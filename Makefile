@@ -5,7 +5,8 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 DATA   ?=
 PIP    := $(BIN)/python -m pip --disable-pip-version-check -q
-PINNED := $(PIP) install --require-hashes --only-binary :all: -r
+# Pins are complete; pip would refuse the newer typer that pyproject.toml sets for openapi-python-client.
+PINNED := $(PIP) install --no-deps --require-hashes --only-binary :all: -r
 MAREY  := $(PIP) install --no-deps --no-build-isolation -e .
 ARGS   ?=
 # Tests start hundreds of processes, each of which would compile the sources again.

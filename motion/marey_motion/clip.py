@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import ClipError
-from marey_motion.skeleton import UNIT_TOLERANCE, Skeleton
+from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.clips import UNIT_TOLERANCE
 
 _SURELY_UNIT = 1.9 * UNIT_TOLERANCE
 """Deviation of a squared length from 1 that is surely permitted, whatever the rounding errors of float32."""

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from marey_motion.errors import SkeletonError, UnknownJoint
-
-UNIT_TOLERANCE = 1e-3
+from marey_schemas.documents.clips import UNIT_TOLERANCE
 
 SAME_OFFSET_M = 1e-3
 """Bone offsets of two files may differ by this much, in metres, and still be those of one skeleton."""

@@ -237,3 +237,16 @@ class Event(Answer):
     subject: str
     actor: str | None
     body: dict[str, Any] = Field(default_factory=dict)
+
+
+class EventFeed(Page):
+    """Events in their order, and whether further events exist.
+
+    `next_cursor` and `count` are always null; the number of the last event, as `after`, gives the next page.
+    """
+
+    items: tuple[Event, ...]
+    more: bool = Field(
+        description="Whether further events followed this page when it was read; `after` with the number of its last "
+        "event returns them."
+    )

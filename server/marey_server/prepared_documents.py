@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from marey_schemas.documents.blob_references import is_array_reference, members_of, references_of
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.registry import SCHEMAS
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import EncodedArray
@@ -129,13 +130,31 @@ def _check(tree: Any, schema: str | None) -> str:
             raise InvalidProblem(detail, errors=[FieldError(pointer=pointer, code="array-reference", detail=detail)])
     model = SCHEMAS.get(str(named)) or SCHEMAS[OPEN_SCHEMA]
     try:
-        model.model_validate(tree)
+        checked = model.model_validate(tree)
     except ValidationError as error:
         errors = field_errors(error, tree)
         raise InvalidProblem(
             f"The document is not a valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
         ) from error
+    if isinstance(checked, MotionDocument):
+        _require_rotations(checked)
     return str(named or OPEN_SCHEMA)
+
+
+def _require_rotations(motion: MotionDocument) -> None:
+    """Raise `InvalidProblem` if a quaternion is not a rotation.
+
+    The model of the document does not check this, so that motions which were stored before this check can be read.
+    """
+    wrong = motion.find_wrong_rotation()
+    if wrong is not None:
+        frame, joint, length = wrong
+        detail = (
+            f"Frame {frame}, joint {motion.joints[joint]}: the rotation must be a unit quaternion (w, x, y, z), but "
+            f"has the length {length:.6g}. Divide each quaternion by its length."
+        )
+        place = f"/poses/data/{frame}/{3 + 4 * joint}"
+        raise InvalidProblem(detail, errors=[FieldError(pointer=place, code="no-rotation", detail=detail)])
 
 
 def _check_pointers(pointers: list[str]) -> None:

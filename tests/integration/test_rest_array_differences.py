@@ -32,10 +32,11 @@ RIG = revision_content("skeleton", {"hierarchy": document_digest(HIERARCHY)})
 ABSENT = "sha256:" + "2" * 64
 
 
-def poses(edited: int = 0) -> NDArray[np.float32]:
-    """Return the poses of one joint; the root is moved in `edited` frames from frame 300 on."""
+def poses(edited: int = 0, height_m: float = 0) -> NDArray[np.float32]:
+    """Return the poses of one joint; the root is moved in `edited` frames from frame 300 on, and up in all frames."""
     made = np.zeros((FRAMES, 7), np.float32)
     made[:, :3] = np.random.default_rng(1).normal(size=(FRAMES, 3))
+    made[:, 1] += height_m
     made[:, 3] = 1
     made[300 : 300 + edited, 0] += 0.5
     return made
@@ -164,8 +165,8 @@ def test_a_base_of_another_project_is_unknown(client: httpx.Client) -> None:
 
 
 def test_documents_have_differences_from_the_base_that_the_reader_names(client: httpx.Client) -> None:
-    assert send(client, clip(poses(9)), clip(poses() + 1)).json() == {"added": 2}
-    before, edited, other = (clip(one)["content"] for one in (poses(), poses(9), poses() + 1))
+    assert send(client, clip(poses(9)), clip(poses(height_m=1))).json() == {"added": 2}
+    before, edited, other = (clip(one)["content"] for one in (poses(), poses(9), poses(height_m=1)))
     wanted = {"content": edited, "part": "motion"}
     found = documents(
         client, wanted, {**wanted, "base": before}, {**wanted, "base": other}, {**wanted, "base": RIG},

@@ -119,3 +119,24 @@ def test_documents_that_are_large_together_are_left_out_at_the_end(
     monkeypatch.setattr(reading, "MOST_BYTES_AT_ONCE", 10)
     place = {"kind": "character", "item": study.rpartition("/")[2], "revision": 1, "part": "character"}
     assert ok(owner.post("/projects/lab/parts", json={"parts": [place, place]}))["documents"] == [STUDY]
+
+
+def test_quaternions_that_are_no_rotations_are_refused_by_frame_and_joint(owner: httpx.Client) -> None:
+    rows = [[0, 1, 0, 1, 0, 0, 0, 1, 0, 0, 0], [0, 1, 0, 0.6, 0.8, 0, 0, 1, 0, 0.5, 0]]
+    motion = {
+        "schema": "marey/motion@1", "skeleton": {"item": "skeleton_none", "revision": 1}, "frame_rate_hz": 30,
+        "joints": ["Hips", "LeftArm"], "poses": {"dtype": "<f4", "shape": [2, 11], "data": rows},
+    }  # fmt: skip
+    refused = owner.post("/projects/lab/clips", json={"name": "walk", "parts": {"motion": motion}})
+    assert (refused.status_code, refused.json()["code"]) == (422, "invalid")
+    (fault,) = refused.json()["errors"]
+    assert fault["pointer"] == "/motion/poses/data/1/7"
+    assert fault["detail"].startswith(
+        "Frame 1, joint LeftArm: the rotation must be a unit quaternion (w, x, y, z), but"
+    )
+    replaced = owner.put("/projects/lab/clips/clip_none/parts/motion", json=motion, headers={"If-Match": "*"})
+    assert (replaced.status_code, replaced.json()["errors"]) == (422, [fault])
+    rows[1][9] = 0
+    replaced = owner.put("/projects/lab/clips/clip_none/parts/motion", json=motion, headers={"If-Match": "*"})
+    assert replaced.status_code == 404
+    assert owner.get("/projects/lab/clips").json()["items"] == []

@@ -19,6 +19,7 @@ import msgpack
 import numpy as np
 import pytest
 from tests.support.rest_server import PATIENCE_S, Server
+from tests.support.store_fixtures import random_poses
 from tornado.iostream import IOStream
 
 from marey_schemas.encoding.arrays import EncodedArray
@@ -45,8 +46,7 @@ HIERARCHY = {
 
 
 def motion(skeleton: str, frames: int = 40) -> dict[str, Any]:
-    rng = np.random.default_rng(7)
-    poses = rng.normal(size=(frames, 3 + 4 * len(JOINTS))).astype("<f4")
+    poses = random_poses(frames, len(JOINTS), 7)
     return {
         "schema": "marey/motion@1",
         "skeleton": {"item": skeleton, "revision": 1},

@@ -6,8 +6,8 @@ import contextlib
 import functools
 import re
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -23,13 +23,11 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
+from tests.support.api_document import api_document
 from tests.support.furnished_house import CANARY, INVENTED, House, build_house
 from tests.support.rest_server import running
 
-from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.queue.jobs import LONGEST_WAIT_S
-from marey_server.http.openapi import build_document
-from marey_server.http.routes import RouteTable
 from marey_server.store.database.connections import Database
 
 LONGEST_QUERY = 50_000
@@ -102,8 +100,7 @@ def fuzzed_server(database: Database, folder: Path) -> Iterator[FuzzedServer]:
 @functools.cache
 def operations() -> list[AnyOperation]:
     """Return every operation of the OpenAPI document."""
-    document = build_document(RouteTable(None, RESOURCES), version("marey"))
-    schema = schemathesis.openapi.from_dict(document, config=schemathesis.config.SchemathesisConfig())
+    schema = schemathesis.openapi.from_dict(deepcopy(api_document()), config=schemathesis.config.SchemathesisConfig())
     results: Any = schema.get_all_operations()
     return [result.ok() for result in results]
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from marey_schemas.access import MemberChange, ProjectChange, ProjectCreate, Role, UserCreate, Visibility
 from marey_schemas.items import Event, Item, ItemCreate
@@ -27,18 +28,25 @@ def skeleton_tree(joints: int = 3, *, bone_m: float = 0.5) -> dict[str, Any]:
     return {"schema": "marey/skeleton@1", "joints": chain}
 
 
+def random_poses(frames: int, joints: int, seed: int) -> NDArray[np.float32]:
+    """Return poses with random places of the root, and random rotations."""
+    poses = np.random.default_rng(seed).normal(size=(frames, 3 + 4 * joints))
+    rotations = poses[:, 3:].reshape(frames, joints, 4)
+    rotations /= np.linalg.norm(rotations, axis=2, keepdims=True)
+    return poses.astype("<f4")
+
+
 def motion_tree(
     skeleton: Mapping[str, object] | Item, *, frames: int = 5, joints: int = 3, seed: int = 0
 ) -> dict[str, Any]:
     """Return the document of a random motion of `skeleton_tree`; `skeleton` is an item, or a reference."""
     ref = {"item": skeleton.id, "revision": skeleton.revision} if isinstance(skeleton, Item) else skeleton
-    poses = np.random.default_rng(seed).normal(size=(frames, 3 + 4 * joints)).astype("<f4")
     return {
         "schema": "marey/motion@1",
         "skeleton": ref,
         "frame_rate_hz": 120.0,
         "joints": [f"j{i}" for i in range(joints)],
-        "poses": poses,
+        "poses": random_poses(frames, joints, seed),
     }
 
 

@@ -26,6 +26,9 @@ MAX_FRAME_RATE_HZ = 100_000.0
 MIN_FRAME_RATE_HZ = 1e-6
 """Lowest frame rate of a clip; at much lower ones, the duration of a clip would be no finite number."""
 
+UNIT_TOLERANCE = 1e-3
+"""A quaternion is a rotation if its length differs from 1 by at most this."""
+
 
 class MotionDocument(Request):
     """Part `motion` of a clip: the poses."""
@@ -63,6 +66,16 @@ class MotionDocument(Request):
         if unknown := set(self.translated_joints) - set(self.joints):
             raise ValueError(f"translated_joints: {sorted(unknown)} are not joints of the motion")
         return self
+
+    def find_wrong_rotation(self) -> tuple[int, int, float] | None:
+        """Return frame, joint and length of the first quaternion that is not a rotation; None if all are rotations."""
+        rotations = self.poses[:, 3:].reshape(len(self.poses), len(self.joints), 4).astype(np.float64)
+        lengths = np.sqrt(np.einsum("fjc,fjc->fj", rotations, rotations))
+        wrong = np.abs(lengths - 1) > UNIT_TOLERANCE
+        if not wrong.any():
+            return None
+        frame, joint = (int(index) for index in np.argwhere(wrong)[0])
+        return frame, joint, float(lengths[frame, joint])
 
 
 class Check(Request):

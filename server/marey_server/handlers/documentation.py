@@ -9,6 +9,7 @@ from pydantic import Field
 from marey_schemas.address import API
 from marey_schemas.base import Answer
 from marey_server.http.declarations import Access, Bytes, reads
+from marey_server.http.docs_page import POLICY
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 
@@ -70,8 +71,7 @@ class DocumentationPage(Resource):
     async def get(self) -> Reply:
         """Return this API as an HTML page."""
         description = await self.compute(self.services.description)
-        style_only = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
-        headers = {"Content-Security-Policy": style_only}
+        headers = {"Content-Security-Policy": POLICY}
         return Reply(description.page, rev=description.tag, media_type="text/html; charset=utf-8", headers=headers)
 
 

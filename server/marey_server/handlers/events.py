@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.items import Event, Page
+from marey_schemas.items import EventFeed
 from marey_server.errors import BadRequestProblem, TooManyRequestsProblem
 from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Access, reads
@@ -40,8 +40,7 @@ class Events(Resource):
     @reads(
         access=Access.READER,
         query=EventsQuery,
-        answer=Event,
-        paged=True,
+        answer=EventFeed,
         public=False,
         stream=True,
         headers=("Last-Event-ID",),
@@ -49,8 +48,8 @@ class Events(Resource):
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
         """Return events in the order of their commits; as text/event-stream, also send events that occur later.
 
-        A page may have fewer events than `limit`, because the bodies of its events have at most 4 MiB together. Only a
-        page without events means that there are no more.
+        A page may have fewer events than `limit`, because the bodies of its events have at most 4 MiB together; `more`
+        says whether further events exist.
 
         If events that follow the event `after` were deleted because of their age, the answer is 410 (`events-deleted`).
         `context` then contains the number after which the remaining events begin.
@@ -59,7 +58,7 @@ class Events(Resource):
         await self.services.number_events()
         if self.media is not EVENT_STREAM:
             page = await self.look_up(events.list_events, project, after=after, limit=query.limit)
-            return Reply(Page(items=tuple(page.items)))
+            return Reply(EventFeed(items=tuple(page.items), more=not page.complete))
         project_id = (await self.look_up(projects.require, project)).id
         await self.look_up(events.require_kept, after)
         with self._counted(), wakeups.listen([events_topic(project_id)]) as listener:

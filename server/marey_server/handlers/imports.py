@@ -123,9 +123,12 @@ class ProjectImports(Resource):
 
     @writes(
         access=Access.CONTRIBUTOR,
-        body=RequestBody(Files, max_bytes=MAX_UPLOAD_BYTES, alternative=ImportRequest, streamed=True),
+        body=RequestBody(
+            Files, max_bytes=MAX_UPLOAD_BYTES, alternative=ImportRequest, fields=ImportOptions, streamed=True
+        ),
         answer=ImportAnswer,
         also=((202, Job),),
+        headers=("X-Request-Id",),
         in_folders=True,
     )
     async def post(self, project: str) -> Reply:

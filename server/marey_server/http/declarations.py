@@ -66,7 +66,7 @@ Content = type[BaseModel] | type[Document] | type[Bytes]
 
 @dataclass(frozen=True, slots=True)
 class RequestBody:
-    """Body of a request: a model, a document, bytes or files.
+    """Body of a request: a model, a document, bytes or files with the form fields `fields`.
 
     `streamed` bodies are passed to the resource piece by piece while they are received. If `results` is true, the body
     contains results of a job. The arrays in these results may have up to `max_bytes` when decoded. If possible, they
@@ -76,6 +76,7 @@ class RequestBody:
     content: Content | type[Files]
     max_bytes: int = MIB
     alternative: type[Request] | None = None
+    fields: type[Request] | None = None
     streamed: bool = False
     required: bool = True
     results: bool = False
@@ -142,6 +143,39 @@ class Operation:
     def may_create(self) -> bool:
         """Whether the operation accepts `If-None-Match: *`."""
         return self.precondition in ("create", "optional")
+
+
+_WHO = {
+    Access.ANYONE: "Needs no token",
+    Access.SIGNED_IN: "Needs a token",
+    Access.USER: "Needs the token of a user",
+    Access.ADMINISTRATOR: "Only for administrators of the server",
+    Access.WORKER: "Only for workers",
+    Access.ATTEMPT: "Needs the token of the attempt",
+    Access.PARTICIPANT: "Needs the link of a participant of a study",
+}
+
+
+def conditions_of(operation: Operation) -> str:
+    """Return sentences that say who may use an operation, and what repeated requests and pages do."""
+    role = operation.access.role
+    who = _WHO[operation.access] if role is None else f"Needs at least the role {role.value} in the project"
+    if operation.in_folders:
+        who += " or in the folder"
+    if operation.scope is not None:
+        who += f", and the scope `{operation.scope}`"
+    sentences = [who]
+    if role is Role.READER and operation.public:
+        sentences.append("In public projects, no token is needed")
+    if operation.precondition == "required":
+        sentences.append("The header If-Match must contain the ETag that you read, or `*`")
+    if operation.precondition == "create":
+        sentences.append("Send If-Match with the ETag that you read, or `If-None-Match: *` to create the resource")
+    if operation.idempotency == "key":
+        sentences.append("With Idempotency-Key, a repeated request gets the same answer")
+    if operation.paged:
+        sentences.append("The answer is one page; its `next_cursor` as `cursor` gives the next")
+    return " ".join(f"{one}." for one in sentences)
 
 
 def reads(

@@ -1,9 +1,17 @@
-"""Documentation page of the API: the OpenAPI document as one HTML page without scripts or external resources."""
+"""Documentation page of the API: the OpenAPI document as one HTML page without external resources.
+
+A script adds forms that send requests with a token, which only the page's memory keeps. Without the script, the page
+can be read, too.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from markupsafe import escape
@@ -12,18 +20,13 @@ from marey_server import errors
 
 Schema = dict[str, Any]
 
-_STYLE = """
-:root { color-scheme: light dark; --line: #8884; --soft: #8882; --mark: #2563eb; }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { margin-bottom: 0 } h2 { margin-top: 2.5rem; border-bottom: 1px solid var(--line) }
-code, pre { font: 13px/1.45 ui-monospace, monospace } pre { background: var(--soft); padding: .6rem; overflow: auto }
-details { border: 1px solid var(--line); border-radius: 6px; margin: .4rem 0 }
-summary { cursor: pointer; padding: .35rem .7rem } details > div { padding: 0 .9rem .6rem }
-.method { display: inline-block; min-width: 4.2rem; font-weight: 700; color: var(--mark) }
-.access { float: right; opacity: .7 } table { border-collapse: collapse; width: 100% }
-td, th { text-align: left; vertical-align: top; padding: .2rem .6rem .2rem 0; border-bottom: 1px solid var(--soft) }
-nav a { margin-right: .8rem }
-"""
+_STYLE, _SCRIPT = (Path(__file__).with_suffix(f".{kind}").read_text("utf-8") for kind in ("css", "js"))
+_DIGEST = base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode()
+POLICY = (
+    f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{_DIGEST}'; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""Content security policy of the page: only its own script runs, and it connects to this server only."""
 
 
 def render_page(document: Schema) -> bytes:
@@ -36,21 +39,23 @@ def _page(document: Schema) -> Iterator[str]:
     yield "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
     yield f"<title>{escape(info['title'])} API</title><style>{_STYLE}</style>"
     yield f"<h1>{escape(info['title'])} API</h1><p>Version {escape(info['version'])}. {escape(info['description'])}"
-    yield " Programs read <a href='openapi.json'>openapi.json</a>.</p><nav>"
+    yield " Programs read <a href='openapi.json'>openapi.json</a>.</p>"
+    yield "<div class=token><label>Token for requests sent from this page; reloading the page forgets it"
+    yield "<input id=token type=password autocomplete=off placeholder='marey_…'></label></div><nav>"
     for tag in document["tags"]:
         yield f"<a href='#{_anchor(tag['name'])}'>{escape(tag['name'])}</a>"
-    yield "<a href='#models'>Models</a><a href='#problems'>Problems</a></nav>"
+    yield "<a href='#schemas'>Schemas</a><a href='#problems'>Problems</a></nav>"
     for tag in document["tags"]:
         yield f"<h2 id='{_anchor(tag['name'])}'>{escape(tag['name'])}</h2>"
         yield from _operations(document, tag["name"])
-    yield "<h2 id=models>Models</h2>"
+    yield "<h2 id=schemas>Schemas</h2>"
     for name, schema in sorted(document["components"]["schemas"].items()):
         yield f"<details id='model-{escape(name)}'><summary><code>{escape(name)}</code> "
         yield f"{escape(_first_line(schema.get('description', '')))}</summary><div>"
         yield f"<pre>{escape(json.dumps(schema, indent=2, ensure_ascii=False))}</pre></div></details>"
-    yield "<h2 id=problems>Problems</h2><table><tr><th>Status<th>Code<th>Meaning"
+    yield "<h2 id=problems>Problems</h2><table><tr class=head><th>Status<th>Code<th>Meaning"
     yield from _problems()
-    yield "</table></html>"
+    yield f"</table><script>{_SCRIPT}</script></html>"
 
 
 def _operations(document: Schema, tag: str) -> Iterator[str]:
@@ -61,24 +66,43 @@ def _operations(document: Schema, tag: str) -> Iterator[str]:
 
 
 def _operation(path: str, method: str, operation: Schema, shared: list[Schema]) -> Iterator[str]:
-    yield f"<details id='{escape(operation['operationId'])}'><summary><span class=method>{method.upper()}</span>"
+    place = f"data-method={method.upper()} data-path='{escape(path)}'"
+    yield f"<details id='{escape(operation['operationId'])}' {place}>"
+    yield f"<summary><span class='method {method}'>{method.upper()}</span>"
     yield f"<code>{escape(path)}</code> {escape(operation['summary'])}"
     yield f"<span class=access>{escape(operation['x-access'].replace('_', ' '))}</span></summary><div>"
-    yield f"<p>{escape(operation.get('description', ''))}</p>"
+    for paragraph in operation["description"].split("\n\n"):
+        yield f"<p>{_with_code(paragraph)}</p>"
     parameters = [*shared, *operation["parameters"]]
     if parameters:
-        yield "<table><tr><th>Parameter<th>In<th>Type<th>Meaning"
+        yield "<table><tr class=head><th>Parameter<th>In<th>Type<th>Meaning"
         for parameter in parameters:
             needed = " (needed)" if parameter["required"] and parameter["in"] != "path" else ""
-            yield f"<tr><td><code>{escape(parameter['name'])}</code>{needed}<td>{parameter['in']}"
-            yield f"<td>{_type(parameter['schema'])}<td>{escape(parameter.get('description', ''))}"
+            yield f"<tr data-name='{escape(parameter['name'])}' data-place={parameter['in']}"
+            yield f" data-example='{escape(parameter['example'])}'{' data-required' if parameter['required'] else ''}>"
+            yield f"<td><code>{escape(parameter['name'])}</code>{needed}<td>{parameter['in']}"
+            yield f"<td>{_type(parameter['schema'])}<td>{_with_code(parameter.get('description', ''))}"
         yield "</table>"
     if "requestBody" in operation:
-        yield f"<p>Body: {_content(operation['requestBody']['content'])}</p>"
+        yield from _body(operation["requestBody"]["content"])
     for status, response in operation["responses"].items():
         if "content" in response:
             yield f"<p>{status}: {_content(response['content'])}</p>"
+    yield from (f"<pre>{escape(sample['source'])}</pre>" for sample in operation["x-codeSamples"])
     yield "</div></details>"
+
+
+def _with_code(text: str) -> str:
+    """Return a text as HTML, with what is between backquotes as code."""
+    return re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text)))
+
+
+def _body(content: Schema) -> Iterator[str]:
+    yield f"<p>Body: {_content(content)}</p>"
+    media_type = next(iter(content))
+    example = content[media_type].get("example")
+    shown = "" if example is None else escape(json.dumps(example, indent=2, ensure_ascii=False))
+    yield f"<pre data-body='{media_type}'{'' if shown else ' hidden'}>{shown}</pre>"
 
 
 def _content(content: Schema) -> str:
@@ -107,9 +131,12 @@ def _problems() -> Iterator[str]:
         errors.ApiProblem,
         *sorted(_subclasses(errors.ApiProblem), key=lambda error: (error.status, error.code)),
     ]
+    named: set[str] = set()
     for error in known:
         code, title = escape(error.code), escape(_first_line(error.__doc__ or ""))
-        yield f"<tr id='problem-{code}'><td>{error.status}<td><code>{code}</code><td>{title}"
+        place = "" if code in named else f" id='problem-{code}'"
+        named.add(code)
+        yield f"<tr{place}><td>{error.status}<td><code>{code}</code><td>{title}"
 
 
 def _subclasses(base: type[errors.ApiProblem]) -> Iterator[type[errors.ApiProblem]]:

@@ -5,24 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from http import HTTPStatus
-from typing import Any
 
 from pydantic import BaseModel
-from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
-from marey_schemas.documents.registry import SCHEMAS
 from marey_schemas.encoding.codecs import MEDIA_TYPES
+from marey_schemas.formats import OCTETS
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.names import DIGEST_PATTERN
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM_TYPE
-from marey_schemas.problems import Problem
-from marey_server.http.declarations import Access, Bytes, Document, Files, Operation, RequestBody
+from marey_server.http.declarations import Access, Bytes, Document, Files, Operation, RequestBody, conditions_of
+from marey_server.http.examples import curl_command, example_of
 from marey_server.http.negotiation import DOCUMENT_FORMS
+from marey_server.http.openapi_models import REF, ApiModels, Schema, bytes_schema, form_schema, without_null
 from marey_server.http.routes import Route
 
-Schema = dict[str, Any]
-
-_REF = "#/components/schemas/{model}"
 _NAME = {"type": "string", "minLength": 1}
 _PART_NAMES = sorted({part for parts in PARTS.values() for part in parts})
 PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
@@ -62,7 +58,7 @@ _OFFSET = {"type": "integer", "minimum": 0, "maximum": 10**12 - 1}
 _STATE = {"type": "string", "pattern": r'^(\*|"[0-9]{1,9}\.[a-z-]+")$'}
 _HEADER_SCHEMAS: dict[str, Schema] = {
     "If-Match": _STATE,
-    "If-None-Match": {"type": "string", "const": "*"},
+    "If-None-Match": {"type": "string", "pattern": r"^\*$"},
     "Idempotency-Key": {"type": "string", "pattern": "^[!-~]{1,255}$"},
     "Upload-Offset": _OFFSET,
     "Last-Event-ID": _OFFSET,
@@ -76,6 +72,7 @@ _HEADERS = {
     "If-Range": "Return the range only if the resource still has this ETag; otherwise return all bytes.",
     "Last-Event-ID": "Number of the last event that you received, to continue a stream after it.",
     "Upload-Offset": "Number of bytes that the server has already received; any other number is refused.",
+    "X-Request-Id": "Name of the request in the server's log; absent: the server chooses one.",
     "Idempotency-Key": "Text that you choose. For seven days, the same request with the same text gets the same "
     "answer.",
 }
@@ -86,11 +83,12 @@ _TOKEN_OPTIONAL: list[Schema] = [{}, {"bearer": []}]
 def build_document(routes: Iterable[Route], version: str) -> Schema:
     """Return the OpenAPI document of a table of routes."""
     routes = list(routes)
-    models = _Models(routes)
+    models = ApiModels(route.operation for route in routes)
     paths: dict[str, Schema] = {}
     for route in routes:
         entry = paths.setdefault(route.template, {"parameters": [_path_parameter(name) for name in route.variables]})
         entry[route.operation.method.lower()] = _operation(route, models)
+    _add_examples(paths, models.components)
     return {
         "openapi": "3.1.0",
         "info": {
@@ -111,48 +109,7 @@ def build_document(routes: Iterable[Route], version: str) -> Schema:
     }
 
 
-class _Models:
-    """JSON schemas of all models in requests and answers, and references to them."""
-
-    def __init__(self, routes: list[Route]) -> None:
-        wanted: dict[tuple[type[BaseModel], JsonSchemaMode], None] = {(Problem, "serialization"): None}
-        for route in routes:
-            operation = route.operation
-            for answer in (operation.answer, *(model for _, model in operation.also)):
-                if answer is not None and issubclass(answer, BaseModel):
-                    wanted[answer, "serialization"] = None
-            for taken in (operation.body.content, operation.body.alternative) if operation.body else ():
-                if taken is not None and issubclass(taken, BaseModel):
-                    wanted[taken, "validation"] = None
-        wanted |= {(model, "validation"): None for model in SCHEMAS.values()}
-        self._refs, definitions = models_json_schema(list(wanted), ref_template=_REF)
-        self.components: dict[str, Schema] = definitions.get("$defs", {})
-
-    def reading(self, model: type[BaseModel]) -> Schema:
-        """Return a `$ref` to the schema of a model in requests."""
-        return dict(self._refs[model, "validation"])
-
-    def writing(self, model: type[BaseModel]) -> Schema:
-        """Return a `$ref` to the schema of a model in answers."""
-        return dict(self._refs[model, "serialization"])
-
-    def partial(self, model: type[BaseModel]) -> Schema:
-        """Return a `$ref` to a new schema: the model's schema in answers, but without required fields."""
-        name = f"Some{model.__name__}"
-        full = self.components[self.writing(model)["$ref"].rpartition("/")[2]]
-        self.components[name] = {key: value for key, value in full.items() if key != "required"} | {"title": name}
-        return {"$ref": _REF.format(model=name)}
-
-    def document(self) -> Schema:
-        """Return the schema that matches every kind of document.
-
-        The schema uses `anyOf`, not `oneOf`, because the schema of `OpenDocument` also matches documents of other
-        schemas.
-        """
-        return {"anyOf": [self.reading(model) for model in SCHEMAS.values()]}
-
-
-def _operation(route: Route, models: _Models) -> Schema:
+def _operation(route: Route, models: ApiModels) -> Schema:
     operation = route.operation
     guests = operation.access is Access.ANYONE or (operation.access is Access.READER and operation.public)
     entry: Schema = {
@@ -166,11 +123,27 @@ def _operation(route: Route, models: _Models) -> Schema:
     }
     if operation.scope is not None:
         entry["x-scope"] = operation.scope
-    if operation.description:
-        entry["description"] = operation.description
+    entry["description"] = "\n\n".join(filter(None, (operation.description, conditions_of(operation))))
     if operation.body is not None:
         entry["requestBody"] = _request_body(operation.body, models)
     return entry
+
+
+def _add_examples(paths: dict[str, Schema], components: dict[str, Schema]) -> None:
+    """Give each parameter, each body and each answer in JSON an example, and each operation a command that sends it."""
+    for path, entry in paths.items():
+        shared = entry["parameters"]
+        for method, operation in entry.items():
+            if method == "parameters":
+                continue
+            for parameter in (*shared, *operation["parameters"]):
+                parameter.setdefault("example", example_of(parameter["schema"], components, parameter["name"]))
+            for holder in (operation.get("requestBody", {}), *operation["responses"].values()):
+                media = holder.get("content", {}).get("application/json")
+                if media is not None:
+                    media["example"] = example_of(media["schema"], components)
+            source = curl_command(method.upper(), path, operation, shared)
+            operation["x-codeSamples"] = [{"lang": "Shell", "label": "curl", "source": source}]
 
 
 def _snake(name: str) -> str:
@@ -185,10 +158,10 @@ def _path_parameter(name: str) -> Schema:
 def _query_parameters(operation: Operation) -> list[Schema]:
     if operation.query is None:
         return []
-    schema = operation.query.model_json_schema(by_alias=True, ref_template=_REF)
+    schema = operation.query.model_json_schema(by_alias=True, ref_template=REF)
     parameters = []
     for name, found in schema.get("properties", {}).items():
-        shown = _without_null(found)
+        shown = without_null(found)
         description = shown.pop("description", "")
         parameter = {"name": name, "in": "query", "required": name in schema.get("required", ()), "schema": shown}
         if description:
@@ -197,18 +170,6 @@ def _query_parameters(operation: Operation) -> list[Schema]:
             parameter |= {"style": "form", "explode": False}
         parameters.append(parameter)
     return parameters
-
-
-def _without_null(schema: Schema) -> Schema:
-    """Return the schema of a query parameter without null: a client omits a parameter instead of sending null."""
-    shown = {key: value for key, value in schema.items() if key not in ("title", "default") or schema[key] is not None}
-    shown.pop("title", None)
-    choices = [choice for choice in shown.pop("anyOf", ()) if choice.get("type") != "null"]
-    if len(choices) == 1:
-        shown |= choices[0]
-    elif choices:
-        shown["anyOf"] = choices
-    return shown
 
 
 def _header_parameters(operation: Operation) -> list[Schema]:
@@ -223,18 +184,19 @@ def _header_parameters(operation: Operation) -> list[Schema]:
     return [
         {
             "name": name, "in": "header", "required": name in needed, "description": _HEADERS[name],
-            "schema": {"type": "string"},
+            "schema": _HEADER_SCHEMAS.get(name, {"type": "string"}),
         }
         for name in (*names, *operation.headers)
     ]  # fmt: skip
 
 
-def _request_body(body: RequestBody, models: _Models) -> Schema:
+def _request_body(body: RequestBody, models: ApiModels) -> Schema:
     content: Schema = {}
     if body.content is Bytes:
-        content["application/octet-stream"] = {}
+        content[OCTETS] = {"schema": bytes_schema(OCTETS)}
     elif body.content is Files:
-        content["multipart/form-data"] = {"schema": {"type": "object", "description": "Files and form fields."}}
+        assert body.fields is not None
+        content["multipart/form-data"] = {"schema": form_schema(body.fields)}
     else:
         schema = models.document() if body.content is Document else models.reading(body.content)  # type: ignore[arg-type]
         content |= {name: {"schema": schema} for name in MEDIA_TYPES}
@@ -243,7 +205,7 @@ def _request_body(body: RequestBody, models: _Models) -> Schema:
     return {"required": body.required, "content": content}
 
 
-def _responses(operation: Operation, models: _Models) -> Schema:
+def _responses(operation: Operation, models: ApiModels) -> Schema:
     success: Schema = {"description": HTTPStatus(operation.status).phrase}
     if operation.answer is not None:
         success["content"] = _answer_content(operation, models)
@@ -273,19 +235,20 @@ def _responses(operation: Operation, models: _Models) -> Schema:
     return found
 
 
-def _answer_content(operation: Operation, models: _Models) -> Schema:
+def _answer_content(operation: Operation, models: ApiModels) -> Schema:
     answer = operation.answer
     if answer is Bytes:
-        return {name: {} for name in operation.answer_types or ("application/octet-stream",)}
+        return {name: {"schema": bytes_schema(name)} for name in operation.answer_types or (OCTETS,)}
     if answer is Document:
-        return {str(form): ({"schema": models.document()} if form.form == "json" else {}) for form in DOCUMENT_FORMS}
+        packed = bytes_schema(OCTETS)
+        return {str(form): {"schema": models.document() if form.form == "json" else packed} for form in DOCUMENT_FORMS}
     assert answer is not None
     assert issubclass(answer, BaseModel)
     schema = models.writing(answer)
     if operation.paged:
         selectable = operation.query is not None and "fields" in operation.query.model_fields
         schema = _page_schema(models.partial(answer) if selectable else schema)
-    streams: Schema = {"text/event-stream": {}} if operation.stream else {}
+    streams: Schema = {"text/event-stream": {"schema": bytes_schema("text/event-stream")}} if operation.stream else {}
     return {name: {"schema": schema} for name in operation.answer_types or MEDIA_TYPES} | streams
 
 
@@ -324,5 +287,8 @@ def _problem_response(*others: str) -> Schema:
     return {
         "description": "Reason why the request was refused.",
         "headers": {"X-Request-Id": {"description": "Quote it when asking for help.", "schema": {"type": "string"}}},
-        "content": {PROBLEM_TYPE: {"schema": {"$ref": _REF.format(model="Problem")}}, **{name: {} for name in others}},
+        "content": {
+            PROBLEM_TYPE: {"schema": {"$ref": REF.format(model="Problem")}},
+            **{name: {"schema": bytes_schema(name)} for name in others},
+        },
     }

@@ -67,7 +67,7 @@ _UNNUMBERED = event.c.number.is_(None)
 
 
 class EventPage(NamedTuple):
-    """Page of the feed, and whether no events remained after the page when it was read."""
+    """Page of the feed, and whether no events followed it when it was read."""
 
     items: list[Event]
     complete: bool
@@ -91,7 +91,7 @@ def list_events(
     if subject is not None:
         conditions.append(event.c.subject == subject)
     most = min(limit, MAX_EVENTS)
-    placed = _placed(tx, conditions, most).subquery()
+    placed = _placed(tx, conditions, most + 1).subquery()
     statement = (
         select(*_COLUMNS, number_of(tx).label("number"), project.c.name.label("project"), placed.c.found)
         .select_from(event.join(placed, placed.c.seq == event.c.seq))
@@ -99,7 +99,8 @@ def list_events(
         .where(or_(placed.c.until_bytes <= PAGE_BYTES, placed.c.until_bytes == placed.c.size_bytes))
     )
     rows = tx.execute(statement.order_by(number_of(tx))).all()
-    return EventPage([_shown(row) for row in rows], not rows or len(rows) == rows[0].found < most)
+    shown = rows[:most]  # the one event more tells whether events follow the page
+    return EventPage([_shown(row) for row in shown], not rows or len(shown) == rows[0].found)
 
 
 def _placed(tx: Transaction, conditions: Sequence[ColumnElement[bool]], most: int) -> Select[Any]:

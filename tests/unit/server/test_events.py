@@ -69,7 +69,8 @@ def project_id(tx: Transaction) -> str:
 def test_a_page_is_complete_if_no_event_remains(lab: Lab) -> None:
     whole = lab.events()
     assert lab.read(events.list_events, "lab", limit=len(whole) + 1).complete
-    assert not lab.read(events.list_events, "lab", limit=len(whole)).complete  # the limit hides whether more follow
+    assert lab.read(events.list_events, "lab", limit=len(whole)).complete
+    assert not lab.read(events.list_events, "lab", limit=len(whole) - 1).complete
     assert lab.read(events.list_events, "lab", after=whole[-1].seq) == ([], True)
 
 

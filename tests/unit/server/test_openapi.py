@@ -1,19 +1,22 @@
 """The OpenAPI document, compared with the routes that it describes."""
 
+import base64
+import hashlib
 import json
 import re
 from typing import Any
 
 import pytest
+from jsonschema import Draft202012Validator
+from tests.support.api_document import api_document, api_routes
 
 from marey_schemas.encoding.codecs import MEDIA_TYPES
+from marey_schemas.items import ItemCreate
 from marey_server.handlers.catalogue import RESOURCES
-from marey_server.http.docs_page import render_page
-from marey_server.http.openapi import build_document
+from marey_server.http.docs_page import POLICY, render_page
 from marey_server.http.routes import RouteTable
 
-ROUTES = list(RouteTable(None, RESOURCES))
-DOCUMENT = build_document(ROUTES, "1.2.3")
+DOCUMENT = api_document()
 OPERATIONS = [
     (path, method, operation)
     for path, entry in DOCUMENT["paths"].items()
@@ -24,7 +27,7 @@ OPERATIONS = [
 
 def test_every_route_is_described_once_and_nothing_else_is() -> None:
     described = {(path, method.upper()) for path, method, _ in OPERATIONS}
-    assert described == {(route.template, route.operation.method) for route in ROUTES}
+    assert described == {(route.template, route.operation.method) for route in api_routes()}
     names = [operation["operationId"] for _, _, operation in OPERATIONS]
     assert len(set(names)) == len(names)
 
@@ -32,6 +35,10 @@ def test_every_route_is_described_once_and_nothing_else_is() -> None:
 @pytest.mark.parametrize(("path", "operation"), [(path, operation) for path, _, operation in OPERATIONS])
 def test_an_operation_says_what_it_does_who_may_and_what_can_go_wrong(path: str, operation: dict[str, Any]) -> None:
     assert operation["summary"]
+    assert operation["description"].endswith(".")
+    (sample,) = operation["x-codeSamples"]
+    assert sample["source"].startswith("curl")
+    assert not set(re.findall(r"\{(\w+)\}", sample["source"].partition("$MAREY_SERVER")[2]))
     assert operation["x-access"]
     assert "default" in operation["responses"]
     success = [status for status in operation["responses"] if status.startswith("2")]
@@ -75,10 +82,76 @@ def test_the_page_shows_every_operation_and_asks_nobody_else() -> None:
         assert path in page
         assert f"id='{operation['operationId']}'" in page
     assert re.findall(r"(?:src|href|action|url\(|import)[=\s'\"]*(?:https?:)?//", page) == []
-    assert "<script" not in page
+    (script,) = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    assert base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() in POLICY
+    assert not re.search("localStorage|sessionStorage|cookie\\.|innerHTML", script)
     assert "id='problem-precondition-required'" in page
+    names = re.findall(r" id='?([\w-]+)", page)
+    assert len(set(names)) == len(names)
 
 
 def test_no_two_resources_share_an_address() -> None:
     with pytest.raises(ValueError, match="two resources have the path"):
         RouteTable(None, [*RESOURCES, RESOURCES[0]])
+
+
+def test_every_body_and_answer_has_a_schema() -> None:
+    """Generators of clients leave out operations with content whose schema is missing."""
+    contents = [
+        (path, media)
+        for path, _, operation in OPERATIONS
+        for one in (operation.get("requestBody", {}), *operation["responses"].values())
+        for media, content in one.get("content", {}).items()
+        if not content.get("schema")
+    ]
+    assert contents == []
+
+
+def test_members_have_no_titles_that_would_name_the_classes_of_clients_twice() -> None:
+    schemas = DOCUMENT["components"]["schemas"]
+    titled = {
+        (name, member, inner["title"])
+        for name, schema in schemas.items()
+        for member, inner in schema.get("properties", {}).items()
+        if "title" in inner
+    }
+    assert titled == {
+        ("BatchCompletion", "result", "result by name"),
+        ("Item", "facets", "facets by name"),
+        ("SomeItem", "facets", "facets by name"),
+    }
+
+
+def test_defaults_are_told_but_not_sent_by_generated_clients() -> None:
+    """A token whose request names no time ends with the token that creates it; the default as a number is refused."""
+    expiry = DOCUMENT["components"]["schemas"]["TokenCreate"]["properties"]["expires_in_s"]
+    assert "default" not in expiry
+    assert expiry["description"].endswith("Default: 7776000.")
+    motion = DOCUMENT["components"]["schemas"]["MotionDocument"]["properties"]["schema"]
+    assert motion["default"] == motion["const"] == "marey/motion@1"
+
+
+def test_every_example_fits_its_schema() -> None:
+    shown = 0
+    for path, method, operation in OPERATIONS:
+        parameters = [*DOCUMENT["paths"][path]["parameters"], *operation["parameters"]]
+        holders = (operation.get("requestBody", {}), *operation["responses"].values())
+        media = [
+            holder["content"]["application/json"]
+            for holder in holders
+            if "application/json" in holder.get("content", {})
+        ]
+        for described in (*parameters, *media):
+            schema = {**described["schema"], "components": DOCUMENT["components"]}
+            faults = [fault.message for fault in Draft202012Validator(schema).iter_errors(described["example"])]
+            assert faults == [], f"{method} {path}"
+            shown += 1
+    assert shown > 4 * len(OPERATIONS)
+
+
+def test_the_example_of_a_command_can_be_sent() -> None:
+    create = DOCUMENT["paths"]["/api/v1/projects/{project}/{kind}"]["post"]
+    assert ItemCreate.model_validate(create["requestBody"]["content"]["application/json"]["example"]).name == "walk"
+    command = create["x-codeSamples"][0]["source"]
+    assert command.startswith('curl -X POST -H "Authorization: Bearer $MAREY_TOKEN"')
+    assert command.endswith('"$MAREY_SERVER/api/v1/projects/lab/skeletons"')

@@ -8,7 +8,7 @@ import re
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.items import Event, Page
+from marey_schemas.items import EventFeed, Page
 from marey_schemas.queue.job_kinds import UnknownKindError, find_kind, job_kinds
 from marey_schemas.queue.jobs import (
     Attempt,
@@ -276,12 +276,12 @@ class JobEvents(Resource):
     path = "/jobs/{job}/events"
     tag = "Jobs"
 
-    @reads(access=Access.READER, query=JobEventsQuery, answer=Event, paged=True, public=False)
+    @reads(access=Access.READER, query=JobEventsQuery, answer=EventFeed, public=False)
     async def get(self, job: str, query: JobEventsQuery) -> Rendered:
         """Return the events of a job in the order of their commits.
 
-        A page may have fewer events than `limit`, because the bodies of its events have at most 4 MiB; only a page
-        without events means that there are no more.
+        A page may have fewer events than `limit`, because the bodies of its events have at most 4 MiB together; `more`
+        says whether further events exist.
         """
         await self.services.number_events()
         return await self.answer(reading.list_job_events, job, query.after, query.limit)

@@ -11,7 +11,7 @@ from sqlalchemy import ColumnElement, Row, Select, and_, case, func, select, upd
 
 from marey_schemas.access import Role
 from marey_schemas.documents.reports import StoredFile
-from marey_schemas.items import Page
+from marey_schemas.items import EventFeed, Page
 from marey_schemas.queue.jobs import Attempt, Job, JobOutput, JobState, TaskResult
 from marey_server.access import roles
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem
@@ -141,10 +141,11 @@ def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit:
     return Page(items=tuple(results), next_cursor=next_cursor)
 
 
-def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 100) -> Page:
+def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 100) -> EventFeed:
     """Return the events of a job, for members of its project."""
     _, project = find_job(tx, job_id)
-    return Page(items=tuple(events.list_events(tx, project.name, after=after, limit=limit, subject=job_id).items))
+    page = events.list_events(tx, project.name, after=after, limit=limit, subject=job_id)
+    return EventFeed(items=tuple(page.items), more=not page.complete)
 
 
 def read_job_log(tx: Transaction, job_id: str, offset: int = 0, limit: int = MOST_READ_BYTES) -> LogPage:
