@@ -250,14 +250,15 @@ def _metres(value: float | None) -> str:
 
 def _print_suggestions(document: Mapping[str, Any]) -> None:
     unused, redundant = document["unused"], document["redundant"]
+    # The effect of all unused data together follows the list of its parts.
+    together = {name: unused[f"confirmed_{name}"] for name in ("clips", "ranges")}
     sections = (
         (f"{counted(len(unused['clips']), 'clip')} ({_seconds(unused['clips'])}) can be removed without changing any "
          "trial", unused["clips"]),
         (f"{counted(len(unused['ranges']), 'range')} of clips ({_seconds(unused['ranges'])}) can be cut off with "
          "hardly any change", unused["ranges"]),
-        (f"{counted(len(redundant['plan']), 'clip')} can {'then ' if unused['clips'] else ''}be removed one after "
-         f"another with little effect; {redundant['tried']} of {redundant['needed']} used clips were tried",
-         redundant["plan"]),
+        (f"{counted(len(redundant['plan']), 'clip')} to {'then ' if unused['clips'] else ''}remove, one after another; "
+         f"{redundant['tried']} of {redundant['needed']} used clips were tried", redundant["plan"]),
         (f"{counted(len(document['near_duplicates']['pairs']), 'pair')} of clips with nearly the same motion, within "
          f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
         (f"{counted(len(document['fillings']), 'clip')} would fill holes", document["fillings"]),
@@ -270,7 +271,15 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
                 typer.echo(f"  {entry['reason']}")
             if len(entries) > SHOWN:
                 typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
+            for name, effect in together.items():
+                if effect is not None and entries is unused[name]:
+                    typer.echo(f"  {effect['reason']}")
             typer.echo("")
+    if (chance := document["chance"].get("offset_mean")) is not None:
+        typer.echo(
+            f"By chance alone, the mean distance from the path varies by {100 * chance:.2f} cm between replicates "
+            "(standard deviation)."
+        )
     _print_similarity(document["similarity"])
     if (metric := document["near_duplicates"].get("metric")) is not None:
         typer.echo(
@@ -304,18 +313,38 @@ def _print_steps(document: Mapping[str, Any]) -> None:
     names = document["names"]
     rows = [
         (step["number"], step["action"], ", ".join(names.get(source, source) for source in step["sources"]),
-         f"{step['objective']:.4f}", f"{step['metrics']['offset_mean']:.4f}", f"{step['data_s']:.1f}",
-         step["changed_trials"])
+         f"{step['objective']:.4f}", _confirmed(step["confirmed"]), f"{step['metrics']['offset_mean']:.4f}",
+         f"{step['data_s']:.1f}", step["changed_trials"])
         for step in document["steps"]
     ]  # fmt: skip
-    columns = ("step", "action", "clips", "objective m", "offset m", "data s", "trials changed")
+    columns = ("step", "action", "clips", "objective m", "confirmed change m", "offset m", "data s", "trials changed")
     print_table(columns, rows, right=columns[3:])
+    for one in document["unconfirmed"]:
+        clips = ", ".join(names.get(source, source) for source in one["sources"])
+        typer.echo(
+            f"No effect found: {one['action']} {clips} seemed to change the objective by {-one['estimated_gain']:+.4f} "
+            f"m; in other replicates, it changes by {_change(one['effect']['objective'])} m."
+        )
     reasons = {
         "no gain": "Ended because no further step gains enough.",
+        "not confirmed": "Ended because the gain of no further step was confirmed.",
         "steps": "Ended at the greatest number of steps.",
         "evaluations": "Ended at the greatest number of sets to try.",
     }
     typer.echo(reasons[document["ended"]])
+    if document["total"] is not None:
+        change = _change(document["total"]["objective"])
+        typer.echo(f"All steps together change the objective by {change} m, in replicates that had no part in them.")
+
+
+def _confirmed(effect: Mapping[str, Any] | None) -> str:
+    return "" if effect is None else _change(effect["objective"])
+
+
+def _change(change: Mapping[str, Any]) -> str:
+    """Write a change with its interval, if it has one."""
+    interval = "" if change["low"] is None else f" ({change['low']:+.4f} to {change['high']:+.4f})"
+    return f"{change['change']:+.4f}{interval}"
 
 
 def _print_sweep(document: Mapping[str, Any]) -> None:
@@ -327,11 +356,13 @@ def _print_sweep(document: Mapping[str, Any]) -> None:
             f"{one['best_weight']:g}",
             f"{one['gain']:.4f}",
             f"{one['spread']:.4f}",
+            "" if one["confirmed"] is None else _change(one["confirmed"]),
+            "" if one["confirmed"] is None else one["confirmed"]["verdict"],
         )
         for one in document["influences"]
     ]
-    columns = ("features", "weight", "best weight", "gain m", "spread m")
-    print_table(columns, rows, right=columns[1:])
+    columns = ("features", "weight", "best weight", "gain m", "spread m", "confirmed change m", "verdict")
+    print_table(columns, rows, right=columns[1:6])
     typer.echo(f"The objective is {document['settings'][0]['objective']:.4f} m with the weights of the evaluation.")
 
 

@@ -27,7 +27,11 @@ from marey_schemas.documents.replicates import LEAST_REPLICATES, mean_interval
 SAME_CHANGE = 1e-12
 """Relative difference up to which two changes count as equal, because rounding can cause a difference of this size."""
 
+OBJECTIVE = "objective"
+"""Name of the objective of an improvement where its change is stated like that of a metric, in metres."""
+
 LESS_IS_BETTER = (
+    OBJECTIVE,
     "abs_se_v",
     "abs_se_omega_deg",
     "dse_v",
@@ -239,16 +243,32 @@ def corrected(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
     -------
     tuple of MetricChange    in the same order
     """
-    raised: dict[str, float] = {}
+    found = list(changes)
     for judged in (True, False):
-        own = sorted(
-            (one.p, one.metric) for one in changes if one.p is not None and (one.metric in LESS_IS_BETTER) == judged
-        )
-        most = 0.0
-        for place, (p, metric) in enumerate(own):
-            most = max(most, min(1.0, (len(own) - place) * p))
-            raised[metric] = most
-    return tuple(replace(one, p=raised.get(one.metric)) for one in changes)
+        own = [place for place, one in enumerate(changes) if (one.metric in LESS_IS_BETTER) == judged]
+        for place, one in zip(own, corrected_family([changes[place] for place in own]), strict=True):
+            found[place] = one
+    return tuple(found)
+
+
+def corrected_family(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
+    """Correct the probabilities of changes for their number, by Holm's method.
+
+    Parameters
+    ----------
+    changes : sequence of MetricChange    with uncorrected probabilities
+
+    Returns
+    -------
+    tuple of MetricChange    in the same order
+    """
+    known = sorted((one.p, place) for place, one in enumerate(changes) if one.p is not None)
+    raised: dict[int, float] = {}
+    most = 0.0
+    for rank, (p, place) in enumerate(known):
+        most = max(most, min(1.0, (len(known) - rank) * p))
+        raised[place] = most
+    return tuple(replace(one, p=raised.get(place)) for place, one in enumerate(changes))
 
 
 def _names(result: EvaluationResult) -> set[str]:

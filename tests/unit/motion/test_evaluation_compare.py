@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
-from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
@@ -18,7 +17,7 @@ from marey_motion.evaluation.compare import (
     corrected,
     paired_change,
 )
-from marey_motion.evaluation.improvement.selection import joined
+from marey_motion.evaluation.improvement.selection import joined, without_sources
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.matching.building import union_normaliser, with_normaliser
 from marey_motion.matching.database import MatchingDatabase

@@ -1,6 +1,7 @@
 """Suggestions after an evaluation: unused and redundant clips, duplicates, and clips that fill holes.
 
-Each suggestion is a proposal with its predicted effect; the set of clips is not changed.
+Each suggestion is a proposal; the set of clips is not changed. Effects on the trials are estimated in some replicates,
+to choose what to propose, and confirmed in others (`confirming`).
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from typing import Any
 import numpy as np
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.confirming import Confirmed, confirm
 from marey_motion.evaluation.improvement.duplicates import (
     NearDuplicate,
     NearDuplicates,
     find_near_duplicates,
     spared_sources,
 )
+from marey_motion.evaluation.improvement.effects import estimation_replicates
 from marey_motion.evaluation.improvement.filling import Addition, Filling, plan_fillings, rank_fillings
 from marey_motion.evaluation.improvement.lost_poses import LostPoses
 from marey_motion.evaluation.improvement.redundancy import (
@@ -56,7 +59,8 @@ class Suggestions:
     ----------
     unused : data whose removal changes no trial
     redundant : all clips that were tried, ranked by the harm of their removal per second saved
-    plan : a sequence of removals from the set without its unused clips
+    plan : a sequence of removals from the set without its unused clips, with confirmed effects
+    confirmed : effects that were measured in replicates without a part in the choice
     spared : near-duplicates to remove, each with the pair to which it belongs; the other clip of the pair stays
     fillings, additions : clips of other collections that fill holes. In `fillings`, each is measured alone; `additions`
         is a sequence in which each is measured after all earlier clips were added
@@ -76,6 +80,7 @@ class Suggestions:
     additions: tuple[Addition, ...]
     tried: tuple[int, int]
     metric: MetricDocument | None = None
+    confirmed: Confirmed | None = None
 
 
 def suggest(
@@ -118,7 +123,13 @@ def suggest(
     trials, records = [trial.trial for trial in result.trials], result.records
     stages = _Stages(progress, cancelled)
     simulation = Resimulation(
-        database, result.options, trials=trials, records=records, threads=threads, cancelled=cancelled
+        database,
+        result.options,
+        trials=trials,
+        records=records,
+        replicates=estimation_replicates(how),
+        threads=threads,
+        cancelled=cancelled,
     )
     seen = None if metric is None else PerceivedRows(database, metric)
     # The records are those of the first replicates only; the usage is that of all.
@@ -136,6 +147,13 @@ def suggest(
     gone = frozenset(clip.source for clip in unused.clips)
     appearance = _appearance(database, how, seen, threshold, stages)
     redundant, plan = _redundancy(simulation, how, gone, appearance, stages)
+    additions = plan_fillings(fillings, result.coverage, others, result.options)
+    confirmed = None
+    if how.confirmation_replicates:
+        confirmed = confirm(
+            database, result, how, unused, plan, additions, others, threads=threads, **stages.watch("confirming")
+        )
+        plan, additions = confirmed.plan, confirmed.additions
     return Suggestions(
         result=result,
         options=how,
@@ -149,8 +167,9 @@ def suggest(
         metric=metric,
         similarity=similarity,
         fillings=fillings,
-        additions=plan_fillings(fillings, result.coverage, others, result.options),
+        additions=additions,
         tried=(len(redundant), len(simulation.needed(gone))),
+        confirmed=confirmed,
     )
 
 
@@ -217,7 +236,7 @@ def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
 class _Stages:
     """Progress over several stages as one count, with a thousand units for each stage."""
 
-    NAMES = ("duplicates", "similarity", "filling", "lost poses", "leaving out", "planning")
+    NAMES = ("duplicates", "similarity", "filling", "lost poses", "leaving out", "planning", "confirming")
 
     def __init__(self, progress: ProgressCallback | None, cancelled: CancelCallback | None) -> None:
         self._tell = progress or (lambda _done, _total, _note: None)
