@@ -1,4 +1,4 @@
-"""Comparison of two evaluations of the same trials: changes with their confidence intervals.
+"""Comparison of evaluations of the same trials: changes with their confidence intervals.
 
 Trials are no sample: they differ by what they ask for, and not by chance. What differs by chance are replicates. So
 each replicate gives one change, the mean over the trials, and the interval is that of these changes by Student's t. A
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.perceived import require_same_metric
-from marey_motion.evaluation.provenance import require_comparable
+from marey_motion.evaluation.provenance import differing_options, require_comparable
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.matching.record import TrialRecord
 from marey_schemas.documents.evaluations import CONFIDENCE
@@ -146,8 +146,48 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     ------
     MotionError    if the conditions differ (the error names them), or if an evaluation was read without its records
     """
-    require_comparable(before.provenance, after.provenance)
+    return compare_several(before, [after])[0]
+
+
+def compare_several(before: EvaluationResult, others: Sequence[EvaluationResult]) -> tuple[Comparison, ...]:
+    """Compare each of several evaluations with the first one, under the same normaliser, options and scenarios.
+
+    Parameters
+    ----------
+    before : EvaluationResult    the evaluation with which the others are compared
+    others : sequence of EvaluationResult    at least one; all with their records
+
+    Returns
+    -------
+    tuple of Comparison    one for each other evaluation; probabilities are corrected for all metrics of all of them
+
+    Raises
+    ------
+    MotionError    if the conditions differ (the error names them), or if an evaluation was read without its records
+    """
+    found = [_compared(before, after) for after in others]
+    changes = iter(corrected([change for one in found for change in one.metrics]))
+    return tuple(replace(one, metrics=tuple(next(changes) for _ in one.metrics)) for one in found)
+
+
+def require_same_conditions(before: EvaluationResult, after: EvaluationResult) -> None:
+    """Check that two evaluations can be compared.
+
+    Parameters
+    ----------
+    before, after : EvaluationResult    the evaluations
+
+    Raises
+    ------
+    MotionError    if normaliser, options, scenarios, limits or perceptual metric differ; the error names them
+    """
+    require_comparable(before.provenance, after.provenance, differing_options(before.options, after.options))
     require_same_metric(before.perceived, after.perceived)
+
+
+def _compared(before: EvaluationResult, after: EvaluationResult) -> Comparison:
+    """Compare two evaluations; probabilities are not corrected."""
+    require_same_conditions(before, after)
     if not (len(before.records) == len(before.trials) == len(after.trials) == len(after.records)):
         raise MotionError("both evaluations must contain the records of all their trials", code="records-missing")
     uids = {clip.uid for clip in before.clips}, {clip.uid for clip in after.clips}
@@ -155,7 +195,7 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     return Comparison(
         before=before,
         after=after,
-        metrics=metric_changes(before, after),
+        metrics=_metric_changes(before, after),
         changed=_trial_changes(before, after),
         removed=tuple(sorted(uids[0] - uids[1])),
         added=tuple(sorted(uids[1] - uids[0])),
@@ -164,22 +204,13 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     )
 
 
-def metric_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[MetricChange, ...]:
-    """Compute the changes of all metrics that both evaluations define in one trial at least.
-
-    Parameters
-    ----------
-    before, after : EvaluationResult    with the same trials
-
-    Returns
-    -------
-    tuple of MetricChange    in alphabetical order, with probabilities that are corrected within their family
-    """
+def _metric_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[MetricChange, ...]:
+    """Compute the changes of all metrics that both evaluations define in one trial at least, in alphabetical order."""
     pairs = {metric: (_values(before, metric), _values(after, metric)) for metric in _names(before) & _names(after)}
     known = {
         metric: pair for metric, pair in sorted(pairs.items()) if np.any(np.isfinite(pair[0]) & np.isfinite(pair[1]))
     }
-    return corrected([paired_change(metric, *pair) for metric, pair in known.items()])
+    return tuple(paired_change(metric, *pair) for metric, pair in known.items())
 
 
 def paired_change(metric: str, before: Floats, after: Floats) -> MetricChange:

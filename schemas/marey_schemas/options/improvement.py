@@ -57,7 +57,7 @@ class ConfirmedEffects(ObjectiveChoice):
     confirmation_seed: int = Field(
         0,
         ge=0,
-        le=2**53,
+        lt=2**63,
         description="Seed of these other replicates: with another seed, the same choices are confirmed anew.",
     )
 

@@ -187,8 +187,8 @@ def test_evaluations_under_other_conditions_are_refused_by_name(
     other = OPTIONS.replace(controller=OPTIONS.controller.replace(follow="path"))
     with pytest.raises(MotionError, match="options"):
         compare_results(result, evaluated(database, other))
-    with pytest.raises(MotionError, match="scenarios"):
-        compare_results(result, evaluated(database, OPTIONS.replace(duration_s=5.0)))
+    with pytest.raises(MotionError, match=r"scenarios differ \(duration_s: 6.0 and 5.0; seed: 0 and 3\)"):
+        compare_results(result, evaluated(database, OPTIONS.replace(duration_s=5.0, seed=3, coverage_least_s=9.0)))
     with pytest.raises(MotionError, match="records"):
         compare_results(result, replace(result, records=()))
 

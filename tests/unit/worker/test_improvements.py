@@ -78,6 +78,30 @@ def test_evaluations_under_two_normalisers_are_refused_with_what_to_type(project
     assert refused.value.code == "not-comparable"
 
 
+def test_several_sets_under_one_normaliser_are_compared_with_the_first_in_one_report(project: LoggedProject) -> None:
+    clips = project.inputs["clips"]
+    union = evaluated(project, "union", clips)
+    project.inputs["normaliser"] = (union,)
+    left, right = evaluated(project, "left", clips[1:]), evaluated(project, "right", clips[:3])
+    project.inputs = {"before": (union,), "after": (left,), "others": (right, union)}
+    result = compare.run(project, CompareParams())
+    document = document_of(project, result)
+    assert [one["names"]["after"] for one in document["others"]] == ["results/right", "results/union"]
+    assert document["removed"] == [f"{clips[0].item}@1"]
+    assert [one["removed"] for one in result["others"]] == [1, 0]
+    assert result["others"][1]["changed_trials"] == 0
+    page = project.blobs[result["report"]["blob"]].decode()
+    assert all(
+        text in page
+        for text in ("than results/union", "results/left", "Sets of clips", "1 replicate, so it is unknown")
+    )
+    assert page.count("<svg") >= 2, "distances and density of all sets"
+
+    project.inputs["others"] = (right,) * 7
+    with pytest.raises(JobRefused, match="9 evaluations cannot be compared at once; choose up to 8"):
+        compare.run(project, CompareParams())
+
+
 def test_what_can_go_is_named_and_clips_of_other_skeletons_need_to_be_retargeted(project: LoggedProject) -> None:
     clips = project.inputs["clips"]
     own = evaluated(project, "first", clips[1:2])
