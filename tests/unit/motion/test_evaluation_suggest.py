@@ -71,6 +71,24 @@ def test_every_kind_of_suggestion_is_made(found: Suggestions) -> None:
     assert found.similarity.threshold == 3.0
 
 
+def test_effects_are_confirmed_in_other_replicates_or_said_not_to_be(found: Suggestions) -> None:
+    first, *others = found.additions
+    assert first.confirmed is not None
+    assert all(step.confirmed is None for step in others)
+    tree = suggestions_to_tree(found)
+    assert "the mean distance from the path" in tree["additions"][0]["reason"]
+    assert all(one["reason"].endswith("Its effect on the trials was not simulated.") for one in tree["additions"][1:])
+    for step, planned in zip(found.plan, tree["redundant"]["plan"], strict=True):
+        assert step.confirmed is not None
+        assert step.confirmed.objective.replicates == 3
+        assert planned["confirmed"]["objective"]["verdict"] == step.confirmed.objective.verdict
+        assert "was not confirmed" not in planned["reason"]
+    assert all("was not confirmed" in clip["reason"] for clip in tree["redundant"]["clips"])
+    assert tree["unused"]["confirmed_clips"]["reason"].startswith("Without all of them, in other replicates, ")
+    assert tree["unused"]["confirmed_ranges"]["objective"]["replicates"] == 3
+    assert tree["chance"]["offset_mean"] > 0.0
+
+
 def test_what_another_replicate_shows_is_not_called_unused(database: MatchingDatabase) -> None:
     options = OPTIONS.replace(replicates=3)
     trials = suite_trials(options)
