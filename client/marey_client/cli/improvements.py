@@ -154,8 +154,6 @@ def print_found(
 
 def _print_suggestions(document: Mapping[str, Any]) -> None:
     unused, redundant = document["unused"], document["redundant"]
-    # The effect of all unused data together follows the list of its parts.
-    together = {name: unused[f"confirmed_{name}"] for name in ("clips", "ranges")}
     sections = (
         (f"{counted(len(unused['clips']), 'clip')} ({_seconds(unused['clips'])}) can be removed without changing any "
          "trial", unused["clips"]),
@@ -168,17 +166,7 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
         (f"{counted(len(document['fillings']), 'clip')} would fill holes", document["fillings"]),
         ("Order in which to add clips", document["additions"]),
     )  # fmt: skip
-    for heading, entries in sections:
-        if entries:
-            typer.echo(f"{heading}.")
-            for entry in entries[:SHOWN]:
-                typer.echo(f"  {entry['reason']}")
-            if len(entries) > SHOWN:
-                typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
-            for name, effect in together.items():
-                if effect is not None and entries is unused[name]:
-                    typer.echo(f"  {effect['reason']}")
-            typer.echo("")
+    _print_sections(sections, unused)
     if (chance := document["chance"].get("offset_mean")) is not None:
         typer.echo(
             f"By chance alone, the mean distance from the path varies by {100 * chance:.2f} cm between replicates "
@@ -196,6 +184,22 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
         )
     if not any(entries for _, entries in sections):
         typer.echo("No clip was found that can be removed or that would fill a hole.")
+
+
+def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unused: Mapping[str, Any]) -> None:
+    """Print the reasons of suggestions, list by list; the effect of all unused data together follows its list."""
+    for heading, entries in sections:
+        if not entries:
+            continue
+        typer.echo(f"{heading}.")
+        for entry in entries[:SHOWN]:
+            typer.echo(f"  {entry['reason']}")
+        if len(entries) > SHOWN:
+            typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
+        for name in ("clips", "ranges"):
+            if entries is unused[name] and (effect := unused[f"confirmed_{name}"]) is not None:
+                typer.echo(f"  {effect['reason']}")
+        typer.echo("")
 
 
 def _print_similarity(similarity: Mapping[str, Any]) -> None:

@@ -217,10 +217,10 @@ class SuggestKeywords(TypedDict, total=False):
     """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
     the evaluation."""
     confirmation_replicates: int
-    """Number of other replicates in which the chosen effects are measured again: the effects that are told, with
+    """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
     intervals. At least 3, or 0: effects are not confirmed."""
     confirmation_seed: int
-    """Seed of these other replicates: with another seed, the same choices are confirmed anew."""
+    """Seed of these other replicates: with another seed, the same choices are confirmed again."""
     removals: int
     """Number of clips whose removal is planned, in addition to the unused clips; 0: none."""
     simulated_additions: int
@@ -251,10 +251,10 @@ class OptimiseKeywords(TypedDict, total=False):
     """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
     the evaluation."""
     confirmation_replicates: int
-    """Number of other replicates in which the chosen effects are measured again: the effects that are told, with
+    """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
     intervals. At least 3, or 0: effects are not confirmed."""
     confirmation_seed: int
-    """Seed of these other replicates: with another seed, the same choices are confirmed anew."""
+    """Seed of these other replicates: with another seed, the same choices are confirmed again."""
     least_gain: float
     """Least decrease of the objective of a step, in metres, in addition to its confirmation. Chance needs no allowance
     here, because only steps that are confirmed are made."""
@@ -277,10 +277,10 @@ class SweepKeywords(TypedDict, total=False):
     """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
     the evaluation."""
     confirmation_replicates: int
-    """Number of other replicates in which the chosen effects are measured again: the effects that are told, with
+    """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
     intervals. At least 3, or 0: effects are not confirmed."""
     confirmation_seed: int
-    """Seed of these other replicates: with another seed, the same choices are confirmed anew."""
+    """Seed of these other replicates: with another seed, the same choices are confirmed again."""
     factors: Sequence[float]
     """Factors to try. Each setting multiplies the weight of one group of features by one factor and leaves all other
     weights unchanged."""

@@ -131,24 +131,6 @@ class Comparison:
     coverage_change_s: NDArray[np.float64]
 
 
-def compare_results(before: EvaluationResult, after: EvaluationResult) -> Comparison:
-    """Compare two evaluations with the same normaliser, options and scenarios.
-
-    Parameters
-    ----------
-    before, after : EvaluationResult    both with their records
-
-    Returns
-    -------
-    Comparison    changes of metrics, trials and coverage
-
-    Raises
-    ------
-    MotionError    if the conditions differ (the error names them), or if an evaluation was read without its records
-    """
-    return compare_several(before, [after])[0]
-
-
 def compare_several(before: EvaluationResult, others: Sequence[EvaluationResult]) -> tuple[Comparison, ...]:
     """Compare each of several evaluations with the first one, under the same normaliser, options and scenarios.
 

@@ -52,13 +52,13 @@ class ConfirmedEffects(ObjectiveChoice):
         ge=0,
         le=64,
         description="Number of other replicates in which the chosen effects are measured again: the effects that are "
-        f"told, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed.",
+        f"reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed.",
     )
     confirmation_seed: int = Field(
         0,
         ge=0,
         lt=2**63,
-        description="Seed of these other replicates: with another seed, the same choices are confirmed anew.",
+        description="Seed of these other replicates: with another seed, the same choices are confirmed again.",
     )
 
     @field_validator("confirmation_replicates")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
+from tests.support.compared_evaluations import compare_results
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
@@ -13,7 +14,6 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import (
     LESS_IS_BETTER,
     MetricChange,
-    compare_results,
     corrected,
     paired_change,
 )

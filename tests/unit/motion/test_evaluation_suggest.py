@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.support.compared_evaluations import compare_results
 from tests.support.suggestion_cases import (
     OPTIONS,
     UNWANTED,
@@ -18,7 +19,7 @@ from tests.support.suggestion_cases import (
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.compare import OBJECTIVE, compare_results, paired_change
+from marey_motion.evaluation.compare import OBJECTIVE, paired_change
 from marey_motion.evaluation.improvement.effects import Effect
 from marey_motion.evaluation.improvement.filling import FilledCell, Filling
 from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means

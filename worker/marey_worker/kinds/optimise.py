@@ -24,10 +24,7 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
     with refusing_motion_errors():
         database = _with_candidates(evaluated.clips.database, candidates)
         simulation = _simulation(context, evaluated, database, estimation_replicates(params))
-        others = [
-            _simulation(context, evaluated, database, confirmation_replicates(params, turn), params.confirmation_seed)
-            for turn in range(2 if params.confirmation_replicates else 0)
-        ]
+        others = _confirming(context, params, evaluated, database)
         own = {source_of(clip) for clip in evaluated.clips.database.clips}
         names = {source_of(clip): clip.name for clip in database.clips if clip.mirrored_from is None}
         steps: list[OptimisationStep] = []
@@ -98,6 +95,16 @@ def _simulation(
         seed=seed,
         threads=context.threads,
     )
+
+
+def _confirming(
+    context: Context, params: OptimiseParams, evaluated: EvaluatedSet, database: MatchingDatabase
+) -> list[Resimulation]:
+    """Return simulations to confirm single steps and all steps together; none if the parameters ask for none."""
+    return [
+        _simulation(context, evaluated, database, confirmation_replicates(params, turn), params.confirmation_seed)
+        for turn in range(2 if params.confirmation_replicates else 0)
+    ]
 
 
 def _log_end(context: Context, found: Optimisation, names: dict[str, str]) -> None:

@@ -30,7 +30,7 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Confirmed:
-    """What was measured in replicates that had no part in choosing the suggestions.
+    """Effects that were measured in replicates without a part in the choice of the suggestions.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def confirm(
     threads: int | None = None,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
-) -> Confirmed:
+) -> Confirmed | None:
     """Measure the effects of suggestions in other replicates than those from which they were chosen.
 
     Parameters
@@ -82,12 +82,14 @@ def confirm(
 
     Returns
     -------
-    Confirmed    the effects
+    Confirmed or None    the effects; None if the options ask for no replicates to confirm them
 
     Raises
     ------
     EvaluationCancelled    if cancelled
     """
+    if not how.confirmation_replicates:
+        return None
     simulated = _to_simulate(additions, how.simulated_additions)
     stages = _Stages(2 + len(plan) + 2 * len(simulated) + bool(unused.ranges), progress)
 

@@ -1,6 +1,6 @@
 """Effects of changes of a set of clips on its trials: estimated in some replicates, confirmed in others.
 
-Whoever picks the best of many candidates also picks the luckiest. So an effect that was the reason for a choice says
+The best of many candidates is also the luckiest. So an effect that was the reason for a choice says
 too much, and must be measured again in replicates that had no part in the choice.
 """
 
@@ -29,7 +29,7 @@ class Effect:
     Parameters
     ----------
     objective : change of the objective, metres; its term for the amount of data is left out where a saving of data is
-        told beside it
+        stated beside it
     headlines : change of each headline metric, by name, in its unit
     """
 
@@ -134,7 +134,7 @@ def effect_of(
 
 
 def corrected_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """Correct the probabilities of several effects that are told together, each metric for the number of effects.
+    """Correct the probabilities of several effects that are reported together, each metric for the number of effects.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ def why_unused_range(part: UnusedRange) -> str:
 
 
 def why_unused_again(effect: Effect) -> str:
-    """Tell what the removal of all unused data does in replicates that the evaluation did not contain.
+    """State what the removal of all unused data does in replicates that the evaluation did not contain.
 
     Parameters
     ----------

@@ -121,16 +121,8 @@ def suggest(
     how, others = options or SuggestionOptions(), dict(collections or {})
     _require_same(database, result)
     trials, records = [trial.trial for trial in result.trials], result.records
-    stages = _Stages(progress, cancelled)
-    simulation = Resimulation(
-        database,
-        result.options,
-        trials=trials,
-        records=records,
-        replicates=estimation_replicates(how),
-        threads=threads,
-        cancelled=cancelled,
-    )
+    stages = _SuggestionStages(progress, cancelled)
+    simulation = _simulation(database, result, how, threads, cancelled)
     seen = None if metric is None else PerceivedRows(database, metric)
     # The records are those of the first replicates only; the usage is that of all.
     shown = np.concatenate([use.popularity > 0 for use in result.usage])
@@ -138,7 +130,6 @@ def suggest(
     duplicates = find_near_duplicates(
         database, threshold_cm=how.duplicate_cm, seen=seen, threads=threads, **stages.watch("duplicates")
     )
-    ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
     threshold = _threshold(how, result, seen)
     similarity = measure_similarity(database, result.coverage, threshold, seen=seen, **stages.watch("similarity"))
     fillings = rank_fillings(
@@ -148,11 +139,10 @@ def suggest(
     appearance = _appearance(database, how, seen, threshold, stages)
     redundant, plan = _redundancy(simulation, how, gone, appearance, stages)
     additions = plan_fillings(fillings, result.coverage, others, result.options)
-    confirmed = None
-    if how.confirmation_replicates:
-        confirmed = confirm(
-            database, result, how, unused, plan, additions, others, threads=threads, **stages.watch("confirming")
-        )
+    confirmed = confirm(
+        database, result, how, unused, plan, additions, others, threads=threads, **stages.watch("confirming")
+    )
+    if confirmed is not None:
         plan, additions = confirmed.plan, confirmed.additions
     return Suggestions(
         result=result,
@@ -161,9 +151,7 @@ def suggest(
         redundant=redundant,
         plan=plan,
         duplicates=duplicates,
-        spared=spared_sources(
-            database, duplicates, ticks, most_perceived=np.inf if metric is None else indistinguishable(metric)
-        ),
+        spared=_spared(database, result, duplicates, metric),
         metric=metric,
         similarity=similarity,
         fillings=fillings,
@@ -171,6 +159,34 @@ def suggest(
         tried=(len(redundant), len(simulation.needed(gone))),
         confirmed=confirmed,
     )
+
+
+def _simulation(
+    database: MatchingDatabase,
+    result: EvaluationResult,
+    how: SuggestionOptions,
+    threads: int | None,
+    cancelled: CancelCallback | None,
+) -> Resimulation:
+    """Return a simulation of the replicates in which effects are estimated; it knows the records of the evaluation."""
+    return Resimulation(
+        database,
+        result.options,
+        trials=[trial.trial for trial in result.trials],
+        records=result.records,
+        replicates=estimation_replicates(how),
+        threads=threads,
+        cancelled=cancelled,
+    )
+
+
+def _spared(
+    database: MatchingDatabase, result: EvaluationResult, duplicates: NearDuplicates, metric: MetricDocument | None
+) -> tuple[tuple[str, NearDuplicate], ...]:
+    """Choose the clip of each pair of near-duplicates that may be removed, by its use."""
+    ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
+    most = np.inf if metric is None else indistinguishable(metric)
+    return spared_sources(database, duplicates, ticks, most_perceived=most)
 
 
 def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: PerceivedRows | None) -> float:
@@ -181,7 +197,11 @@ def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: Perceived
 
 
 def _appearance(
-    database: MatchingDatabase, how: SuggestionOptions, seen: PerceivedRows | None, threshold: float, stages: _Stages
+    database: MatchingDatabase,
+    how: SuggestionOptions,
+    seen: PerceivedRows | None,
+    threshold: float,
+    stages: _SuggestionStages,
 ) -> Appearance | None:
     """Compare the poses of all clips by the metric, if one was chosen."""
     if seen is None:
@@ -194,7 +214,7 @@ def _redundancy(
     how: SuggestionOptions,
     gone: frozenset[str],
     appearance: Appearance | None,
-    stages: _Stages,
+    stages: _SuggestionStages,
 ) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
     """Rank the clips by the harm of their removal, and plan several removals.
 
@@ -233,7 +253,7 @@ def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
         )
 
 
-class _Stages:
+class _SuggestionStages:
     """Progress over several stages as one count, with a thousand units for each stage."""
 
     NAMES = ("duplicates", "similarity", "filling", "lost poses", "leaving out", "planning", "confirming")
