@@ -120,13 +120,10 @@ def suggest(
     """
     how, others = options or SuggestionOptions(), dict(collections or {})
     _require_same(database, result)
-    trials, records = [trial.trial for trial in result.trials], result.records
     stages = _SuggestionStages(progress, cancelled)
     simulation = _simulation(database, result, how, threads, cancelled)
     seen = None if metric is None else PerceivedRows(database, metric)
-    # The records are those of the first replicates only; the usage is that of all.
-    shown = np.concatenate([use.popularity > 0 for use in result.usage])
-    unused = find_unused(database, trials, records, result.options, index=simulation.index, shown=shown)
+    unused = _unused(simulation, result)
     duplicates = find_near_duplicates(
         database, threshold_cm=how.duplicate_cm, seen=seen, threads=threads, **stages.watch("duplicates")
     )
@@ -177,6 +174,19 @@ def _simulation(
         replicates=estimation_replicates(how),
         threads=threads,
         cancelled=cancelled,
+    )
+
+
+def _unused(simulation: Resimulation, result: EvaluationResult) -> Unused:
+    """Find what no trial needs. Records are those of the first replicates only; the usage is that of all."""
+    shown = np.concatenate([use.popularity > 0 for use in result.usage])
+    return find_unused(
+        simulation.database,
+        simulation.trials,
+        result.records,
+        result.options,
+        index=simulation.index,
+        shown=shown,
     )
 
 
