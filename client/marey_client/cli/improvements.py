@@ -1,4 +1,4 @@
-"""Commands `compare`, `suggest`, `optimise` and `sweep`."""
+"""Commands `suggest`, `optimise` and `sweep`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address
-from marey_client.cli.evaluations import evaluation_at, perceived_text
+from marey_client.cli.evaluations import evaluation_at
 from marey_client.cli.perception.metrics import MetricName, metric_at
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, clips_at, follow
@@ -26,21 +26,11 @@ if TYPE_CHECKING:
     from marey_schemas.queue.jobs import ExistingInput, JobCreate
 
 WEIGHT = {"objective": "--weight"}
-COMPARE = OptionsOf("marey_schemas.queue.job_params:CompareParams")
 SUGGEST = OptionsOf("marey_schemas.queue.job_params:SuggestParams", short=WEIGHT, without=("metric",))
 OPTIMISE = OptionsOf("marey_schemas.queue.job_params:OptimiseParams", short=WEIGHT)
 SWEEP = OptionsOf("marey_schemas.queue.job_params:SweepParams", short=WEIGHT)
 
 SHOWN = 10
-PRINTED_METRICS = (
-    ("offset_mean", "offset m"),
-    ("abs_se_v", "speed error m/s"),
-    ("abs_se_omega_deg", "turn error degrees/s"),
-    ("pose_cost_mean", "pose cost m"),
-    ("transitions_per_s", "switches 1/s"),
-)
-"""Metrics in the printed tables; --json and the report contain all metrics."""
-
 Evaluation = Annotated[str, typer.Argument(help="An evaluation: project/folder/name, or project/id.")]
 From = Annotated[
     list[str] | None,
@@ -54,47 +44,9 @@ From = Annotated[
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
-    add_command(app, compare, params=COMPARE, job=FINDINGS_JOB)
     add_command(app, suggest, params=SUGGEST, job=FINDINGS_JOB)
     add_command(app, optimise, params=OPTIMISE, job=FINDINGS_JOB)
     add_command(app, sweep, params=SWEEP, job=FINDINGS_JOB)
-
-
-def compare(
-    context: typer.Context,
-    before: Evaluation,
-    after: Annotated[
-        str,
-        typer.Argument(
-            help="The evaluation after the change, with the same trials. Create it with `marey evaluate --normaliser "
-            "BEFORE`."
-        ),
-    ],
-    params: Chosen,
-    job: Chosen,
-    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
-    wait: Wait = True,
-    as_json: AsJson = False,
-) -> None:
-    """Show what changed between two evaluations, trial by trial."""
-    if out is not None and not wait:
-        raise WrongUsage(
-            "--out writes the result of the job, but --no-wait does not wait for the result; leave out one of "
-            "the two options"
-        )
-    with connect(context) as marey:
-        first, second = evaluation_at(marey, before), evaluation_at(marey, after)
-        if first.project != second.project:
-            raise WrongUsage("both evaluations must be in one project")
-        found = _found(marey, first, first.compare_request(second, **params), job, wait, as_json)
-        if found is None:
-            return
-        document = found.document()
-        if out is not None:
-            found.save_report(out)
-    _print_found(found, document, as_json, _print_comparison)
-    if out is not None and not as_json:
-        print_message(f"report: {out}")
 
 
 def suggest(
@@ -124,7 +76,7 @@ def suggest(
         handle = evaluation_at(marey, evaluation)
         places = _places(marey, handle, candidates)
         request = handle.suggest_request(places, metric=metric_at(marey, metric), **params)
-        found = _found(marey, handle, request, job, wait, as_json)
+        found = found_by(marey, handle, request, job, wait, as_json)
         if found is None:
             return
         document = found.document()
@@ -132,7 +84,7 @@ def suggest(
         names = [f"{clip['name']}\n" for clip in document["unused"]["clips"]]
         remove_out.write_text("".join(names), encoding="utf-8")
         print_message(f"{counted(len(names), 'clip')} that can be removed: {remove_out}")
-    _print_found(found, document, as_json, _print_suggestions)
+    print_found(found, document, as_json, _print_suggestions)
 
 
 def optimise(
@@ -148,8 +100,8 @@ def optimise(
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         request = handle.optimise_request(_places(marey, handle, candidates), **params)
-        if (found := _found(marey, handle, request, job, wait, as_json)) is not None:
-            _print_found(found, found.document(), as_json, _print_steps)
+        if (found := found_by(marey, handle, request, job, wait, as_json)) is not None:
+            print_found(found, found.document(), as_json, _print_steps)
 
 
 def sweep(
@@ -163,14 +115,14 @@ def sweep(
     """Repeat an evaluation with other weights of the features, and rank the features by their effect on the result."""
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
-        if (found := _found(marey, handle, handle.sweep_request(**params), job, wait, as_json)) is not None:
-            _print_found(found, found.document(), as_json, _print_sweep)
+        if (found := found_by(marey, handle, handle.sweep_request(**params), job, wait, as_json)) is not None:
+            print_found(found, found.document(), as_json, _print_sweep)
 
 
 # -- requests ---------------------------------------------------------------------------------------------------------
 
 
-def _found(
+def found_by(
     marey: Marey, handle: EvaluationHandle, request: JobCreate, job: Chosen, wait: bool, as_json: bool
 ) -> Findings | None:
     from marey_client.handles.findings import Findings
@@ -188,7 +140,7 @@ def _places(marey: Marey, handle: EvaluationHandle, candidates: Sequence[str] | 
     return [clips_at(marey, address) for address in addresses]
 
 
-def _print_found(
+def print_found(
     found: Findings, document: Mapping[str, Any], as_json: bool, show: Callable[[Mapping[str, Any]], None]
 ) -> None:
     if as_json:
@@ -200,54 +152,6 @@ def _print_found(
 # -- output -----------------------------------------------------------------------------------------------------------
 
 
-def _print_comparison(document: Mapping[str, Any]) -> None:
-    changed = document["changed"]
-    moved = [one for one in changed if not one["same_motion"]]
-    if not changed:
-        typer.echo(f"No trial changed: the results of all {document['trials']} trials are identical, bit for bit.")
-    elif not moved:
-        typer.echo(
-            f"The character moves in the same way in every trial; {len(changed)} of {document['trials']} trials use "
-            "other clips."
-        )
-    else:
-        typer.echo(f"{len(moved)} of {document['trials']} trials changed.")
-    metrics = {one["metric"]: one for one in document["metrics"]}
-    rows = [
-        (label, f"{one['before']:.4f}", f"{one['after']:.4f}", f"{one['change']:+.4f}",
-         "" if one["low"] is None else f"{one['low']:+.4f} to {one['high']:+.4f}", one["verdict"])
-        for name, label in PRINTED_METRICS if (one := metrics.get(name)) is not None
-    ]  # fmt: skip
-    columns = ("metric", "before", "after", "change", "95 % interval", "verdict")
-    print_table(columns, rows, right=columns[1:5])
-    _print_perceived(document)
-    if moved:
-        worst = sorted(moved, key=lambda one: -_rise(one))[:SHOWN]
-        rows_of_trials = [
-            (one["trial"], _metres(one["offset_mean_before"]), _metres(one["offset_mean_after"])) for one in worst
-        ]
-        columns_of_trials = ("changed trials, the worst first", "offset before m", "after m")
-        print_table(columns_of_trials, rows_of_trials, right=columns_of_trials[1:])
-    for name, label in (("removed", "removed"), ("added", "added"), ("newly_unused", "newly unused")):
-        if document[name]:
-            typer.echo(f"{label}: {counted(len(document[name]), 'clip')}")
-
-
-def _print_perceived(document: Mapping[str, Any]) -> None:
-    """Print the perceptual distances of transitions, if an evaluation has them."""
-    for name in ("before", "after"):
-        if (perceived := document.get(f"perceived_{name}")) is not None:
-            typer.echo(f"{name}: {perceived_text(perceived)}")
-
-
-def _rise(one: Mapping[str, Any]) -> float:
-    return float((one["offset_mean_after"] or 0.0) - (one["offset_mean_before"] or 0.0))
-
-
-def _metres(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
-
-
 def _print_suggestions(document: Mapping[str, Any]) -> None:
     unused, redundant = document["unused"], document["redundant"]
     sections = (
@@ -255,22 +159,19 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
          "trial", unused["clips"]),
         (f"{counted(len(unused['ranges']), 'range')} of clips ({_seconds(unused['ranges'])}) can be cut off with "
          "hardly any change", unused["ranges"]),
-        (f"{counted(len(redundant['plan']), 'clip')} can {'then ' if unused['clips'] else ''}be removed one after "
-         f"another with little effect; {redundant['tried']} of {redundant['needed']} used clips were tried",
-         redundant["plan"]),
+        (f"{counted(len(redundant['plan']), 'clip')} to {'then ' if unused['clips'] else ''}remove, one after another; "
+         f"{redundant['tried']} of {redundant['needed']} used clips were tried", redundant["plan"]),
         (f"{counted(len(document['near_duplicates']['pairs']), 'pair')} of clips with nearly the same motion, within "
          f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
         (f"{counted(len(document['fillings']), 'clip')} would fill holes", document["fillings"]),
         ("Order in which to add clips", document["additions"]),
     )  # fmt: skip
-    for heading, entries in sections:
-        if entries:
-            typer.echo(f"{heading}.")
-            for entry in entries[:SHOWN]:
-                typer.echo(f"  {entry['reason']}")
-            if len(entries) > SHOWN:
-                typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
-            typer.echo("")
+    _print_sections(sections, unused)
+    if (chance := document["chance"].get("offset_mean")) is not None:
+        typer.echo(
+            f"By chance alone, the mean distance from the path varies by {100 * chance:.2f} cm between replicates "
+            "(standard deviation)."
+        )
     _print_similarity(document["similarity"])
     if (metric := document["near_duplicates"].get("metric")) is not None:
         typer.echo(
@@ -283,6 +184,22 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
         )
     if not any(entries for _, entries in sections):
         typer.echo("No clip was found that can be removed or that would fill a hole.")
+
+
+def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unused: Mapping[str, Any]) -> None:
+    """Print the reasons of suggestions, list by list; the effect of all unused data together follows its list."""
+    for heading, entries in sections:
+        if not entries:
+            continue
+        typer.echo(f"{heading}.")
+        for entry in entries[:SHOWN]:
+            typer.echo(f"  {entry['reason']}")
+        if len(entries) > SHOWN:
+            typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
+        for name in ("clips", "ranges"):
+            if entries is unused[name] and (effect := unused[f"confirmed_{name}"]) is not None:
+                typer.echo(f"  {effect['reason']}")
+        typer.echo("")
 
 
 def _print_similarity(similarity: Mapping[str, Any]) -> None:
@@ -304,18 +221,38 @@ def _print_steps(document: Mapping[str, Any]) -> None:
     names = document["names"]
     rows = [
         (step["number"], step["action"], ", ".join(names.get(source, source) for source in step["sources"]),
-         f"{step['objective']:.4f}", f"{step['metrics']['offset_mean']:.4f}", f"{step['data_s']:.1f}",
-         step["changed_trials"])
+         f"{step['objective']:.4f}", _confirmed(step["confirmed"]), f"{step['metrics']['offset_mean']:.4f}",
+         f"{step['data_s']:.1f}", step["changed_trials"])
         for step in document["steps"]
     ]  # fmt: skip
-    columns = ("step", "action", "clips", "objective m", "offset m", "data s", "trials changed")
+    columns = ("step", "action", "clips", "objective m", "confirmed change m", "offset m", "data s", "trials changed")
     print_table(columns, rows, right=columns[3:])
+    for one in document["unconfirmed"]:
+        clips = ", ".join(names.get(source, source) for source in one["sources"])
+        typer.echo(
+            f"No effect found: {one['action']} {clips} seemed to change the objective by {-one['estimated_gain']:+.4f} "
+            f"m; in other replicates, it changes by {_change(one['effect']['objective'])} m."
+        )
     reasons = {
         "no gain": "Ended because no further step gains enough.",
+        "not confirmed": "Ended because the gain of no further step was confirmed.",
         "steps": "Ended at the greatest number of steps.",
         "evaluations": "Ended at the greatest number of sets to try.",
     }
     typer.echo(reasons[document["ended"]])
+    if document["total"] is not None:
+        change = _change(document["total"]["objective"])
+        typer.echo(f"All steps together change the objective by {change} m, in replicates that had no part in them.")
+
+
+def _confirmed(effect: Mapping[str, Any] | None) -> str:
+    return "" if effect is None else _change(effect["objective"])
+
+
+def _change(change: Mapping[str, Any]) -> str:
+    """Write a change with its interval, if it has one."""
+    interval = "" if change["low"] is None else f" ({change['low']:+.4f} to {change['high']:+.4f})"
+    return f"{change['change']:+.4f}{interval}"
 
 
 def _print_sweep(document: Mapping[str, Any]) -> None:
@@ -327,11 +264,13 @@ def _print_sweep(document: Mapping[str, Any]) -> None:
             f"{one['best_weight']:g}",
             f"{one['gain']:.4f}",
             f"{one['spread']:.4f}",
+            "" if one["confirmed"] is None else _change(one["confirmed"]),
+            "" if one["confirmed"] is None else one["confirmed"]["verdict"],
         )
         for one in document["influences"]
     ]
-    columns = ("features", "weight", "best weight", "gain m", "spread m")
-    print_table(columns, rows, right=columns[1:])
+    columns = ("features", "weight", "best weight", "gain m", "spread m", "confirmed change m", "verdict")
+    print_table(columns, rows, right=columns[1:6])
     typer.echo(f"The objective is {document['settings'][0]['objective']:.4f} m with the weights of the evaluation.")
 
 

@@ -19,7 +19,7 @@ from marey_client.items import Items
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.keywords.evaluation import CompareKeywords, OptimiseKeywords, SuggestKeywords, SweepKeywords
 from marey_client.places import Places, as_inputs, resolved
-from marey_schemas.documents.evaluations import COSTS
+from marey_schemas.documents.evaluations import COSTS, MOST_COMPARED
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.queue.jobs import JobCreate
@@ -79,13 +79,13 @@ class EvaluationHandle(ReportedHandle):
     # -- jobs on the evaluation: each method submits one and waits for it, or raises `JobUnsuccessful` --
 
     def compare(
-        self, after: EvaluationHandle, *, on_progress: OnProgress | None = None, **options: Unpack[CompareKeywords]
+        self, *others: EvaluationHandle, on_progress: OnProgress | None = None, **options: Unpack[CompareKeywords]
     ) -> Findings:
-        """Compare this evaluation with `after`, a later one with the same trials and the same scaling of features.
+        """Compare this evaluation with others, at least one, with the same trials and the same scaling of features.
 
         `options` are those of `CompareParams`.
         """
-        return self._run(self.compare_request(after, **options), on_progress)
+        return self._run(self.compare_request(*others, **options), on_progress)
 
     def suggest(
         self,
@@ -120,9 +120,14 @@ class EvaluationHandle(ReportedHandle):
 
     # -- requests for the same jobs --
 
-    def compare_request(self, after: EvaluationHandle, **options: Unpack[CompareKeywords]) -> JobCreate:
+    def compare_request(self, *others: EvaluationHandle, **options: Unpack[CompareKeywords]) -> JobCreate:
         """Return the job request of `compare`; `options` are those of `CompareParams`."""
-        inputs = {"before": self.as_input(), "after": after.as_input()}
+        if not 0 < len(others) < MOST_COMPARED:
+            raise ValueError(f"between 2 and {MOST_COMPARED} evaluations can be compared, not {1 + len(others)}")
+        after, *further = (other.as_input() for other in others)
+        inputs: dict[str, Any] = {"before": self.as_input(), "after": after}
+        if further:
+            inputs["others"] = further
         return job_request("compare", inputs, CompareParams.model_validate(options))
 
     def suggest_request(

@@ -213,8 +213,19 @@ class SuggestKeywords(TypedDict, total=False):
 
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
+    estimation_replicates: int
+    """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
+    the evaluation."""
+    confirmation_replicates: int
+    """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
+    intervals. At least 3, or 0: effects are not confirmed."""
+    confirmation_seed: int
+    """Seed of these other replicates: with another seed, the same choices are confirmed again."""
     removals: int
     """Number of clips whose removal is planned, in addition to the unused clips; 0: none."""
+    simulated_additions: int
+    """Number of clips to add whose effect on the trials is simulated, in the order of the additions; each takes as long
+    as an evaluation with `confirmation_replicates`."""
     consider: int | None
     """Number of clips whose removal is tried, one at a time, beginning with the clips that the fewest trials use; null:
     all."""
@@ -236,8 +247,17 @@ class OptimiseKeywords(TypedDict, total=False):
 
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
+    estimation_replicates: int
+    """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
+    the evaluation."""
+    confirmation_replicates: int
+    """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
+    intervals. At least 3, or 0: effects are not confirmed."""
+    confirmation_seed: int
+    """Seed of these other replicates: with another seed, the same choices are confirmed again."""
     least_gain: float
-    """The optimisation ends when no step lowers the objective by at least this many metres."""
+    """Least decrease of the objective of a step, in metres, in addition to its confirmation. Chance needs no allowance
+    here, because only steps that are confirmed are made."""
     max_steps: int
     """Greatest number of steps."""
     max_evaluations: int | None
@@ -253,6 +273,14 @@ class SweepKeywords(TypedDict, total=False):
 
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
+    estimation_replicates: int
+    """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
+    the evaluation."""
+    confirmation_replicates: int
+    """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
+    intervals. At least 3, or 0: effects are not confirmed."""
+    confirmation_seed: int
+    """Seed of these other replicates: with another seed, the same choices are confirmed again."""
     factors: Sequence[float]
     """Factors to try. Each setting multiplies the weight of one group of features by one factor and leaves all other
     weights unchanged."""

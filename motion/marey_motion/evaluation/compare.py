@@ -1,4 +1,4 @@
-"""Comparison of two evaluations of the same trials: changes with their confidence intervals.
+"""Comparison of evaluations of the same trials: changes with their confidence intervals.
 
 Trials are no sample: they differ by what they ask for, and not by chance. What differs by chance are replicates. So
 each replicate gives one change, the mean over the trials, and the interval is that of these changes by Student's t. A
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.perceived import require_same_metric
-from marey_motion.evaluation.provenance import require_comparable
+from marey_motion.evaluation.provenance import differing_options, require_comparable
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.matching.record import TrialRecord
 from marey_schemas.documents.evaluations import CONFIDENCE
@@ -27,7 +27,11 @@ from marey_schemas.documents.replicates import LEAST_REPLICATES, mean_interval
 SAME_CHANGE = 1e-12
 """Relative difference up to which two changes count as equal, because rounding can cause a difference of this size."""
 
+OBJECTIVE = "objective"
+"""Name of the objective of an improvement where its change is stated like that of a metric, in metres."""
+
 LESS_IS_BETTER = (
+    OBJECTIVE,
     "abs_se_v",
     "abs_se_omega_deg",
     "dse_v",
@@ -127,23 +131,45 @@ class Comparison:
     coverage_change_s: NDArray[np.float64]
 
 
-def compare_results(before: EvaluationResult, after: EvaluationResult) -> Comparison:
-    """Compare two evaluations with the same normaliser, options and scenarios.
+def compare_several(before: EvaluationResult, others: Sequence[EvaluationResult]) -> tuple[Comparison, ...]:
+    """Compare each of several evaluations with the first one, under the same normaliser, options and scenarios.
 
     Parameters
     ----------
-    before, after : EvaluationResult    both with their records
+    before : EvaluationResult    the evaluation with which the others are compared
+    others : sequence of EvaluationResult    at least one; all with their records
 
     Returns
     -------
-    Comparison    changes of metrics, trials and coverage
+    tuple of Comparison    one for each other evaluation; probabilities are corrected for all metrics of all of them
 
     Raises
     ------
     MotionError    if the conditions differ (the error names them), or if an evaluation was read without its records
     """
-    require_comparable(before.provenance, after.provenance)
+    found = [_compared(before, after) for after in others]
+    changes = iter(corrected([change for one in found for change in one.metrics]))
+    return tuple(replace(one, metrics=tuple(next(changes) for _ in one.metrics)) for one in found)
+
+
+def require_same_conditions(before: EvaluationResult, after: EvaluationResult) -> None:
+    """Check that two evaluations can be compared.
+
+    Parameters
+    ----------
+    before, after : EvaluationResult    the evaluations
+
+    Raises
+    ------
+    MotionError    if normaliser, options, scenarios, limits or perceptual metric differ; the error names them
+    """
+    require_comparable(before.provenance, after.provenance, differing_options(before.options, after.options))
     require_same_metric(before.perceived, after.perceived)
+
+
+def _compared(before: EvaluationResult, after: EvaluationResult) -> Comparison:
+    """Compare two evaluations; probabilities are not corrected."""
+    require_same_conditions(before, after)
     if not (len(before.records) == len(before.trials) == len(after.trials) == len(after.records)):
         raise MotionError("both evaluations must contain the records of all their trials", code="records-missing")
     uids = {clip.uid for clip in before.clips}, {clip.uid for clip in after.clips}
@@ -151,7 +177,7 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     return Comparison(
         before=before,
         after=after,
-        metrics=metric_changes(before, after),
+        metrics=_metric_changes(before, after),
         changed=_trial_changes(before, after),
         removed=tuple(sorted(uids[0] - uids[1])),
         added=tuple(sorted(uids[1] - uids[0])),
@@ -160,22 +186,13 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     )
 
 
-def metric_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[MetricChange, ...]:
-    """Compute the changes of all metrics that both evaluations define in one trial at least.
-
-    Parameters
-    ----------
-    before, after : EvaluationResult    with the same trials
-
-    Returns
-    -------
-    tuple of MetricChange    in alphabetical order, with probabilities that are corrected within their family
-    """
+def _metric_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[MetricChange, ...]:
+    """Compute the changes of all metrics that both evaluations define in one trial at least, in alphabetical order."""
     pairs = {metric: (_values(before, metric), _values(after, metric)) for metric in _names(before) & _names(after)}
     known = {
         metric: pair for metric, pair in sorted(pairs.items()) if np.any(np.isfinite(pair[0]) & np.isfinite(pair[1]))
     }
-    return corrected([paired_change(metric, *pair) for metric, pair in known.items()])
+    return tuple(paired_change(metric, *pair) for metric, pair in known.items())
 
 
 def paired_change(metric: str, before: Floats, after: Floats) -> MetricChange:
@@ -239,16 +256,32 @@ def corrected(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
     -------
     tuple of MetricChange    in the same order
     """
-    raised: dict[str, float] = {}
+    found = list(changes)
     for judged in (True, False):
-        own = sorted(
-            (one.p, one.metric) for one in changes if one.p is not None and (one.metric in LESS_IS_BETTER) == judged
-        )
-        most = 0.0
-        for place, (p, metric) in enumerate(own):
-            most = max(most, min(1.0, (len(own) - place) * p))
-            raised[metric] = most
-    return tuple(replace(one, p=raised.get(one.metric)) for one in changes)
+        own = [place for place, one in enumerate(changes) if (one.metric in LESS_IS_BETTER) == judged]
+        for place, one in zip(own, corrected_family([changes[place] for place in own]), strict=True):
+            found[place] = one
+    return tuple(found)
+
+
+def corrected_family(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
+    """Correct the probabilities of changes for their number, by Holm's method.
+
+    Parameters
+    ----------
+    changes : sequence of MetricChange    with uncorrected probabilities
+
+    Returns
+    -------
+    tuple of MetricChange    in the same order
+    """
+    known = sorted((one.p, place) for place, one in enumerate(changes) if one.p is not None)
+    raised: dict[int, float] = {}
+    most = 0.0
+    for rank, (p, place) in enumerate(known):
+        most = max(most, min(1.0, (len(known) - rank) * p))
+        raised[place] = most
+    return tuple(replace(one, p=raised.get(place)) for place, one in enumerate(changes))
 
 
 def _names(result: EvaluationResult) -> set[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from typing import Any
 
@@ -53,19 +53,22 @@ def _drawn(options: EvaluationOptions) -> list[dict[str, int]]:
     return [{"replicates": options.replicates, "seed": options.seed}] if options.replicates > 1 else []
 
 
-def require_comparable(before: Provenance, after: Provenance) -> None:
+def require_comparable(
+    before: Provenance, after: Provenance, options: Mapping[str, Sequence[str]] | None = None
+) -> None:
     """Check that the cost functions, options and scenarios of two evaluations agree.
 
     Parameters
     ----------
     before, after : Provenance    digests of the two evaluations
+    options : mapping of str to sequence of str, optional    options that differ, as made by `differing_options`
 
     Raises
     ------
     MotionError    if any of these differ; the error names all differences
     """
     different = {
-        name: f"their {plural} differ ({_short(first)} and {_short(second)}): {remedy}"
+        name: f"their {plural} differ ({_named((options or {}).get(name, ()), first, second)}): {remedy}"
         for name, (plural, remedy) in _CONDITIONS.items()
         if (first := getattr(before, name)) != (second := getattr(after, name))
     }
@@ -77,6 +80,36 @@ def require_comparable(before: Provenance, after: Provenance) -> None:
         )
 
 
+def differing_options(before: EvaluationOptions, after: EvaluationOptions) -> dict[str, list[str]]:
+    """Describe the options that differ between two evaluations, by the condition of a comparison to which they belong.
+
+    Parameters
+    ----------
+    before, after : EvaluationOptions    the options
+
+    Returns
+    -------
+    dict of str to list of str    such as {"scenarios": ["seed: 0 and 1"]}
+    """
+    found: dict[str, list[str]] = {}
+    first, second = (dict(_flat("", options.model_dump())) for options in (before, after))
+    for name in first.keys() | second.keys():
+        condition = _CONDITION_OF.get(name.partition(".")[0])
+        if condition is not None and (one := first.get(name, "none")) != (other := second.get(name, "none")):
+            found.setdefault(condition, []).append(f"{name}: {one} and {other}")
+    return {condition: sorted(texts) for condition, texts in found.items()}
+
+
+_CONDITION_OF = {
+    **dict.fromkeys(("database", "controller", "window"), "options"),
+    **dict.fromkeys(("speeds_m_s", "turn_rates_deg_s", "families", "approach_s", "duration_s"), "scenarios"),
+    **dict.fromkeys(("switch_speed_m_s", "switch_every_s", "replicates", "seed"), "scenarios"),
+    "limits": "limits",
+}
+"""Condition of a comparison to which a member of the options belongs; other members do not change any number."""
+_NAMED = 5
+"""Greatest number of differing options that an error names."""
+
 _CONDITIONS = {
     "normaliser": ("normalisers", "evaluate both with one pinned normaliser, or with one fitted on both"),
     "options": ("options", "evaluate both with the same database, controller and window"),
@@ -86,6 +119,23 @@ _CONDITIONS = {
         "evaluate both with the same limits, and again if one of them has none, since looks were not measured then",
     ),
 }
+
+
+def _named(texts: Sequence[str], first: str, second: str) -> str:
+    """Name the options that differ, or the digests if the options are not the reason."""
+    if not texts:
+        return f"{_short(first)} and {_short(second)}"
+    more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
+    return f"{'; '.join(texts[:_NAMED])}{more}"
+
+
+def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name of each option, and its value."""
+    if isinstance(value, Mapping):
+        for name, member in value.items():
+            yield from _flat(f"{prefix}.{name}" if prefix else name, member)
+    else:
+        yield prefix, ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
 
 
 def _rows_digest(database: MatchingDatabase, clip: DatabaseClip) -> str:

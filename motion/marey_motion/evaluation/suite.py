@@ -29,6 +29,7 @@ from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.rigs import map_joints
+from marey_schemas.documents.replicates import LEAST_REPLICATES
 from marey_schemas.options.evaluation import EvaluationOptions
 
 _baselines: dict[EvaluationOptions, EvaluationResult] = {}
@@ -194,7 +195,7 @@ def evaluate(
     trials = suite_trials(options)
     index = _index_of(database)
     replicated = len(trials) * options.replicates
-    total = replicated + (len(trials) if with_baseline else 0)
+    total = replicated + (len(trials) * baseline_replicates(options) if with_baseline else 0)
     report = progress or (lambda _done, _total, _note: None)
 
     def progress_after(before: int) -> ProgressCallback:
@@ -233,7 +234,8 @@ def evaluate_baseline(
 ) -> EvaluationResult:
     """Evaluate clips generated for every cell of the grid, without records; the last result is cached.
 
-    The baseline has no replicates: it is a scale for the eye, and no statistic is computed from it.
+    The baseline runs in at most as many replicates as an interval needs: it is a scale for the eye, but chance moves it
+    like any other set.
 
     Parameters
     ----------
@@ -250,17 +252,30 @@ def evaluate_baseline(
     ------
     EvaluationCancelled    if cancelled
     """
-    options = options.replace(replicates=1)
+    options = options.replace(replicates=baseline_replicates(options))
     if options not in _baselines:
-        trials = suite_trials(options)
         database, notes = baseline_database(options)
-        records = run_suite(database, options, trials=trials, threads=threads, progress=progress, cancelled=cancelled)
-        made = assemble(database, options, trials, records)
+        made = evaluate(database, options, threads=threads, with_baseline=False, progress=progress, cancelled=cancelled)
         _baselines.clear()
         _baselines[options] = replace(made, records=(), notes=(*notes, *made.notes))
     elif progress is not None:
-        progress(len(_baselines[options].trials), len(_baselines[options].trials), "")
+        runs = len(_baselines[options].trials) * options.replicates
+        progress(runs, runs, "")
     return _baselines[options]
+
+
+def baseline_replicates(options: EvaluationOptions) -> int:
+    """Return the number of replicates in which the baseline of an evaluation runs.
+
+    Parameters
+    ----------
+    options : EvaluationOptions    options of the evaluation
+
+    Returns
+    -------
+    int    at most as many as an interval needs, since the baseline is not compared by a test
+    """
+    return min(options.replicates, LEAST_REPLICATES)
 
 
 def baseline_clips(options: EvaluationOptions) -> tuple[list[SourceClip], list[str]]:

@@ -184,7 +184,9 @@ def baseline_chapter(result: EvaluationResult) -> Section:
     base = result.baseline
     replicates = result.replicates
     heads = ["measure", "this dataset", *(["95 % interval"] if replicates is not None else [])]
-    heads += [*(["generated baseline"] if base is not None else []), "unit"]
+    baseline_runs = None if base is None else base.replicates
+    heads += ["generated baseline"] if base is not None else []
+    heads += [*(["95 % interval"] if baseline_runs is not None else []), "unit"]
     beyond = exceeded_in_suite(result)
     rows: list[Sequence[Cell]] = []
     for name, metric in METRICS.items():
@@ -196,6 +198,8 @@ def baseline_chapter(result: EvaluationResult) -> Section:
             row.append(_interval(replicates.interval(name), metric.digits))
         if base is not None:
             row.append(number(base.suite.get(name), metric.digits))
+        if baseline_runs is not None:
+            row.append(_interval(baseline_runs.interval(name), metric.digits))
         rows.append([*row, metric.unit])
     pooled = HOW_POOLED if replicates is None else f"{HOW_POOLED} {_replicated(replicates)}"
     about = (

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from marey_schemas.base import Options
+from marey_schemas.documents.replicates import LEAST_REPLICATES
 
 _Price = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 _Factor = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
@@ -36,7 +37,42 @@ class ObjectiveChoice(Options):
     )
 
 
-class SuggestionOptions(ObjectiveChoice):
+class ConfirmedEffects(ObjectiveChoice):
+    """Replicates of the trials on which effects are estimated, and others on which the chosen ones are confirmed."""
+
+    estimation_replicates: int = Field(
+        4,
+        ge=1,
+        le=64,
+        description="Number of replicates of each trial in which effects are estimated, to choose among them; the "
+        "first are those of the evaluation.",
+    )
+    confirmation_replicates: int = Field(
+        8,
+        ge=0,
+        le=64,
+        description="Number of other replicates in which the chosen effects are measured again: the effects that are "
+        f"reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed.",
+    )
+    confirmation_seed: int = Field(
+        0,
+        ge=0,
+        lt=2**63,
+        description="Seed of these other replicates: with another seed, the same choices are confirmed again.",
+    )
+
+    @field_validator("confirmation_replicates")
+    @classmethod
+    def _check_confirmations(cls, count: int) -> int:
+        if 0 < count < LEAST_REPLICATES:
+            raise ValueError(
+                f"{count} replicates have no interval; choose at least {LEAST_REPLICATES}, or 0 to leave effects "
+                "unconfirmed"
+            )
+        return count
+
+
+class SuggestionOptions(ConfirmedEffects):
     """Options that select the suggestions to compute."""
 
     removals: int = Field(
@@ -44,6 +80,13 @@ class SuggestionOptions(ObjectiveChoice):
         ge=0,
         le=1000,
         description="Number of clips whose removal is planned, in addition to the unused clips; 0: none.",
+    )
+    simulated_additions: int = Field(
+        3,
+        ge=0,
+        le=100,
+        description="Number of clips to add whose effect on the trials is simulated, in the order of the additions; "
+        "each takes as long as an evaluation with `confirmation_replicates`.",
     )
     consider: int | None = Field(
         50,
@@ -82,15 +125,16 @@ class SuggestionOptions(ObjectiveChoice):
     )
 
 
-class OptimisationOptions(ObjectiveChoice):
+class OptimisationOptions(ConfirmedEffects):
     """Limits of an optimisation."""
 
     least_gain: float = Field(
-        1e-4,
+        0.0,
         ge=0,
         le=1000,
         allow_inf_nan=False,
-        description="The optimisation ends when no step lowers the objective by at least this many metres.",
+        description="Least decrease of the objective of a step, in metres, in addition to its confirmation. Chance "
+        "needs no allowance here, because only steps that are confirmed are made.",
     )
     max_steps: int = Field(50, ge=1, le=10_000, description="Greatest number of steps.")
     max_evaluations: int | None = Field(
@@ -112,7 +156,7 @@ class OptimisationOptions(ObjectiveChoice):
     )
 
 
-class SweepOptions(ObjectiveChoice):
+class SweepOptions(ConfirmedEffects):
     """Options of a sweep: the weights of feature groups to try."""
 
     factors: tuple[_Factor, ...] = Field(

@@ -1,6 +1,6 @@
 """Kinds of jobs that measure clips and sets of clips; `job_kinds` lists them with all others."""
 
-from marey_schemas.documents.evaluations import REMOVAL_FACETS, USAGE_FACETS
+from marey_schemas.documents.evaluations import MOST_COMPARED, REMOVAL_FACETS, USAGE_FACETS
 from marey_schemas.documents.quality import QUALITY_FACETS
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_params
@@ -53,15 +53,26 @@ EVALUATE = KindDeclaration(
 
 COMPARE = KindDeclaration(
     name="compare",
-    description="Compares two evaluations trial by trial, with confidence intervals of the changes.",
+    description="Compares two evaluations trial by trial, with confidence intervals of the changes, or several sets of "
+    "clips with the first one.",
     params=job_params.CompareParams,
     implementation="marey_worker.kinds.compare:run",
-    version=3,
+    version=4,
     inputs={
-        "before": InputSpec(kind=Kind.EVALUATION, description="The evaluation before the change."),
+        "before": InputSpec(
+            kind=Kind.EVALUATION,
+            description="The evaluation before the change, or the one with which all others are compared.",
+        ),
         "after": InputSpec(
             kind=Kind.EVALUATION,
             description="The evaluation after the change, with the same trials and the same normaliser.",
+        ),
+        "others": InputSpec(
+            kind=Kind.EVALUATION,
+            many=True,
+            required=False,
+            description=f"Further evaluations to compare with `before`, at most {MOST_COMPARED - 2}, with the same "
+            "trials and the same normaliser.",
         ),
     },
     outputs={"document": "file", "report": "file"},
@@ -126,7 +137,7 @@ SUGGEST = KindDeclaration(
     "coverage.",
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
-    version=4,
+    version=5,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": METRIC},
     outputs={"document": "file"},
     facets=REMOVAL_FACETS,
@@ -137,7 +148,7 @@ OPTIMISE = KindDeclaration(
     description="Removes clips from an evaluated set and adds others, step by step, as long as the set improves.",
     params=job_params.OptimiseParams,
     implementation="marey_worker.kinds.optimise:run",
-    version=2,
+    version=3,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
     outputs={"document": "file"},
 )
@@ -149,7 +160,7 @@ SWEEP = KindDeclaration(
     implementation="marey_worker.kinds.sweep:run",
     gathering="marey_worker.kinds.sweep:gather",
     task_count=job_params.count_sweep_tasks,
-    version=2,
+    version=3,
     inputs={"evaluation": _EVALUATED},
     outputs={"document": "file"},
 )

@@ -24,6 +24,8 @@ SMALL: dict[str, Any] = {
     "baseline": False, "report": False, "replicates": 1,
 }  # fmt: skip
 
+FEW = ("--estimation-replicates", 1, "--confirmation-replicates", 3)
+
 
 def evaluated(lab: ProjectHandle, clips: Any = "walks", **options: Any) -> EvaluationHandle:
     return lab.evaluation(lab.evaluate(clips, **{**SMALL, **options}))
@@ -31,7 +33,7 @@ def evaluated(lab: ProjectHandle, clips: Any = "walks", **options: Any) -> Evalu
 
 def test_without_all_that_can_go_no_trial_changes(lab: ProjectHandle, run: CommandLine, tmp_path: Path) -> None:
     first = evaluated(lab, name="first")
-    told = run("suggest", "lab/first", "--removals", 1, "--remove-out", "names.txt").stdout
+    told = run("suggest", "lab/first", "--removals", 1, "--remove-out", "names.txt", *FEW).stdout
     names = (tmp_path / "names.txt").read_text(encoding="utf-8").splitlines()
     unused = {clip["clip"] for clip in first.clips() if clip["ticks"] == 0}
     assert names
@@ -89,16 +91,27 @@ def test_evaluations_under_their_own_normalisers_are_refused_with_the_way_out(
 def test_clips_of_another_folder_fill_the_holes_of_a_set(lab: ProjectHandle, marey: Marey, run: CommandLine) -> None:
     straight = [clip for clip in lab.clips.list() if clip.name.endswith(" 0")]
     first = evaluated(lab, straight, name="straight")
-    found = first.suggest("walks", removals=0, consider=0).document()
+    found = first.suggest("walks", removals=0, consider=0, confirmation_replicates=0).document()
     names = {one["name"] for one in found["fillings"]}
     assert names
     assert all("60" in name for name in names)
     assert not any(one["needs_retarget"] for one in found["fillings"])
-    told = run("suggest", "lab/straight", "--from", "lab/walks", "--removals", 0, "--consider", 0).stdout
+    told = run(
+        "suggest",
+        "lab/straight",
+        "--from",
+        "lab/walks",
+        "--removals",
+        0,
+        "--consider",
+        0,
+        "--confirmation-replicates",
+        0,
+    ).stdout
     assert f"{len(found['fillings'])} clips would fill holes." in told
     assert "can be blended with the set" in told
 
-    run("optimise", "lab/straight", "--from", "lab/walks", "--max-steps", 2, "--consider", 3)
+    run("optimise", "lab/straight", "--from", "lab/walks", "--max-steps", 2, "--consider", 3, *FEW)
     (job,) = [one for one in lab.jobs() if one.kind == "optimise"]
     log = b"".join(marey.jobs.log(job.id))
     steps = [line for line in log.decode().splitlines() if line.startswith("step ")]
@@ -108,7 +121,7 @@ def test_clips_of_another_folder_fill_the_holes_of_a_set(lab: ProjectHandle, mar
 
 def test_weights_are_swept_over_tasks(lab: ProjectHandle, run: CommandLine) -> None:
     first = evaluated(lab, name="first")
-    found = first.sweep(factors=(0.5,))
+    found = first.sweep(factors=(0.5,), estimation_replicates=1, confirmation_replicates=0)
     assert found.job.size == 8
     document = found.document()
     weights = [setting["weights"] for setting in document["settings"]]
@@ -116,7 +129,7 @@ def test_weights_are_swept_over_tasks(lab: ProjectHandle, run: CommandLine) -> N
     assert differing[0] == []
     assert all(len(names) == 1 for names in differing[1:])
     assert {one["group"] for one in document["influences"]} == {name for (name,) in differing[1:]}
-    assert "The objective is" in run("sweep", "lab/first", "--factors", "0.5").stdout
+    assert "The objective is" in run("sweep", "lab/first", "--factors", "0.5", *FEW).stdout
 
 
 def test_who_may_read_the_project_may_read_the_files_that_its_results_name(

@@ -6,7 +6,8 @@ import httpx
 import pytest
 from tests.support.scripted_server import ScriptedServer, folder
 
-from marey_client.cli.improvements import OPTIMISE, _print_comparison
+from marey_client.cli.comparisons import _print_comparison, _print_several
+from marey_client.cli.improvements import OPTIMISE
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_schemas.encoding.digests import digest_of
@@ -65,6 +66,26 @@ def test_a_comparison_in_which_nothing_changed_says_so(capsys: pytest.CaptureFix
     lists: dict[str, list[str]] = {name: [] for name in ("changed", "metrics", "removed", "added", "newly_unused")}
     _print_comparison({**lists, "trials": 162})
     assert "No trial changed: the results of all 162 trials are identical, bit for bit." in capsys.readouterr().out
+
+
+def test_several_sets_are_printed_beside_each_other_with_their_verdicts(
+    script: ScriptedServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def compared(after: str, offset_m: float, verdict: str) -> dict[str, object]:
+        change = {"metric": "offset_mean", "before": 0.5, "after": offset_m, "verdict": verdict}
+        return {"names": {"before": "union", "after": after}, "metrics": [change]}
+
+    _print_several({**compared("walks", 0.25, "better"), "others": [compared("runs", 0.75, "worse")]})
+    told = capsys.readouterr().out.splitlines()
+    assert next(line.split() for line in told if "metric" in line) == ["metric", "union", "walks", "runs"]
+    found = next(line.split() for line in told if "offset" in line)
+    assert found == ["offset", "m", "0.5000", "0.2500", "better", "0.7500", "worse"]
+
+    first, *others = (evaluation(script, f"set{number}") for number in range(9))
+    request = first.compare_request(*others[:3])
+    assert [request.inputs["after"], *request.inputs["others"]] == [one.as_input() for one in others[:3]]
+    with pytest.raises(ValueError, match="between 2 and 8"):
+        first.compare_request(*others)
 
 
 def test_weights_of_the_objective_are_read_by_name() -> None:

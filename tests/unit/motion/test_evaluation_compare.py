@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
-from tests.support.smaller_databases import without_sources
+from tests.support.compared_evaluations import compare_results
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
@@ -14,11 +14,10 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import (
     LESS_IS_BETTER,
     MetricChange,
-    compare_results,
     corrected,
     paired_change,
 )
-from marey_motion.evaluation.improvement.selection import joined
+from marey_motion.evaluation.improvement.selection import joined, without_sources
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.matching.building import union_normaliser, with_normaliser
 from marey_motion.matching.database import MatchingDatabase
@@ -188,8 +187,8 @@ def test_evaluations_under_other_conditions_are_refused_by_name(
     other = OPTIONS.replace(controller=OPTIONS.controller.replace(follow="path"))
     with pytest.raises(MotionError, match="options"):
         compare_results(result, evaluated(database, other))
-    with pytest.raises(MotionError, match="scenarios"):
-        compare_results(result, evaluated(database, OPTIONS.replace(duration_s=5.0)))
+    with pytest.raises(MotionError, match=r"scenarios differ \(duration_s: 6.0 and 5.0; seed: 0 and 3\)"):
+        compare_results(result, evaluated(database, OPTIONS.replace(duration_s=5.0, seed=3, coverage_least_s=9.0)))
     with pytest.raises(MotionError, match="records"):
         compare_results(result, replace(result, records=()))
 

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, with_mirrored
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.filling import plan_fillings, rank_fillings
-from marey_motion.evaluation.improvement.selection import joined
+from marey_motion.evaluation.improvement.selection import joined, without_sources
 from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 

@@ -234,5 +234,5 @@ def test_an_evaluation_tells_its_progress_over_all_runs_and_builds_one_index(mon
     for _ in range(2):
         told.clear()
         evaluate(database, options, progress=lambda *news: told.append(news[:2]))
-        assert told[:4] == [(0, 4), (1, 4), (2, 4), (3, 4)]
-        assert told[-1] == (4, 4)
+        assert told[:4] == [(0, 6), (1, 6), (2, 6), (3, 6)], "the baseline runs in three replicates, too"
+        assert told[-1] == (6, 6)

@@ -5,7 +5,6 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
@@ -13,6 +12,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.objective import headline_means, objective_value
 from marey_motion.evaluation.improvement.optimise import Optimisation, optimise
 from marey_motion.evaluation.improvement.resimulation import Resimulation
+from marey_motion.evaluation.improvement.selection import without_sources
 from marey_motion.evaluation.improvement.suggestion_documents import optimisation_to_tree
 from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase

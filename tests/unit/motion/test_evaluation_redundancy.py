@@ -2,7 +2,6 @@
 
 import pytest
 from pydantic import ValidationError
-from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
 from tests.support.synthetic_databases import synthetic_database
 
@@ -10,6 +9,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, objective_value
 from marey_motion.evaluation.improvement.redundancy import leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
+from marey_motion.evaluation.improvement.selection import without_sources
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
@@ -68,7 +68,8 @@ def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(
     for removal in removals:
         again = evaluated(without_sources(database, [removal.source]))
         after = headline_means(again.trials)
-        assert removal.changes == {name: after[name] - before[name] for name in HEADLINES}
+        changes = {name: change.change for name, change in removal.estimate.headlines.items()}
+        assert changes == {name: after[name] - before[name] for name in HEADLINES}
         assert removal.harm == objective_value(objective, again.trials, 0.0) - objective_value(
             objective, result.trials, 0.0
         )

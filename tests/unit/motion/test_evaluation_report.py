@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.compared_evaluations import compare_results
 from tests.support.drawn_evaluations import (
     DRAWN_EVALUATIONS,
     changed,
@@ -23,7 +24,6 @@ from tests.support.evaluation_results import synthetic_result
 from tests.support.report_pages import HOSTILE, Page, is_sound
 from tests.support.tiers import is_soak
 
-from marey_motion.evaluation.compare import compare_results
 from marey_motion.evaluation.judgement import GRADES, judge, judge_trial, mean_speed_m_s
 from marey_motion.evaluation.result import EvaluationResult, ReplicateValues, TrialResult
 from marey_motion.evaluation.scenario import Trial, demand

@@ -4,12 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.smaller_databases import without_rows, without_sources
 from tests.support.suggestion_cases import named, same_to_the_bit, simulated, wandering_tracks, with_mirrored
 from tests.support.synthetic_databases import synthetic_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.selection import clips_by_source, joined, rows_of_sources, same_skeleton
+from marey_motion.evaluation.improvement.selection import (
+    clips_by_source,
+    joined,
+    rows_of_sources,
+    same_skeleton,
+    without_rows,
+    without_sources,
+)
 from marey_motion.matching.database import MatchingDatabase
 
 ROWS = ("features", "selectable", "root_positions", "root_headings", "pose_points", "poses", "contacts")

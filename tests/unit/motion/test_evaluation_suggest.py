@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.smaller_databases import without_rows, without_sources
+from tests.support.compared_evaluations import compare_results
 from tests.support.suggestion_cases import (
     OPTIONS,
     UNWANTED,
@@ -19,12 +19,13 @@ from tests.support.suggestion_cases import (
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.compare import compare_results
+from marey_motion.evaluation.compare import OBJECTIVE, paired_change
+from marey_motion.evaluation.improvement.effects import Effect
 from marey_motion.evaluation.improvement.filling import FilledCell, Filling
-from marey_motion.evaluation.improvement.objective import headline_means
+from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means
 from marey_motion.evaluation.improvement.reasons import why_filling, why_redundant
 from marey_motion.evaluation.improvement.redundancy import Removal
-from marey_motion.evaluation.improvement.selection import joined
+from marey_motion.evaluation.improvement.selection import joined, without_rows, without_sources
 from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree, suggestions_to_tree
 from marey_motion.evaluation.replicates import run_replicates
@@ -40,6 +41,8 @@ from marey_motion.rigs import map_joints
 from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.improvement import SuggestionOptions
 
+FEW = SuggestionOptions(estimation_replicates=2, confirmation_replicates=3, simulated_additions=1)
+
 
 @pytest.fixture(scope="module")
 def database() -> MatchingDatabase:
@@ -54,7 +57,7 @@ def outside() -> MatchingDatabase:
 
 @pytest.fixture(scope="module")
 def found(database: MatchingDatabase, outside: MatchingDatabase) -> Suggestions:
-    options = SuggestionOptions(removals=3, blendable_m=3.0)
+    options = FEW.replace(removals=3, blendable_m=3.0)
     return suggest(database, evaluated(database), collections={"turns": outside}, options=options)
 
 
@@ -69,6 +72,24 @@ def test_every_kind_of_suggestion_is_made(found: Suggestions) -> None:
     assert found.similarity.threshold == 3.0
 
 
+def test_effects_are_confirmed_in_other_replicates_or_said_not_to_be(found: Suggestions) -> None:
+    first, *others = found.additions
+    assert first.confirmed is not None
+    assert all(step.confirmed is None for step in others)
+    tree = suggestions_to_tree(found)
+    assert "the mean distance from the path" in tree["additions"][0]["reason"]
+    assert all(one["reason"].endswith("Its effect on the trials was not simulated.") for one in tree["additions"][1:])
+    for step, planned in zip(found.plan, tree["redundant"]["plan"], strict=True):
+        assert step.confirmed is not None
+        assert step.confirmed.objective.replicates == 3
+        assert planned["confirmed"]["objective"]["verdict"] == step.confirmed.objective.verdict
+        assert "was not confirmed" not in planned["reason"]
+    assert all("was not confirmed" in clip["reason"] for clip in tree["redundant"]["clips"])
+    assert tree["unused"]["confirmed_clips"]["reason"].startswith("Without all of them, in other replicates, ")
+    assert tree["unused"]["confirmed_ranges"]["objective"]["replicates"] == 3
+    assert tree["chance"]["offset_mean"] > 0.0
+
+
 def test_what_another_replicate_shows_is_not_called_unused(database: MatchingDatabase) -> None:
     options = OPTIONS.replace(replicates=3)
     trials = suite_trials(options)
@@ -77,7 +98,7 @@ def test_what_another_replicate_shows_is_not_called_unused(database: MatchingDat
     (own,) = (clip for clip in database.clips if clip.uid == UNWANTED[0])
     replicates.usage.popularity[own.start + 5] += 1
     result = assemble(database, options, trials, simulated(database, options), replicates=replicates)
-    found = suggest(database, result, options=SuggestionOptions(removals=0, consider=0))
+    found = suggest(database, result, options=FEW.replace(removals=0, consider=0, confirmation_replicates=0))
     assert UNWANTED[1] in {clip.source for clip in found.unused.clips}
     assert UNWANTED[0] not in {clip.source for clip in found.unused.clips}
     shown = {result.clips[use.clip].uid for use in result.usage if use.ticks}
@@ -86,7 +107,7 @@ def test_what_another_replicate_shows_is_not_called_unused(database: MatchingDat
 
 def test_the_threshold_is_the_suites_own_when_none_is_given(database: MatchingDatabase) -> None:
     result = evaluated(database)
-    found = suggest(database, result, options=SuggestionOptions(removals=0, consider=0))
+    found = suggest(database, result, options=FEW.replace(removals=0, consider=0, confirmation_replicates=0))
     assert found.similarity.threshold == accepted_distance(result.records)
     assert (found.plan, found.redundant, found.fillings) == ((), (), ())
 
@@ -123,17 +144,39 @@ def test_reasons_name_the_clip_and_what_it_does(found: Suggestions) -> None:
     assert "turns contains" in tree["fillings"][0]["reason"]
 
 
+def effect(*changes_m: float) -> Effect:
+    """Return an effect that changes the mean distance from the path by so much in each replicate."""
+    before, after = np.ones((1, len(changes_m))), 1.0 + np.array([changes_m])
+    changes = {name: paired_change(name, before, after) for name in HEADLINES}
+    return Effect(paired_change(OBJECTIVE, before, after), changes)
+
+
+SURE = effect(-0.0021, -0.0024, -0.0027, -0.0024)
+
+
 @pytest.mark.parametrize(
-    ("change_m", "said"),
+    ("confirmed", "said"),
     [
-        (0.081, "the mean distance from the path increases by 8.1 cm."),
-        (-0.081, "the mean distance from the path decreases by 8.1 cm."),
-        (0.0004, "the mean distance from the path changes by less than 0.5 mm."),
+        (effect(0.0, 0.0, 0.0), "the mean distance from the path stays the same."),
+        (
+            SURE,
+            "the mean distance from the path decreases by 0.24 cm (95 % interval of the change -0.28 to -0.20 cm).",
+        ),
+        (
+            effect(0.01, -0.01, 0.02, -0.02),
+            "no effect on the mean distance from the path was found (95 % interval of the change -2.91 to +2.91 cm).",
+        ),
+        (
+            None,
+            "the mean distance from the path seems to change by -1.90 cm, which was not confirmed in other replicates.",
+        ),
     ],
 )
-def test_the_reason_for_a_removal_says_which_way_the_distance_goes_and_how_far(change_m: float, said: str) -> None:
-    removal = Removal("walk@1", "walk", 2.0, 3, {"offset_mean": change_m}, 0.0, 0.0)
-    assert why_redundant(removal, 9) == f"Without “walk” (2.0 s, used in 3 of 9 trials), {said}"
+def test_the_reason_for_a_removal_states_what_was_confirmed_and_not_what_was_estimated(
+    confirmed: Effect | None, said: str
+) -> None:
+    removal = Removal("walk@1", "walk", 2.0, 3, effect(-0.019), 0.0, 0.0)
+    assert why_redundant(removal, 9, confirmed) == f"Without “walk” (2.0 s, used in 3 of 9 trials), {said}"
 
 
 @pytest.mark.parametrize(
@@ -177,7 +220,7 @@ def test_an_evaluation_of_another_set_is_refused(database: MatchingDatabase) -> 
 
 def test_progress_only_rises_and_the_work_can_be_stopped(database: MatchingDatabase) -> None:
     told, result = [], evaluated(database)
-    options = SuggestionOptions(removals=2)
+    options = FEW.replace(removals=2)
     suggest(database, result, options=options, progress=lambda *step: told.append(step))
     assert [done for done, _, _ in told] == sorted(done for done, _, _ in told)
     assert told[-1][0] == told[-1][1]
@@ -208,7 +251,7 @@ def bandai(mocap: Path) -> tuple[MatchingDatabase, MatchingDatabase]:
 
 @pytest.fixture(scope="module")
 def real(bandai: tuple[MatchingDatabase, MatchingDatabase]) -> Suggestions:
-    options = SuggestionOptions(removals=10, consider=12)
+    options = SuggestionOptions(removals=10, consider=12, estimation_replicates=1, confirmation_replicates=0)
     return suggest(bandai[0], evaluated(bandai[0], REAL), collections={"turns": bandai[1]}, options=options)
 
 

@@ -27,7 +27,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.rigs import map_joints
-from marey_schemas.options.improvement import ObjectiveOptions
+from marey_schemas.options.improvement import ObjectiveOptions, SweepOptions
 from marey_schemas.options.matching import DatabaseOptions, FeatureWeights
 
 
@@ -47,6 +47,7 @@ def database() -> MatchingDatabase:
     return walks()
 
 
+ONCE = SweepOptions(estimation_replicates=1, confirmation_replicates=0)
 OTHER = FeatureWeights(trajectory_directions=0.3, hip_velocity=2.0, left_foot_position=1.1)
 
 
@@ -66,7 +67,7 @@ def test_a_group_without_weight_plays_no_part_and_cannot_be_brought_back(databas
 
 
 def test_each_row_of_a_sweep_is_an_evaluation_with_these_weights(database: MatchingDatabase) -> None:
-    rows = sweep_weights(database, OPTIONS, [FeatureWeights(), OTHER])
+    rows = sweep_weights(database, OPTIONS, [FeatureWeights(), OTHER], how=ONCE)
     for row in rows:
         result = evaluated(reweighted(database, row.weights))
         assert row.metrics == pooled_metrics(result.trials)
@@ -109,8 +110,8 @@ def test_the_group_whose_weight_changes_most_is_the_most_influential() -> None:
 
 def test_a_sweep_tells_its_progress_and_can_be_stopped(database: MatchingDatabase) -> None:
     told = []
-    sweep_weights(database, OPTIONS, [FeatureWeights(), OTHER], progress=lambda *step: told.append(step[:2]))
+    sweep_weights(database, OPTIONS, [FeatureWeights(), OTHER], how=ONCE, progress=lambda *step: told.append(step[:2]))
     assert told[-1] == (12, 12)
     assert [done for done, _ in told] == sorted(done for done, _ in told)
     with pytest.raises(EvaluationCancelled):
-        sweep_weights(database, OPTIONS, [OTHER], cancelled=lambda: True)
+        sweep_weights(database, OPTIONS, [OTHER], how=ONCE, cancelled=lambda: True)

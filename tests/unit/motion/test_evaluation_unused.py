@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.smaller_databases import without_rows, without_sources
 from tests.support.suggestion_cases import (
     OPTIONS,
     UNWANTED,
@@ -18,6 +17,7 @@ from tests.support.suggestion_cases import (
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.evaluation.improvement.resimulation import needed_rows
+from marey_motion.evaluation.improvement.selection import without_rows, without_sources
 from marey_motion.evaluation.improvement.unused import Unused, find_unused
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.suite import run_suite

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.compared_evaluations import compare_results
 from tests.support.judged_sets import FEW, database_of, evaluated_set, frozen, gliding, walks
 
 from marey_motion.clip import Clip
-from marey_motion.evaluation.compare import compare_results
 from marey_motion.evaluation.judgement import LOOKS, judge, judge_trial
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.result import EvaluationResult

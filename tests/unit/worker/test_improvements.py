@@ -78,12 +78,36 @@ def test_evaluations_under_two_normalisers_are_refused_with_what_to_type(project
     assert refused.value.code == "not-comparable"
 
 
+def test_several_sets_under_one_normaliser_are_compared_with_the_first_in_one_report(project: LoggedProject) -> None:
+    clips = project.inputs["clips"]
+    union = evaluated(project, "union", clips)
+    project.inputs["normaliser"] = (union,)
+    left, right = evaluated(project, "left", clips[1:]), evaluated(project, "right", clips[:3])
+    project.inputs = {"before": (union,), "after": (left,), "others": (right, union)}
+    result = compare.run(project, CompareParams())
+    document = document_of(project, result)
+    assert [one["names"]["after"] for one in document["others"]] == ["results/right", "results/union"]
+    assert document["removed"] == [f"{clips[0].item}@1"]
+    assert [one["removed"] for one in result["others"]] == [1, 0]
+    assert result["others"][1]["changed_trials"] == 0
+    page = project.blobs[result["report"]["blob"]].decode()
+    assert all(
+        text in page
+        for text in ("than results/union", "results/left", "Sets of clips", "1 replicate, so it is unknown")
+    )
+    assert page.count("<svg") >= 2, "distances and density of all sets"
+
+    project.inputs["others"] = (right,) * 7
+    with pytest.raises(JobRefused, match="9 evaluations cannot be compared at once; choose up to 8"):
+        compare.run(project, CompareParams())
+
+
 def test_what_can_go_is_named_and_clips_of_other_skeletons_need_to_be_retargeted(project: LoggedProject) -> None:
     clips = project.inputs["clips"]
     own = evaluated(project, "first", clips[1:2])
     add_clip(project, "tall", of_taller_person(generate_gait(1.25, radians(50), 5.0)), skeleton="skeleton_b")
     project.inputs = {"evaluation": (own,), "candidates": project.inputs["clips"]}
-    result = suggest.run(project, SuggestParams(removals=0, consider=0))
+    result = suggest.run(project, SuggestParams(removals=0, consider=0, confirmation_replicates=0))
     fillings = {one["name"]: one["needs_retarget"] for one in document_of(project, result)["fillings"]}
     assert fillings["walks/tall"]
     assert not fillings["walks/walk 1.25 50"]
@@ -95,7 +119,9 @@ def test_suggestions_publish_the_harm_of_each_removal(project: LoggedProject) ->
     clips = project.inputs["clips"]
     own = evaluated(project, "first", clips)
     project.inputs, project.facets = {"evaluation": (own,)}, []
-    document = document_of(project, suggest.run(project, SuggestParams(removals=0)))
+    document = document_of(
+        project, suggest.run(project, SuggestParams(removals=0, estimation_replicates=1, confirmation_replicates=0))
+    )
     harms = {one.item: one.values["removal_harm"] for one in project.facets}
     assert harms[clips[3].item] == 0, "no trial needs this clip"
     needed = {removal["source"].split("@")[0]: removal["harm"] for removal in document["redundant"]["clips"]}
@@ -108,7 +134,7 @@ def test_every_step_of_an_optimisation_is_logged_and_kept(project: LoggedProject
     clips = project.inputs["clips"]
     own = evaluated(project, "first", clips[1:2])
     project.inputs = {"evaluation": (own,), "candidates": clips}
-    result = optimise.run(project, OptimiseParams(max_steps=2))
+    result = optimise.run(project, OptimiseParams(max_steps=2, estimation_replicates=2, confirmation_replicates=3))
     steps = document_of(project, result)["steps"]
     assert len(steps) == result["steps"] + 1
     assert [line.split(":")[0] for line in project.lines] == [*(f"step {step['number']}" for step in steps), "ended"]
@@ -120,7 +146,7 @@ def test_every_step_of_an_optimisation_is_logged_and_kept(project: LoggedProject
 def test_a_sweep_is_the_same_however_many_tasks_it_is_spread_over(project: LoggedProject) -> None:
     own = evaluated(project, "first", project.inputs["clips"])
     project.inputs = {"evaluation": (own,)}
-    params = SweepParams(factors=(0.5,))
+    params = SweepParams(factors=(0.5,), estimation_replicates=1, confirmation_replicates=0)
     whole = sweep.gather(project, params, [sweep.run(project, params)])
     results = []
     for position in range(3):

@@ -1,47 +1,84 @@
-"""Kind `compare`: compares two evaluations of the same trials, and writes a document and a report."""
+"""Kind `compare`: compares evaluations of the same trials, and writes a document and a report."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.compare import Comparison, compare_results
+from marey_motion.evaluation.compare import Comparison, compare_several, require_same_conditions
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree
+from marey_motion.evaluation.result import EvaluationResult
 from marey_reports.evaluation.page import render_comparison
+from marey_reports.evaluation.several import render_several
+from marey_schemas.documents.evaluations import MOST_COMPARED
 from marey_schemas.queue.job_params import CompareParams
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import read_result, store_document, store_file
-
-STEPS = 3
+from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
 def run(context: Context, params: CompareParams) -> dict[str, Any]:
-    """Compare two evaluations; the result counts the changes, and refers to the document and the report.
+    """Compare evaluations with the first one; the result counts the changes, and refers to the document and the report.
 
-    Raises `JobRefused` if the evaluations have different normalisers, options or scenarios.
+    The document is that of the first two evaluations; with more, its member `others` contains one for each further
+    evaluation. Raises `JobRefused` if normalisers, options or scenarios differ, or if there are too many evaluations.
     """
-    (first,), (second,) = context.inputs["before"], context.inputs["after"]
-    context.progress(0, STEPS, "reading the evaluations")
-    before, _ = read_result(context, first)
-    after, _ = read_result(context, second)
-    context.progress(1, STEPS, "comparing trials")
-    try:
-        comparison = compare_results(before, after)
-    except MotionError as error:
-        again = (
-            f"`marey evaluate … --normaliser PROJECT/{first.path}` with the options of that evaluation makes an "
-            "evaluation that can be compared"
+    pins = (*context.inputs["before"], *context.inputs["after"], *context.inputs.get("others", ()))
+    if len(pins) > MOST_COMPARED:
+        raise JobRefused(
+            "too-many-evaluations", f"{len(pins)} evaluations cannot be compared at once; choose up to {MOST_COMPARED}"
         )
-        raise JobRefused(error.code, f"{error}; {again}") from error
-    document = {**comparison_to_tree(comparison), "names": {"before": first.path, "after": second.path}}
-    result = {**_counts(comparison), "document": store_document(context, document)}
+    results = []
+    for done, pin in enumerate(pins):
+        context.progress(done, len(pins) + 2, f"reading {pin.path}")
+        results.append(read_result(context, pin)[0])
+    context.progress(len(pins), len(pins) + 2, "comparing trials")
+    comparisons = _compared(pins, results)
+    first, *others = (
+        {**comparison_to_tree(one), "names": {"before": pins[0].path, "after": pin.path}}
+        for one, pin in zip(comparisons, pins[1:], strict=True)
+    )
+    result = {**_counts(comparisons[0]), "document": store_document(context, {**first, "others": others})}
+    if others:
+        counts = zip(comparisons[1:], pins[2:], strict=True)
+        result["others"] = [{"evaluation": pin.path, **_counts(one)} for one, pin in counts]
     if params.report:
-        context.progress(2, STEPS, "writing the report")
-        labels = (first.name, second.name) if first.name != second.name else ("before", "after")
-        title = params.title or f"{first.path} and {second.path}"
-        page = render_comparison(before, after, title=title, comparison=comparison, labels=labels)
-        result["report"] = store_file(context, page.encode())
+        context.progress(len(pins) + 1, len(pins) + 2, "writing the report")
+        result["report"] = store_file(context, _report(params, pins, results, comparisons).encode())
     return result
+
+
+def _compared(pins: Sequence[PinnedInput], results: Sequence[EvaluationResult]) -> tuple[Comparison, ...]:
+    """Compare all others with the first. Raises `JobRefused`, with a command that helps, if they are not comparable."""
+    for pin, other in zip(pins[1:], results[1:], strict=True):
+        try:
+            require_same_conditions(results[0], other)
+        except MotionError as error:
+            again = (
+                f"`marey evaluate … --normaliser PROJECT/{pins[0].path}` with the options of that evaluation makes an "
+                f"evaluation of the clips of {pin.path} that can be compared"
+            )
+            raise JobRefused(error.code, f"{pins[0].path} and {pin.path}: {error}; {again}") from error
+    with refusing_motion_errors():
+        return compare_several(results[0], results[1:])
+
+
+def _report(
+    params: CompareParams,
+    pins: Sequence[PinnedInput],
+    results: Sequence[EvaluationResult],
+    comparisons: Sequence[Comparison],
+) -> str:
+    names = [pin.name for pin in pins]
+    paths = [pin.path for pin in pins]
+    title = params.title or f"{', '.join(paths[:-1])} and {paths[-1]}"
+    if len(pins) > 2:
+        labels = names if len(set(names)) == len(names) else paths
+        return render_several(results, comparisons, title=title, labels=labels)
+    pair = (names[0], names[1]) if names[0] != names[1] else ("before", "after")
+    return render_comparison(results[0], results[1], title=title, comparison=comparisons[0], labels=pair)
 
 
 def _counts(comparison: Comparison) -> dict[str, Any]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from marey_motion.evaluation.improvement.optimise import OptimisationStep, optimise
+from marey_motion.evaluation.improvement.effects import confirmation_replicates, estimation_replicates
+from marey_motion.evaluation.improvement.optimise import Optimisation, OptimisationStep, optimise, with_total
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.selection import joined, same_skeleton, source_of
 from marey_motion.evaluation.improvement.suggestion_documents import optimisation_to_tree
@@ -22,7 +23,8 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
     candidates = read_candidates(context, evaluated)
     with refusing_motion_errors():
         database = _with_candidates(evaluated.clips.database, candidates)
-        simulation = _simulation(context, evaluated, database)
+        simulation = _simulation(context, evaluated, database, estimation_replicates(params))
+        others = _confirming(context, params, evaluated, database)
         own = {source_of(clip) for clip in evaluated.clips.database.clips}
         names = {source_of(clip): clip.name for clip in database.clips if clip.mirrored_from is None}
         steps: list[OptimisationStep] = []
@@ -34,19 +36,24 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
         found = optimise(
             simulation,
             params,
+            confirming=others[0] if others else None,
             absent=simulation.sources.keys() - own,
             made=made,
             progress=lambda done, total, uid: context.progress(
                 done, total, f"step {len(steps)}: trying {names.get(uid, uid)}"
             ),
         )
-    context.log(f"ended: {found.ended}")
+        if others:
+            context.progress(0, None, "confirming all steps together")
+            found = with_total(found, others[1], params)
+    _log_end(context, found, names)
     first, last = found.steps[0], found.steps[-1]
     return {
         "steps": len(found.steps) - 1,
         "ended": found.ended,
         "objective_before": first.objective,
         "objective_after": last.objective,
+        "confirmed_change": None if found.total is None else found.total.objective.change,
         "data_s_before": first.data_s,
         "data_s_after": last.data_s,
         "document": store_document(context, {**optimisation_to_tree(found), "names": names}),
@@ -71,10 +78,12 @@ def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> Matc
     return database
 
 
-def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDatabase) -> Resimulation:
-    """Return a simulation with the clips of `database`.
+def _simulation(
+    context: Context, evaluated: EvaluatedSet, database: MatchingDatabase, replicates: range, seed: int | None = None
+) -> Resimulation:
+    """Return a simulation of some replicates with the clips of `database`.
 
-    If `database` contains only the clips of the evaluated set, the simulation reuses the records of the evaluation.
+    If `database` contains only the clips of the evaluated set, the records of the evaluation are used again.
     """
     alone = database is evaluated.clips.database
     return Resimulation(
@@ -82,8 +91,31 @@ def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDat
         evaluated.result.options,
         trials=evaluated.trials,
         records=evaluated.result.records if alone else None,
+        replicates=replicates,
+        seed=seed,
         threads=context.threads,
     )
+
+
+def _confirming(
+    context: Context, params: OptimiseParams, evaluated: EvaluatedSet, database: MatchingDatabase
+) -> list[Resimulation]:
+    """Return simulations to confirm single steps and all steps together; none if the parameters ask for none."""
+    return [
+        _simulation(context, evaluated, database, confirmation_replicates(params, turn), params.confirmation_seed)
+        for turn in range(2 if params.confirmation_replicates else 0)
+    ]
+
+
+def _log_end(context: Context, found: Optimisation, names: dict[str, str]) -> None:
+    for one in found.unconfirmed:
+        clips = ", ".join(names.get(source, source) for source in one.sources)
+        change = one.effect.objective
+        context.log(
+            f"not confirmed: {one.action} {clips}: the objective seemed to change by {-one.estimated_gain:+.4f} m, in "
+            f"other replicates by {change.change:+.4f} m"
+        )
+    context.log(f"ended: {found.ended}")
 
 
 def _describe(step: OptimisationStep, names: dict[str, str]) -> str:

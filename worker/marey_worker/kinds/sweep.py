@@ -6,7 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from marey_motion.evaluation.improvement.sweep import SweepRow, group_influences, sweep_weights, vary_each_group
+from marey_motion.evaluation.improvement.sweep import (
+    Influence,
+    SweepRow,
+    group_influences,
+    sweep_weights,
+    vary_each_group,
+)
 from marey_schemas.options.matching import FeatureWeights
 from marey_schemas.queue.job_params import SweepParams
 from marey_worker.context import Context
@@ -25,7 +31,7 @@ def run(context: Context, params: SweepParams) -> dict[str, Any]:
             evaluated.clips.database,
             evaluated.result.options,
             settings[context.task.position :: context.task.size],
-            objective=params.objective,
+            how=params,
             trials=evaluated.trials,
             threads=context.threads,
             progress=context.progress,
@@ -38,8 +44,8 @@ def gather(context: Context, params: SweepParams, results: Sequence[Mapping[str,
     # Task i of n has made the settings i, i + n, i + 2n and so on.
     longest = max(len(result["rows"]) for result in results)
     found = [result["rows"][turn] for turn in range(longest) for result in results if turn < len(result["rows"])]
-    rows = [SweepRow(**{**row, "weights": FeatureWeights.model_construct(**row["weights"])}) for row in found]
-    influences = [asdict(influence) for influence in group_influences(rows)]
+    rows = [_row_of(tree) for tree in found]
+    influences = [_influence(influence) for influence in group_influences(rows)]
     document = {
         "schema": SWEEP_SCHEMA,
         "objective": params.objective.model_dump(),
@@ -63,4 +69,15 @@ def _row(row: SweepRow) -> dict[str, Any]:
         "metrics": dict(row.metrics),
         "headlines": row.headlines,
         "objective": row.objective,
+        "confirming": list(row.confirming),
     }
+
+
+def _row_of(tree: Mapping[str, Any]) -> SweepRow:
+    weights = FeatureWeights.model_construct(**tree["weights"])
+    return SweepRow(**{**tree, "weights": weights, "confirming": tuple(tree["confirming"])})
+
+
+def _influence(influence: Influence) -> dict[str, Any]:
+    tree, confirmed = asdict(influence), influence.confirmed
+    return tree if confirmed is None else {**tree, "confirmed": {**tree["confirmed"], "verdict": confirmed.verdict}}

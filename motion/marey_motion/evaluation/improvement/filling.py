@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import Floats
 from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.improvement.effects import Effect
 from marey_motion.evaluation.improvement.selection import clips_by_source, same_skeleton
 from marey_motion.evaluation.perceived import PerceivedRows
 from marey_motion.evaluation.result import Coverage
@@ -72,11 +73,16 @@ class Filling:
 
 @dataclass(frozen=True)
 class Addition:
-    """One step of filling: a candidate clip, and its gain after the candidates of all earlier steps were added."""
+    """One step of filling: a candidate clip, and its gain after the candidates of all earlier steps were added.
+
+    `confirmed` is the effect of the step on the trials, corrected for the number of simulated steps; None if the step
+    was not simulated.
+    """
 
     filling: Filling
     filled_s: float
     coverage_index: float
+    confirmed: Effect | None = None
 
 
 def rank_fillings(

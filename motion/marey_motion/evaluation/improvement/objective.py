@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -52,17 +52,3 @@ def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
         values = [value for result in results if (value := result.metrics.get(name)) is not None]
         means[name] = float(np.mean(values)) if values else 0.0
     return means
-
-
-def headline_changes(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
-    """Compute the changes of the headline metrics, after minus before.
-
-    Parameters
-    ----------
-    before, after : mapping of str to float    by metric
-
-    Returns
-    -------
-    dict of str to float    by metric, in its unit
-    """
-    return {name: after[name] - before[name] for name in HEADLINES}

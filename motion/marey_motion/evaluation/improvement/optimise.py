@@ -1,26 +1,36 @@
 """Optimisation of a set of clips: clips are removed or added one by one, as long as this lowers an objective.
 
-Every step tries all candidates, each by simulating the trials that it can change, and applies the best one. The
-objective decreases with every step, so no set is visited twice and the loop ends. An optimisation can be continued
-later from the log of its steps.
+Every step tries all candidates, each by simulating the trials that it can change. The best of them may owe its place to
+chance, so it is simulated again in other replicates, and applied only if its gain is confirmed there. The objective
+decreases with every step, so no set is visited twice and the loop ends. An optimisation can be continued later from the
+log of its steps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.effects import Effect, effect_of
 from marey_motion.evaluation.improvement.filling import source_seconds
 from marey_motion.evaluation.improvement.objective import headline_means, objective_value
 from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation, Sources
 from marey_schemas.options.improvement import OptimisationOptions
 
 Action = Literal["start", "remove", "add"]
+End = Literal["no gain", "not confirmed", "steps", "evaluations"]
 ProgressCallback = Callable[[int, int, str], None]
+
+CONFIRMED_AT_ONCE = 3
+"""Number of candidates of one step, the best first, that are simulated again until one is confirmed.
+
+The best is sometimes luck, and then the next may be real. Each further one raises the bar for all, because with many
+tries chance would confirm one.
+"""
 
 
 @dataclass(frozen=True)
@@ -35,7 +45,8 @@ class OptimisationStep:
     metrics : headline metrics after the step
     data_s : seconds of data after the step
     evaluations : number of candidates tried, over all steps so far
-    changed_trials : trials whose result the step changes
+    changed_trials : trials whose result the step changes, in any replicate of the estimate
+    confirmed : effect of the step in other replicates; None if it was not confirmed, and for the start
     """
 
     number: int
@@ -47,24 +58,40 @@ class OptimisationStep:
     data_s: float
     evaluations: int
     changed_trials: int
+    confirmed: Effect | None = None
+
+
+@dataclass(frozen=True)
+class Unconfirmed:
+    """A candidate of a step whose estimated gain was not confirmed in other replicates, so that it was not applied."""
+
+    action: Action
+    sources: tuple[str, ...]
+    estimated_gain: float
+    effect: Effect
 
 
 @dataclass(frozen=True)
 class Optimisation:
     """Steps of an optimisation, beginning with the unchanged set ("start"), and the reason why the optimisation ended.
 
-    `ended` is "no gain" if no candidate lowers the objective enough, and "steps" or "evaluations" if the maximum number
-    of steps or of evaluations is reached.
+    `ended` is "no gain" if no candidate lowers the objective enough, "not confirmed" if the gain of none of the best
+    candidates is confirmed, and "steps" or "evaluations" if the maximum number of steps or of evaluations is reached.
+    `unconfirmed` contains the candidates that were refused after the last step. `total` is the effect of all steps
+    together in replicates in which no step was chosen or confirmed; None if it was not simulated.
     """
 
     steps: tuple[OptimisationStep, ...]
-    ended: Literal["no gain", "steps", "evaluations"]
+    ended: End
+    unconfirmed: tuple[Unconfirmed, ...] = ()
+    total: Effect | None = None
 
 
 def optimise(
     simulation: Resimulation,
     options: OptimisationOptions,
     *,
+    confirming: Resimulation | None = None,
     absent: Collection[str] = NONE,
     log: Sequence[OptimisationStep] = (),
     made: Callable[[OptimisationStep], None] | None = None,
@@ -77,6 +104,8 @@ def optimise(
     simulation : Resimulation    simulation over a database (`selection.joined`) that contains the clips of the set and
         all clips that may be added
     options : OptimisationOptions    objective and budget
+    confirming : Resimulation, optional    the same trials in other replicates; without it, no step is confirmed, and
+        the estimated gain decides
     absent : collection of str    sources that may be added; all other sources are the set
     log : sequence of OptimisationStep    earlier steps to continue from; `absent` must then list the sources that were
         absent before the first of these steps
@@ -95,18 +124,38 @@ def optimise(
     if steps:
         _require_same(simulation, options, steps[-1])
     else:
-        steps.append(_step(simulation, options, 0, "start", (), frozenset(absent), 0, 0))
+        steps.append(_step(simulation, options, 0, "start", (), frozenset(absent)))
         if made is not None:
             made(steps[0])
-    search = _Search(simulation, options, steps[-1].evaluations)
+    search = _Search(simulation, confirming, options, steps[-1].evaluations)
     while len(steps) - 1 < options.max_steps:
         step = search.best_step(steps[-1], progress)
         if step is None:
-            return Optimisation(tuple(steps), "evaluations" if search.spent else "no gain")
+            ended: End = "evaluations" if search.spent else "not confirmed" if search.refused else "no gain"
+            return Optimisation(tuple(steps), ended, tuple(search.refused))
         steps.append(step)
         if made is not None:
             made(step)
     return Optimisation(tuple(steps), "steps")
+
+
+def with_total(optimisation: Optimisation, fresh: Resimulation, options: OptimisationOptions) -> Optimisation:
+    """Measure the effect of all steps together in replicates in which no step was chosen or confirmed.
+
+    Parameters
+    ----------
+    optimisation : Optimisation    the steps
+    fresh : Resimulation    the trials in these replicates
+    options : OptimisationOptions    objective
+
+    Returns
+    -------
+    Optimisation    with `total`, which stays None if there is no step
+    """
+    if len(optimisation.steps) == 1:
+        return optimisation
+    first, last = (frozenset(optimisation.steps[place].absent) for place in (0, -1))
+    return replace(optimisation, total=effect_of(fresh, options.objective, first, last, with_data=True))
 
 
 def _step(
@@ -116,8 +165,6 @@ def _step(
     action: Action,
     sources: Sequence[str],
     absent: Sources,
-    evaluations: int,
-    changed_trials: int,
 ) -> OptimisationStep:
     results = simulation.results(absent)
     seconds = simulation.seconds(absent)
@@ -129,8 +176,8 @@ def _step(
         objective=objective_value(options.objective, results, seconds),
         metrics=headline_means(results),
         data_s=seconds,
-        evaluations=evaluations,
-        changed_trials=changed_trials,
+        evaluations=0,
+        changed_trials=0,
     )
 
 
@@ -145,25 +192,42 @@ def _require_same(simulation: Resimulation, options: OptimisationOptions, last: 
         )
 
 
+class _Candidate(NamedTuple):
+    """A set to move to, and its estimated gain in metres."""
+
+    gain: float
+    action: Action
+    sources: tuple[str, ...]
+    absent: Sources
+
+
 class _Search:
     """Search over the candidates of each step, within the budget."""
 
-    def __init__(self, simulation: Resimulation, options: OptimisationOptions, evaluations: int) -> None:
-        self._simulation, self._options = simulation, options
+    def __init__(
+        self,
+        simulation: Resimulation,
+        confirming: Resimulation | None,
+        options: OptimisationOptions,
+        evaluations: int,
+    ) -> None:
+        self._simulation, self._confirming, self._options = simulation, confirming, options
         self._evaluations = evaluations
         self._seconds = {
             source: own[0] for source, own in source_seconds(simulation.database, simulation.options).items()
         }
         self._least = simulation.options.coverage_least_s
         self.spent = False
+        self.refused: list[Unconfirmed] = []
 
     def best_step(self, last: OptimisationStep, progress: ProgressCallback | None) -> OptimisationStep | None:
         """Choose the step, after the step `last`, that lowers the objective most.
 
         Returns None if no step lowers the objective enough, or if the budget is spent.
         """
+        self.refused = []
+        found: list[_Candidate] = []
         candidates = self._candidates(frozenset(last.absent))
-        best: tuple[float, Action, tuple[str, ...], Sources] | None = None
         for done, (action, sources, absent) in enumerate(candidates):
             if self._evaluations == self._options.max_evaluations:
                 self.spent = True
@@ -171,24 +235,43 @@ class _Search:
             self._evaluations += 1
             results = self._simulation.results(absent)
             value = objective_value(self._options.objective, results, self._simulation.seconds(absent))
-            if best is None or value < best[0]:
-                best = value, action, sources, absent
+            if (gain := last.objective - value) > 0.0 and gain >= self._options.least_gain:
+                found.append(_Candidate(gain, action, sources, absent))
             if progress is not None:
                 progress(done + 1, len(candidates), sources[0])
-        if best is None or last.objective - best[0] < self._options.least_gain:
-            return None
-        _, action, sources, absent = best
-        before, after = self._simulation.outcomes(last.absent), self._simulation.outcomes(absent)
-        changed = sum(one.result != other.result for one, other in zip(before, after, strict=True))
-        return _step(
-            self._simulation, self._options, last.number + 1, action, sources, absent, self._evaluations, changed
+        # Candidates with equal gains keep their order.
+        found.sort(key=lambda one: -one.gain)
+        return self._first_confirmed(last, found[:CONFIRMED_AT_ONCE])
+
+    def _first_confirmed(self, last: OptimisationStep, best: Sequence[_Candidate]) -> OptimisationStep | None:
+        for one in best:
+            effect = self._confirm(frozenset(last.absent), one)
+            # What changes no trial and saves data is a gain without any chance in it.
+            certain = effect is not None and effect.nothing and effect.objective.change < 0.0
+            if effect is None or certain or effect.improves(len(best)):
+                return self._made(last, one, effect)
+            self.refused.append(Unconfirmed(one.action, one.sources, one.gain, effect))
+        return None
+
+    def _made(self, last: OptimisationStep, one: _Candidate, effect: Effect | None) -> OptimisationStep:
+        sides = (self._simulation.results(absent) for absent in (last.absent, one.absent))
+        changed = {first.trial.name for first, second in zip(*sides, strict=True) if first != second}
+        return replace(
+            _step(self._simulation, self._options, last.number + 1, one.action, one.sources, one.absent),
+            evaluations=self._evaluations,
+            changed_trials=len(changed),
+            confirmed=effect,
         )
+
+    def _confirm(self, before: Sources, one: _Candidate) -> Effect | None:
+        if self._confirming is None:
+            return None
+        return effect_of(self._confirming, self._options.objective, before, one.absent, with_data=True)
 
     def _candidates(self, absent: Sources) -> list[tuple[Action, tuple[str, ...], Sources]]:
         simulation = self._simulation
-        outcomes = simulation.outcomes(absent)
+        counts = simulation.trials_needing(absent)
         present = [source for source in simulation.sources if source not in absent]
-        counts = {source: sum(source in outcome.needed for outcome in outcomes) for source in present}
         unneeded = tuple(source for source in present if counts[source] == 0)
         removals = sorted((source for source in present if counts[source]), key=lambda source: (counts[source], source))
         candidates: list[tuple[Action, tuple[str, ...], Sources]] = []

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from marey_motion.evaluation.compare import MetricChange
 from marey_motion.evaluation.improvement.duplicates import NearDuplicate
+from marey_motion.evaluation.improvement.effects import Effect
 from marey_motion.evaluation.improvement.filling import Addition, FilledCell, Filling
 from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.unused import UnusedClip, UnusedRange
-
-NOTICEABLE_M = 0.0005
-"""Smallest change of the mean distance from the path, in metres, that is given as a number."""
 
 
 def why_unused_clip(clip: UnusedClip) -> str:
@@ -44,27 +43,72 @@ def why_unused_range(part: UnusedRange) -> str:
     )
 
 
-def why_redundant(removal: Removal, trials: int) -> str:
-    """Explain the effect of leaving a clip out.
+def why_unused_again(effect: Effect) -> str:
+    """State what the removal of all unused data does in replicates that the evaluation did not contain.
 
     Parameters
     ----------
-    removal : Removal    the clip and its effect
-    trials : int    number of trials of the suite
+    effect : Effect    the effect
 
     Returns
     -------
     str    a sentence
     """
-    change = removal.changes["offset_mean"]
-    if abs(change) < NOTICEABLE_M:
-        effect = f"the mean distance from the path changes by less than {1000 * NOTICEABLE_M:g} mm"
-    else:
-        direction = "increases" if change > 0 else "decreases"
-        effect = f"the mean distance from the path {direction} by {100 * abs(change):.1f} cm"
+    return f"Without all of them, in other replicates, {distance_in_words(effect)}."
+
+
+def why_redundant(removal: Removal, trials: int, confirmed: Effect | None = None) -> str:
+    """Explain the effect of leaving a clip out.
+
+    Parameters
+    ----------
+    removal : Removal    the clip and its estimated effect
+    trials : int    number of trials of the suite
+    confirmed : Effect, optional    the effect in replicates from which the removal was not chosen
+
+    Returns
+    -------
+    str    a sentence
+    """
+    effect = _estimate_in_words(removal.estimate) if confirmed is None else distance_in_words(confirmed)
     if removal.replaced_share is not None:
         effect += f"; {100 * removal.replaced_share:.0f} % of its poses look like poses of clips that remain"
     return f"Without “{removal.name}” ({removal.seconds:.1f} s, used in {removal.trials} of {trials} trials), {effect}."
+
+
+def _estimate_in_words(effect: Effect) -> str:
+    """Describe an effect that was the reason for a choice, and is therefore probably too large."""
+    change = effect.headlines["offset_mean"]
+    return (
+        f"the mean distance from the path seems to change by {100 * change.change:+.2f} cm{_interval(change)}, which "
+        "was not confirmed in other replicates"
+    )
+
+
+def distance_in_words(effect: Effect) -> str:
+    """Describe a confirmed effect on the mean distance from the path.
+
+    Parameters
+    ----------
+    effect : Effect    the effect in replicates that had no part in the choice
+
+    Returns
+    -------
+    str    a part of a sentence
+    """
+    change = effect.headlines["offset_mean"]
+    if change.verdict == "same":
+        return "the mean distance from the path stays the same"
+    if change.verdict == "unclear":
+        return f"no effect on the mean distance from the path was found{_interval(change)}"
+    direction = "increases" if change.change > 0.0 else "decreases"
+    return f"the mean distance from the path {direction} by {100 * abs(change.change):.2f} cm{_interval(change)}"
+
+
+def _interval(change: MetricChange) -> str:
+    if change.low is None or change.high is None:
+        return ""
+    return f" (95 % interval of the change {100 * change.low:+.2f} to {100 * change.high:+.2f} cm)"
 
 
 def why_duplicate(source: str, pair: NearDuplicate, most_perceived: float | None = None) -> str:
@@ -119,10 +163,13 @@ def why_addition(addition: Addition) -> str:
     -------
     str    a sentence
     """
-    return (
+    gain = (
         f"“{addition.filling.name}” from {addition.filling.collection} then adds {addition.filled_s:.1f} s of the "
-        f"data that is still missing; {100 * addition.coverage_index:.0f} % of the grid are covered then."
+        f"data that is still missing; {100 * addition.coverage_index:.0f} % of the grid are covered then"
     )
+    if addition.confirmed is None:
+        return f"{gain}. Its effect on the trials was not simulated."
+    return f"{gain}, and {distance_in_words(addition.confirmed)}."
 
 
 def _cell_in_words(cell: FilledCell) -> str:

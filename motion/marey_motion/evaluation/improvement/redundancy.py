@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
+from marey_motion.evaluation.improvement.effects import Effect, effect_of
 from marey_motion.evaluation.improvement.lost_poses import LostPoses
-from marey_motion.evaluation.improvement.objective import headline_changes, headline_means, objective_value
+from marey_motion.evaluation.improvement.objective import headline_means
 from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation
 from marey_schemas.options.improvement import ObjectiveOptions
 
@@ -22,9 +22,9 @@ class Removal:
     ----------
     seconds : seconds of data saved
     trials : number of trials that need the clip; all other trials stay identical
-    changes : changes of the suite's headline metrics, after minus before
-    harm : change of the objective without its term for the amount of data, metres; negative if the removal helps. With
-        a perceptual metric, the price of the poses that the removal loses is added
+    estimate : effect on the trials in the replicates from which removals are chosen
+    harm : estimated change of the objective without its term for the amount of data, metres; negative if the removal
+        helps. With a perceptual metric, the price of the poses that the removal loses is added
     harm_per_s : `harm` per second of data saved; removals are ranked by this number, the least harmful first
     lost_s : seconds of poses, of this clip and of those removed before, that look like a pose of this clip, but of no
         clip that remains; None without a metric
@@ -35,7 +35,7 @@ class Removal:
     name: str
     seconds: float
     trials: int
-    changes: Mapping[str, float]
+    estimate: Effect
     harm: float
     harm_per_s: float
     lost_s: float | None = None
@@ -57,13 +57,15 @@ class PlannedRemoval:
     Parameters
     ----------
     removal : the removed source, and the effect of its removal compared with the state after the previous step
-    metrics : headline metrics of the suite after this step
+    metrics : headline metrics of the suite after this step, in the replicates of the estimate
     seconds_left : seconds of data that are left after this step
+    confirmed : the same effect in other replicates, corrected for the number of steps; None if it was not confirmed
     """
 
     removal: Removal
     metrics: Mapping[str, float]
     seconds_left: float
+    confirmed: Effect | None = None
 
 
 def leave_one_out(
@@ -92,25 +94,21 @@ def leave_one_out(
     tuple of Removal    one per source
     """
     gone = frozenset(removed)
-    outcomes = simulation.outcomes(gone)
-    whole = [outcome.result for outcome in outcomes]
-    before, value = headline_means(whole), objective_value(objective, whole, 0.0)
-    counts = Counter(source for outcome in outcomes for source in outcome.needed)
+    counts = simulation.trials_needing(gone)
     rarest = sorted(counts, key=lambda source: (counts[source], source))
     candidates = [source for source in rarest if simulation.leaves_rows(gone | {source})][:consider]
     found = []
     for done, source in enumerate(candidates):
-        results = simulation.results(gone | {source})
+        estimate = effect_of(simulation, objective, gone, gone | {source})
         seconds = simulation.seconds_of(source)
-        harm = objective_value(objective, results, 0.0) - value
-        changes = headline_changes(before, headline_means(results))
+        harm = estimate.objective.change
         name = name_of(simulation, source)
         lost = replaced = None
         if appearance is not None:
             lost = appearance.poses.seconds(gone | {source}) - appearance.poses.seconds(gone)
             replaced = appearance.poses.replaced_share(source, gone)
             harm += appearance.price_m_per_s * lost
-        found.append(Removal(source, name, seconds, counts[source], changes, harm, harm / seconds, lost, replaced))
+        found.append(Removal(source, name, seconds, counts[source], estimate, harm, harm / seconds, lost, replaced))
         if progress is not None:
             progress(done + 1, len(candidates), source)
     return tuple(sorted(found, key=lambda removal: (removal.harm_per_s, removal.source)))

@@ -1,5 +1,7 @@
 """A suite of trials over parts of one database, in which only affected trials are simulated again.
 
+Each trial can run in several replicates; every run is simulated again on its own.
+
 Clips are removed by making their rows unselectable. The trials are then the same as with a database without these
 clips, for three reasons:
 
@@ -16,6 +18,8 @@ after further removals, as long as all clips that the trial needs remain.
 
 from __future__ import annotations
 
+import os
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -24,12 +28,10 @@ from numpy.typing import NDArray
 
 from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
 from marey_motion.evaluation.looks import LooksMeter
-from marey_motion.evaluation.metrics import measure_trial
-from marey_motion.evaluation.replicates import guide_for
+from marey_motion.evaluation.replicates import TrialReplicate, guide_for, measure_run, run_of, simulate
 from marey_motion.evaluation.result import TrialResult
-from marey_motion.evaluation.running import CancelCallback
-from marey_motion.evaluation.scenario import Trial, reference, suite_trials
-from marey_motion.evaluation.suite import run_suite
+from marey_motion.evaluation.running import CancelCallback, ProgressCallback, run_each
+from marey_motion.evaluation.scenario import Trial, require_names, suite_trials
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.display import switched_rows
 from marey_motion.matching.record import TrialRecord
@@ -42,7 +44,7 @@ NONE: Sources = frozenset()
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a trial over some clips, and the source clips whose rows were displayed or chosen in the trial."""
+    """Result of a run of a trial over some clips, and the source clips whose rows it displayed or chose."""
 
     result: TrialResult
     needed: Sources
@@ -54,10 +56,13 @@ class Resimulation:
     Parameters
     ----------
     trials : the trials; all trials of the suite if None
-    records : records of these trials over the whole database, if they exist already
+    records : records of these trials over the whole database, if they exist already: those of replicate 0
+    replicates : numbers of the replicates in which each trial runs
+    seed : seed of the replicates; that of the options if None
     threads, cancelled : as in `suite.run_suite`
+    progress : called as progress(runs done, runs to do, name of the trial)
 
-    The attribute `simulated` is the number of trials that were run; `sources` maps the uid of each source clip to the
+    The attribute `simulated` is the number of runs that were made; `sources` maps the uid of each source clip to the
     indices of this clip and its mirrored copy.
     """
 
@@ -68,20 +73,29 @@ class Resimulation:
         *,
         trials: Sequence[Trial] | None = None,
         records: Sequence[TrialRecord] | None = None,
+        replicates: Sequence[int] = (0,),
+        seed: int | None = None,
         threads: int | None = None,
         cancelled: CancelCallback | None = None,
+        progress: ProgressCallback | None = None,
     ) -> None:
         self.database, self.options = database, options
         self.trials = suite_trials(options) if trials is None else tuple(trials)
+        require_names(self.trials)
         self.sources = clips_by_source(database.clips)
         self.simulated = 0
-        self._threads, self._cancelled = threads, cancelled
+        self._threads, self._cancelled = threads or os.cpu_count() or 1, cancelled or (lambda: False)
+        self._progress = progress or (lambda _done, _total, _note: None)
         self._source_of_clip = np.array([source_of(clip) for clip in database.clips], dtype=object)
         self.index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
         self._looks = LooksMeter(database, options.controller)
-        self._known: list[list[tuple[Sources, Outcome]]] = [[] for _ in self.trials]
-        if records is not None:
-            self._keep(NONE, range(len(self.trials)), records, self.index)
+        drawn = options if seed is None else options.replace(seed=seed)
+        self._runs = [run_of(trial, number, drawn) for number in replicates for trial in self.trials]
+        self._known: list[list[tuple[Sources, Outcome]]] = [[] for _ in self._runs]
+        known = {trial.name: record for trial, record in zip(self.trials, records or (), strict=False)}
+        for number, run in enumerate(self._runs):
+            if run.replicate == 0 and run.trial.name in known:
+                self._known[number].append((NONE, self._outcome(self.index, run, known[run.trial.name])))
 
     def outcomes(self, removed: Collection[str] = NONE) -> tuple[Outcome, ...]:
         """Simulate the trials without some source clips and their mirrored copies.
@@ -92,7 +106,7 @@ class Resimulation:
 
         Returns
         -------
-        tuple of Outcome    one per trial, in the order of the trials
+        tuple of Outcome    one per run: all trials of the first replicate, in their order, then all of the next
 
         Raises
         ------
@@ -101,22 +115,24 @@ class Resimulation:
         """
         gone = frozenset(removed)
         require_sources(self.sources, gone)
-        found = [self._find(number, gone) for number in range(len(self.trials))]
-        ahead = [number for number, outcome in enumerate(found) if outcome is None]
+        found = {number: self._find(number, gone) for number in range(len(self._runs))}
+        ahead = [number for number, outcome in found.items() if outcome is None]
         if ahead:
             index = self._index_without(gone)
-            records = run_suite(
-                self.database,
-                self.options,
-                trials=[self.trials[number] for number in ahead],
-                index=index,
-                threads=self._threads,
-                cancelled=self._cancelled,
-            )
-            self.simulated += len(ahead)
-            for number, outcome in zip(ahead, self._keep(gone, ahead, records, index), strict=True):
+
+            def run(number: int) -> Outcome:
+                one = self._runs[number]
+                return self._outcome(index, one, simulate(self.database, index, self.options, one))
+
+            def keep(number: int, outcome: Outcome) -> None:
                 found[number] = outcome
-        return tuple(outcome for outcome in found if outcome is not None)
+                self._known[number].append((gone, outcome))
+                self.simulated += 1
+                ended = sum(one is not None for one in found.values())
+                self._progress(ended, len(found), self._runs[number].trial.name)
+
+            run_each(run, ahead, keep, self._threads, self._cancelled)
+        return tuple(outcome for outcome in found.values() if outcome is not None)
 
     def results(self, removed: Collection[str] = NONE) -> tuple[TrialResult, ...]:
         """Simulate the trials without some source clips, and return the metrics of the trials.
@@ -127,9 +143,38 @@ class Resimulation:
 
         Returns
         -------
-        tuple of TrialResult    one per trial, in the order of the trials
+        tuple of TrialResult    one per run, in the order of `outcomes`
         """
         return tuple(outcome.result for outcome in self.outcomes(removed))
+
+    def by_replicate(self, removed: Collection[str] = NONE) -> list[tuple[TrialResult, ...]]:
+        """Simulate the trials without some source clips, and return the metrics of the trials in each replicate.
+
+        Parameters
+        ----------
+        removed : collection of str    uids of these clips
+
+        Returns
+        -------
+        list of tuple of TrialResult    for each replicate, one per trial
+        """
+        results, count = self.results(removed), len(self.trials)
+        return [results[first : first + count] for first in range(0, len(results), count)]
+
+    def trials_needing(self, removed: Collection[str] = NONE) -> Counter[str]:
+        """Count, for each source clip, the trials that need it in any replicate.
+
+        Parameters
+        ----------
+        removed : collection of str    uids of removed sources
+
+        Returns
+        -------
+        Counter    by uid; sources that no trial needs are missing
+        """
+        outcomes, count = self.outcomes(removed), len(self.trials)
+        needs = (NONE.union(*(one.needed for one in outcomes[number::count])) for number in range(count))
+        return Counter(source for own in needs for source in own)
 
     def needed(self, removed: Collection[str] = NONE) -> Sources:
         """Find the source clips that at least one trial needs.
@@ -203,22 +248,13 @@ class Resimulation:
         method: Method = "boxes" if self.index.boxed else "scan"
         return build_index(self.index.rows, self.database.starts, selectable, method=method)
 
-    def _keep(
-        self, gone: Sources, numbers: Sequence[int], records: Sequence[TrialRecord], index: SearchIndex
-    ) -> list[Outcome]:
-        outcomes = []
-        for number, record in zip(numbers, records, strict=True):
-            trial = self.trials[number]
-            asked = reference(trial, self.database.options.rate_hz)
-            rows = needed_rows(self.database, index, trial, record, self.options)
-            clips = np.unique(self.database.clip_of_row[rows])
-            outcome = Outcome(
-                measure_trial(trial, asked, record, self.options, self._looks),
-                frozenset(self._source_of_clip[clips].tolist()),
-            )
-            self._known[number].append((gone, outcome))
-            outcomes.append(outcome)
-        return outcomes
+    def _outcome(self, index: SearchIndex, run: TrialReplicate, record: TrialRecord) -> Outcome:
+        rows = needed_rows(self.database, index, run.driven, record, self.options)
+        clips = np.unique(self.database.clip_of_row[rows])
+        return Outcome(
+            measure_run(self.database, self.options, self._looks, run, record),
+            frozenset(self._source_of_clip[clips].tolist()),
+        )
 
 
 def needed_rows(

@@ -95,6 +95,73 @@ def _by_row(database: MatchingDatabase) -> dict[str, Any]:
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
+def without_sources(database: MatchingDatabase, sources: Collection[str]) -> MatchingDatabase:
+    """Return a database without the clips of some sources.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    sources : collection of str    uids
+
+    Returns
+    -------
+    MatchingDatabase    the other clips, with the same features and normaliser
+
+    Raises
+    ------
+    MotionError    if a source is unknown, or no clip is left
+    """
+    removed = rows_of_sources(database.clips, sources)
+    return _gathered(database, [clip for clip in database.clips if not removed[clip.start]], ~removed)
+
+
+def without_rows(database: MatchingDatabase, removed: Flags) -> MatchingDatabase:
+    """Return a database without some rows; the remaining parts of a clip become clips.
+
+    The uid of a part of a clip contains the uid of the clip and the frames, such as "walk#120-480". Searches cannot
+    choose the last row of a part, since no row follows.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    N rows
+    removed : (N,) bool    True for rows to leave out
+
+    Returns
+    -------
+    MatchingDatabase    the other rows, with the same features and normaliser
+
+    Raises
+    ------
+    MotionError    if no clip is left
+    """
+    selectable = database.selectable.copy()
+    pieces = []
+    for clip in database.clips:
+        kept = np.flatnonzero(~removed[clip.start : clip.stop])
+        if len(kept) == clip.frame_count:
+            pieces.append(clip)
+            continue
+        for run in np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1) if len(kept) else ():
+            first, stop = int(run[0]), int(run[-1]) + 1
+            name = f"#{first}-{stop}"
+            piece = replace(clip, start=clip.start + first, stop=clip.start + stop, loop=False)
+            pieces.append(replace(piece, uid=clip.uid + name, name=clip.name + name))
+            selectable[clip.start + stop - 1] = False
+    return _gathered(replace(database, selectable=selectable), pieces, ~removed)
+
+
+def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: Flags) -> MatchingDatabase:
+    """Return a database with only `clips`; `kept` (N,) marks the rows of these clips in the given database."""
+    if not clips:
+        raise MotionError("no clip is left", code="no-clips")
+    before = np.concatenate(([0], np.cumsum(kept)))
+    return replace(
+        database,
+        clips=tuple(replace(clip, start=int(before[clip.start]), stop=int(before[clip.stop])) for clip in clips),
+        **{name: rows[kept] for name, rows in _by_row(database).items()},
+    )
+
+
 def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabase:
     """Join two databases with the same skeleton and options; the result has the normaliser of the first database.
 

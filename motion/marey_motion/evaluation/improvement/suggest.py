@@ -1,6 +1,7 @@
 """Suggestions after an evaluation: unused and redundant clips, duplicates, and clips that fill holes.
 
-Each suggestion is a proposal with its predicted effect; the set of clips is not changed.
+Each suggestion is a proposal; the set of clips is not changed. Effects on the trials are estimated in some replicates,
+to choose what to propose, and confirmed in others (`confirming`).
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from typing import Any
 import numpy as np
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.confirming import Confirmed, confirm
 from marey_motion.evaluation.improvement.duplicates import (
     NearDuplicate,
     NearDuplicates,
     find_near_duplicates,
     spared_sources,
 )
+from marey_motion.evaluation.improvement.effects import estimation_replicates
 from marey_motion.evaluation.improvement.filling import Addition, Filling, plan_fillings, rank_fillings
 from marey_motion.evaluation.improvement.lost_poses import LostPoses
 from marey_motion.evaluation.improvement.redundancy import (
@@ -56,7 +59,8 @@ class Suggestions:
     ----------
     unused : data whose removal changes no trial
     redundant : all clips that were tried, ranked by the harm of their removal per second saved
-    plan : a sequence of removals from the set without its unused clips
+    plan : a sequence of removals from the set without its unused clips, with confirmed effects
+    confirmed : effects that were measured in replicates without a part in the choice
     spared : near-duplicates to remove, each with the pair to which it belongs; the other clip of the pair stays
     fillings, additions : clips of other collections that fill holes. In `fillings`, each is measured alone; `additions`
         is a sequence in which each is measured after all earlier clips were added
@@ -76,6 +80,7 @@ class Suggestions:
     additions: tuple[Addition, ...]
     tried: tuple[int, int]
     metric: MetricDocument | None = None
+    confirmed: Confirmed | None = None
 
 
 def suggest(
@@ -115,19 +120,13 @@ def suggest(
     """
     how, others = options or SuggestionOptions(), dict(collections or {})
     _require_same(database, result)
-    trials, records = [trial.trial for trial in result.trials], result.records
-    stages = _Stages(progress, cancelled)
-    simulation = Resimulation(
-        database, result.options, trials=trials, records=records, threads=threads, cancelled=cancelled
-    )
+    stages = _SuggestionStages(progress, cancelled)
+    simulation = _simulation(database, result, how, threads, cancelled)
     seen = None if metric is None else PerceivedRows(database, metric)
-    # The records are those of the first replicates only; the usage is that of all.
-    shown = np.concatenate([use.popularity > 0 for use in result.usage])
-    unused = find_unused(database, trials, records, result.options, index=simulation.index, shown=shown)
+    unused = _unused(simulation, result)
     duplicates = find_near_duplicates(
         database, threshold_cm=how.duplicate_cm, seen=seen, threads=threads, **stages.watch("duplicates")
     )
-    ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
     threshold = _threshold(how, result, seen)
     similarity = measure_similarity(database, result.coverage, threshold, seen=seen, **stages.watch("similarity"))
     fillings = rank_fillings(
@@ -136,6 +135,12 @@ def suggest(
     gone = frozenset(clip.source for clip in unused.clips)
     appearance = _appearance(database, how, seen, threshold, stages)
     redundant, plan = _redundancy(simulation, how, gone, appearance, stages)
+    additions = plan_fillings(fillings, result.coverage, others, result.options)
+    confirmed = confirm(
+        database, result, how, unused, plan, additions, others, threads=threads, **stages.watch("confirming")
+    )
+    if confirmed is not None:
+        plan, additions = confirmed.plan, confirmed.additions
     return Suggestions(
         result=result,
         options=how,
@@ -143,15 +148,55 @@ def suggest(
         redundant=redundant,
         plan=plan,
         duplicates=duplicates,
-        spared=spared_sources(
-            database, duplicates, ticks, most_perceived=np.inf if metric is None else indistinguishable(metric)
-        ),
+        spared=_spared(database, result, duplicates, metric),
         metric=metric,
         similarity=similarity,
         fillings=fillings,
-        additions=plan_fillings(fillings, result.coverage, others, result.options),
+        additions=additions,
         tried=(len(redundant), len(simulation.needed(gone))),
+        confirmed=confirmed,
     )
+
+
+def _simulation(
+    database: MatchingDatabase,
+    result: EvaluationResult,
+    how: SuggestionOptions,
+    threads: int | None,
+    cancelled: CancelCallback | None,
+) -> Resimulation:
+    """Return a simulation of the replicates in which effects are estimated; it knows the records of the evaluation."""
+    return Resimulation(
+        database,
+        result.options,
+        trials=[trial.trial for trial in result.trials],
+        records=result.records,
+        replicates=estimation_replicates(how),
+        threads=threads,
+        cancelled=cancelled,
+    )
+
+
+def _unused(simulation: Resimulation, result: EvaluationResult) -> Unused:
+    """Find what no trial needs. Records are those of the first replicates only; the usage is that of all."""
+    shown = np.concatenate([use.popularity > 0 for use in result.usage])
+    return find_unused(
+        simulation.database,
+        simulation.trials,
+        result.records,
+        result.options,
+        index=simulation.index,
+        shown=shown,
+    )
+
+
+def _spared(
+    database: MatchingDatabase, result: EvaluationResult, duplicates: NearDuplicates, metric: MetricDocument | None
+) -> tuple[tuple[str, NearDuplicate], ...]:
+    """Choose the clip of each pair of near-duplicates that may be removed, by its use."""
+    ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
+    most = np.inf if metric is None else indistinguishable(metric)
+    return spared_sources(database, duplicates, ticks, most_perceived=most)
 
 
 def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: PerceivedRows | None) -> float:
@@ -162,7 +207,11 @@ def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: Perceived
 
 
 def _appearance(
-    database: MatchingDatabase, how: SuggestionOptions, seen: PerceivedRows | None, threshold: float, stages: _Stages
+    database: MatchingDatabase,
+    how: SuggestionOptions,
+    seen: PerceivedRows | None,
+    threshold: float,
+    stages: _SuggestionStages,
 ) -> Appearance | None:
     """Compare the poses of all clips by the metric, if one was chosen."""
     if seen is None:
@@ -175,7 +224,7 @@ def _redundancy(
     how: SuggestionOptions,
     gone: frozenset[str],
     appearance: Appearance | None,
-    stages: _Stages,
+    stages: _SuggestionStages,
 ) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
     """Rank the clips by the harm of their removal, and plan several removals.
 
@@ -214,10 +263,10 @@ def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
         )
 
 
-class _Stages:
+class _SuggestionStages:
     """Progress over several stages as one count, with a thousand units for each stage."""
 
-    NAMES = ("duplicates", "similarity", "filling", "lost poses", "leaving out", "planning")
+    NAMES = ("duplicates", "similarity", "filling", "lost poses", "leaving out", "planning", "confirming")
 
     def __init__(self, progress: ProgressCallback | None, cancelled: CancelCallback | None) -> None:
         self._tell = progress or (lambda _done, _total, _note: None)

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from marey_motion.evaluation.compare import Comparison
+from marey_motion.evaluation.compare import Comparison, MetricChange
 from marey_motion.evaluation.improvement import reasons
+from marey_motion.evaluation.improvement.confirming import Confirmed
 from marey_motion.evaluation.improvement.duplicates import NearDuplicate
+from marey_motion.evaluation.improvement.effects import Effect
 from marey_motion.evaluation.improvement.optimise import Optimisation
 from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.suggest import Suggestions
@@ -41,7 +43,7 @@ def comparison_to_tree(comparison: Comparison) -> Tree:
         "schema": COMPARISON_SCHEMA,
         **{name: {"dataset": side.provenance.dataset, "clips": len(side.clips)} for name, side in sides.items()},
         "trials": len(comparison.before.trials),
-        "metrics": [{**asdict(change), "verdict": change.verdict} for change in comparison.metrics],
+        "metrics": _plain(comparison.metrics),
         "changed": [asdict(change) for change in comparison.changed],
         "removed": list(comparison.removed),
         "added": list(comparison.added),
@@ -68,7 +70,9 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
         "dataset": found.result.provenance.dataset,
         "normaliser": found.result.provenance.normaliser,
         "options": found.options.model_dump(),
+        "chance": {} if found.confirmed is None else dict(found.confirmed.chance),
         "unused": {
+            **_unused_effects(found.confirmed),
             "clips": [{**asdict(clip), "reason": reasons.why_unused_clip(clip)} for clip in found.unused.clips],
             "ranges": [
                 {**asdict(part), "seconds": part.seconds, "reason": reasons.why_unused_range(part)}
@@ -86,10 +90,24 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
                 "source": step.filling.source,
                 "filled_s": step.filled_s,
                 "coverage_index": step.coverage_index,
+                "confirmed": _plain(step.confirmed),
                 "reason": reasons.why_addition(step),
             }
             for step in found.additions
         ],
+    }
+
+
+def _unused_effects(confirmed: Confirmed | None) -> Tree:
+    """Describe what the removal of unused clips, and of unused ranges as well, does in other replicates."""
+    effects = (
+        {"clips": None, "ranges": None}
+        if confirmed is None
+        else {"clips": confirmed.unused, "ranges": confirmed.ranges}
+    )
+    return {
+        f"confirmed_{name}": None if effect is None else {**_plain(effect), "reason": reasons.why_unused_again(effect)}
+        for name, effect in effects.items()
     }
 
 
@@ -128,15 +146,15 @@ def _identity_to_tree(metric: MetricDocument | None) -> Tree:
 def _redundant_to_tree(suggestions: Suggestions) -> Tree:
     trials = len(suggestions.result.trials)
 
-    def told(removal: Removal) -> Tree:
-        return {"reason": reasons.why_redundant(removal, trials)}
+    def told(removal: Removal, confirmed: Effect | None = None) -> Tree:
+        return {"reason": reasons.why_redundant(removal, trials, confirmed)}
 
     return {
         "tried": suggestions.tried[0],
         "needed": suggestions.tried[1],
         "clips": [{**_removal_to_tree(removal), **told(removal)} for removal in suggestions.redundant],
         "plan": [
-            {**_plain(step), "removal": _removal_to_tree(step.removal), **told(step.removal)}
+            {**_plain(step), "removal": _removal_to_tree(step.removal), **told(step.removal, step.confirmed)}
             for step in suggestions.plan
         ],
         **_identity_to_tree(suggestions.metric),
@@ -179,11 +197,15 @@ def optimisation_to_tree(optimisation: Optimisation) -> Tree:
         "schema": OPTIMISATION_SCHEMA,
         "ended": optimisation.ended,
         "steps": [_plain(step) for step in optimisation.steps],
+        "unconfirmed": [_plain(one) for one in optimisation.unconfirmed],
+        "total": _plain(optimisation.total),
     }
 
 
 def _plain(value: Any) -> Any:
-    """Convert dataclasses to dictionaries, and tuples to lists."""
+    """Convert dataclasses to dictionaries, and tuples to lists; a change of a metric also gets its verdict."""
+    if isinstance(value, MetricChange):
+        return {**asdict(value), "verdict": value.verdict}
     if hasattr(value, "__dataclass_fields__"):
         return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):

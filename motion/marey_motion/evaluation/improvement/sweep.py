@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.compare import OBJECTIVE, MetricChange, corrected_family, paired_change
+from marey_motion.evaluation.improvement.effects import confirmation_replicates, estimation_replicates
 from marey_motion.evaluation.improvement.objective import headline_means, objective_value
-from marey_motion.evaluation.looks import LooksMeter
-from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
+from marey_motion.evaluation.improvement.resimulation import Resimulation
+from marey_motion.evaluation.metrics import pooled_metrics
 from marey_motion.evaluation.result import Metrics
 from marey_motion.evaluation.running import CancelCallback
-from marey_motion.evaluation.scenario import Trial, reference, suite_trials
-from marey_motion.evaluation.suite import run_suite
+from marey_motion.evaluation.scenario import Trial, suite_trials
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.features import feature_layout
 from marey_motion.matching.normaliser import UNMATCHED_SCALE
 from marey_schemas.options.evaluation import EvaluationOptions
-from marey_schemas.options.improvement import ObjectiveOptions
+from marey_schemas.options.improvement import SweepOptions
 from marey_schemas.options.matching import DatabaseOptions, FeatureWeights
 
 ProgressCallback = Callable[[int, int, str], None]
@@ -29,12 +31,17 @@ GROUPS = tuple(FeatureWeights.model_fields)
 
 @dataclass(frozen=True)
 class SweepRow:
-    """Result of one setting: weights, pooled metrics and headline metrics of the suite, and the objective in metres."""
+    """Result of one setting: weights, pooled metrics and headline metrics of the suite, and the objective in metres.
+
+    `confirming` contains the objective in each of the replicates in which a choice of weights is confirmed; all other
+    members belong to the replicates of the estimate.
+    """
 
     weights: FeatureWeights
     metrics: Metrics
     headlines: dict[str, float]
     objective: float
+    confirming: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -45,13 +52,17 @@ class Influence:
     ----------
     spread : largest minus least objective, metres
     best_weight : weight with the least objective
-    gain : decrease of the objective from the first setting to the best, metres
+    gain : decrease of the objective from the first setting to the best, metres; estimated in the replicates from which
+        the best was chosen
+    confirmed : change of the objective from the first setting to the best in other replicates, corrected for the number
+        of groups; None if no setting is better than the first, or if there are no other replicates
     """
 
     group: str
     spread: float
     best_weight: float
     gain: float
+    confirmed: MetricChange | None = None
 
 
 def vary_each_group(options: DatabaseOptions, factors: Sequence[float]) -> tuple[FeatureWeights, ...]:
@@ -83,7 +94,7 @@ def sweep_weights(
     options: EvaluationOptions,
     settings: Sequence[FeatureWeights],
     *,
-    objective: ObjectiveOptions | None = None,
+    how: SweepOptions,
     trials: Sequence[Trial] | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
@@ -91,14 +102,14 @@ def sweep_weights(
 ) -> tuple[SweepRow, ...]:
     """Run the suite with each setting of the weights; the features and their standard deviations stay the same.
 
-    Progress counts trials over all settings.
+    Progress counts runs of trials over all settings.
 
     Parameters
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     settings : sequence of FeatureWeights    weights to try
-    objective : ObjectiveOptions, optional    measure of the result; its default weights if None
+    how : SweepOptions    measure of the result, and replicates
     trials : sequence of Trial, optional    trials to run; all trials of the suite if None
     threads : int, optional    number of trials to run at once
     progress : callable, optional    called as progress(done, total, name)
@@ -114,26 +125,30 @@ def sweep_weights(
     EvaluationCancelled    if cancelled
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
-    aim = objective or ObjectiveOptions()
-    report = progress or (lambda _done, _total, _note: None)
-    looks = LooksMeter(database, options.controller)
+    parts = (estimation_replicates(how), None), (confirmation_replicates(how), how.confirmation_seed)
+    runs = len(settings) * len(wanted) * sum(len(numbers) for numbers, _ in parts)
+    ended, report = count(1), progress or (lambda _done, _total, _note: None)
     rows = []
-    for number, weights in enumerate(settings):
+    for weights in settings:
         weighted = reweighted(database, weights)
-
-        def told(done: int, _total: int, note: str, before: int = number * len(wanted)) -> None:
-            report(before + done, len(settings) * len(wanted), note)
-
-        records = run_suite(weighted, options, trials=wanted, threads=threads, progress=told, cancelled=cancelled)
-        rate = database.options.rate_hz
-        results = [
-            measure_trial(trial, reference(trial, rate), record, options, looks)
-            for trial, record in zip(wanted, records, strict=True)
-        ]
-        # The price of data is the same for all settings, and left out.
-        rows.append(
-            SweepRow(weights, pooled_metrics(results), headline_means(results), objective_value(aim, results, 0.0))
+        estimating, confirming = (
+            Resimulation(
+                weighted,
+                options,
+                trials=wanted,
+                replicates=numbers,
+                seed=seed,
+                threads=threads,
+                progress=lambda _done, _total, note: report(next(ended), runs, note),
+                cancelled=cancelled,
+            ).by_replicate()
+            for numbers, seed in parts
         )
+        results = [one for replicate in estimating for one in replicate]
+        # The price of data is the same for all settings, and left out.
+        value = objective_value(how.objective, results, 0.0)
+        again = tuple(objective_value(how.objective, one, 0.0) for one in confirming)
+        rows.append(SweepRow(weights, pooled_metrics(results), headline_means(results), value, again))
     return tuple(rows)
 
 
@@ -194,6 +209,15 @@ def group_influences(rows: Sequence[SweepRow]) -> tuple[Influence, ...]:
                     spread=float(values.max() - values.min()),
                     best_weight=getattr(best.weights, group),
                     gain=rows[0].objective - best.objective,
+                    confirmed=_confirmed(rows[0], best),
                 )
             )
+    told = iter(corrected_family([one.confirmed for one in found if one.confirmed is not None]))
+    found = [one if one.confirmed is None else replace(one, confirmed=next(told)) for one in found]
     return tuple(sorted(found, key=lambda influence: (-influence.spread, influence.group)))
+
+
+def _confirmed(first: SweepRow, best: SweepRow) -> MetricChange | None:
+    if best is first or not best.confirming:
+        return None
+    return paired_change(OBJECTIVE, np.array([first.confirming]), np.array([best.confirming]))

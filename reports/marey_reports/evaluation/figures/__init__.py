@@ -28,6 +28,7 @@ __all__ = [
     "COVERAGE_FIGURES",
     "FIGURES",
     "SCENARIO_FIGURES",
+    "SHARED_FIGURES",
     "TRIAL_FIGURES",
     "USE_FIGURES",
     "DrawnFigure",
@@ -35,6 +36,7 @@ __all__ = [
     "FigureOptions",
     "draw_figure",
     "draw_figures",
+    "draw_shared_figures",
 ]
 
 
@@ -77,6 +79,8 @@ SCENARIO_FIGURES = ("scenario-circle", "scenario-switching")
 TRIAL_FIGURES = ("transition-cost", "errors")
 USE_FIGURES = ("usage", "frame-use", "clip-graph")
 """Figures that a chapter shows together, in a report of one evaluation or of two."""
+SHARED_FIGURES = ("offsets", "density")
+"""Figures that can show more than two results, as small multiples on one scale."""
 
 
 def draw_figure(
@@ -133,4 +137,20 @@ def draw_figures(
         name: draw_figure(name, result, other=other, labels=labels, options=options)
         for name, kind in FIGURES.items()
         if kind.trials != "one" or (with_records and families.intersection(kind.families))
+    }
+
+
+def draw_shared_figures(results: Sequence[EvaluationResult], labels: Sequence[str]) -> dict[str, DrawnFigure]:
+    """Draw the figures that can show many results, on shared scales; return them by name.
+
+    Parameters
+    ----------
+    results : at least two results with the same grid of trials
+    labels : their names
+    """
+    subjects = [Subject(label, result) for label, result in zip(labels, results, strict=True)]
+    return {
+        name: DrawnFigure(kind.draw(subjects, None, FigureOptions()), name, kind.number, kind.title)
+        for name in SHARED_FIGURES
+        for kind in (FIGURES[name],)
     }

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 SPEED = "speed (m/s)"
 TURN_RATE = "turn rate (deg/s, left positive)"
+COLUMNS = 4
+"""Greatest number of small multiples side by side."""
 
 
 def mark_sides(axes: Axes) -> None:

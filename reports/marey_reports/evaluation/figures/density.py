@@ -22,7 +22,7 @@ from marey_reports.drawing.paper import (
     square_root_ticks,
     write,
 )
-from marey_reports.evaluation.figures.axes import SPEED, TURN_RATE
+from marey_reports.evaluation.figures.axes import COLUMNS, SPEED, TURN_RATE
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 
 if TYPE_CHECKING:
@@ -89,6 +89,9 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
     edges = _edges(subjects, plane)
     cell = plane.cell(subjects[0].result.coverage)
     maps = [_seconds(subject, plane, edges, cell) for subject in subjects]
+    if len(subjects) > 2:
+        figure = _draw_many(subjects, plane, edges, maps)
+        return Sketch(figure, {"density": _table(subjects, plane, edges, maps)}, _caption(subjects, plane))
     two = len(subjects) > 1
     width, height, gap = (2.62, 2.7, 0.3) if two else (5.9, 3.9, 0.3)
     figure = new_figure(9.6 if two else 7.6, height + (1.75 if two else 0.75))
@@ -97,16 +100,7 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
     for number, (subject, each) in enumerate(zip(subjects, maps, strict=True)):
         place = Place(0.68 + number * (width + gap), bottom, width, height)
         x, y = plane.labels
-        panel = add_panel(figure, place, title=subject.label, x=x, y=y if number == 0 else "", grid=False)
-        panel.tick_params(labelleft=number == 0)
-        drawn = panel.pcolormesh(
-            *edges, each, cmap=MORE_IS_DENSER, norm=_norm(ceiling), rasterized=True, shading="flat"
-        )
-        _frame(panel, subject.result.coverage, plane)
-        if not each.any():
-            write(
-                panel, (0.5, 0.5), "no clip of one second or more", transform=panel.transAxes, ha="center", color=LIGHT
-            )
+        drawn = _draw_map(figure, place, subject, plane, edges, each, ceiling, (x, y if number == 0 else ""))
     if two:
         add_colour_bar(
             figure, drawn, Place(0.68, 0.52, 2 * width + gap, 0.12), plane.cell_label, square_root_ticks(ceiling)
@@ -121,6 +115,45 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
             square_root_ticks(ceiling),
         )
     return Sketch(figure, {"density": _table(subjects, plane, edges, maps)}, _caption(subjects, plane))
+
+
+def _draw_many(
+    subjects: Sequence[Subject], plane: _Plane, edges: tuple[Floats, Floats], maps: Sequence[Floats]
+) -> Figure:
+    """Draw small multiples on one scale, up to `COLUMNS` side by side."""
+    width, height, gap, beneath = 1.96, 2.0, 0.26, 0.85
+    bands = -(-len(subjects) // COLUMNS)
+    figure = new_figure(9.6, bands * (height + beneath) + 0.95)
+    ceiling = nice_ceiling(max(float(each.max()) for each in maps))
+    for number, (subject, each) in enumerate(zip(subjects, maps, strict=True)):
+        band, column = divmod(number, COLUMNS)
+        place = Place(0.68 + column * (width + gap), 1.3 + (bands - 1 - band) * (height + beneath), width, height)
+        x, y = plane.labels
+        drawn = _draw_map(figure, place, subject, plane, edges, each, ceiling, (x, y if column == 0 else ""))
+    across = COLUMNS * width + (COLUMNS - 1) * gap
+    add_colour_bar(figure, drawn, Place(0.68, 0.52, across, 0.12), plane.cell_label, square_root_ticks(ceiling))
+    return figure
+
+
+def _draw_map(
+    figure: Figure,
+    place: Place,
+    subject: Subject,
+    plane: _Plane,
+    edges: tuple[Floats, Floats],
+    seconds: Floats,
+    ceiling: float,
+    labels: tuple[str, str],
+) -> Any:
+    """Draw one map; return what the colour bar describes."""
+    x, y = labels
+    panel = add_panel(figure, place, title=subject.label, x=x, y=y, grid=False)
+    panel.tick_params(labelleft=bool(y))
+    drawn = panel.pcolormesh(*edges, seconds, cmap=MORE_IS_DENSER, norm=_norm(ceiling), rasterized=True, shading="flat")
+    _frame(panel, subject.result.coverage, plane)
+    if not seconds.any():
+        write(panel, (0.5, 0.5), "no clip of one second or more", transform=panel.transAxes, ha="center", color=LIGHT)
+    return drawn
 
 
 def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:

@@ -23,7 +23,7 @@ from marey_reports.drawing.paper import (
     nice_levels,
     write,
 )
-from marey_reports.evaluation.figures.axes import SPEED, TURN_RATE
+from marey_reports.evaluation.figures.axes import COLUMNS, SPEED, TURN_RATE
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 
 if TYPE_CHECKING:
@@ -43,14 +43,19 @@ class _Field(NamedTuple):
 
 
 def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
-    """Draw the mean offsets: a row per family of trials, a column per subject; two subjects get a column of changes."""
+    """Draw the mean offsets: a row per family of trials, a column per subject; two subjects get a column of changes.
+
+    More than two subjects share one scale, up to `COLUMNS` side by side.
+    """
     families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
     fields = [[_field(subject, family) for subject in subjects] for family in families]
     levels = nice_levels(max(_largest(field) for row in fields for field in row))
     if len(subjects) == 1:
         figure = _draw_one(families, [row[0] for row in fields], levels)
-    else:
+    elif len(subjects) == 2:
         figure = _draw_two(subjects, families, fields, levels)
+    else:
+        figure = _draw_many(subjects, families, fields, levels)
     return Sketch(figure, {"offsets": _table(subjects, families, fields)}, _caption(subjects, families, fields))
 
 
@@ -118,6 +123,33 @@ def _draw_two(
             "change of the mean offset (m); blue: better",
             np.concatenate((-upward[:0:-1], upward))[:: max(1, (len(upward) - 1) // 2)],
         )
+    return figure
+
+
+def _draw_many(
+    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], levels: Floats
+) -> Figure:
+    """Draw small multiples: below each other, a band of up to `COLUMNS` subjects for each family."""
+    width, height, gap, beneath = 1.96, 1.8, 0.26, 0.85
+    bands = [
+        (family, row, range(first, min(first + COLUMNS, len(subjects))))
+        for first in range(0, len(subjects), COLUMNS)
+        for family, row in zip(families, fields, strict=True)
+    ]
+    figure = new_figure(9.6, len(bands) * (height + beneath) + 0.95)
+    shared = None
+    for number, (family, row, columns) in enumerate(bands):
+        bottom = 1.3 + (len(bands) - 1 - number) * (height + beneath)
+        for column, subject in enumerate(columns):
+            place = Place(0.85 + column * (width + gap), bottom, width, height)
+            labels = {"x": TURN_RATE, "y": f"{FAMILY_TITLES[family]}\n{SPEED}" if column == 0 else ""}
+            shared = (
+                _draw_field(figure, place, row[subject], subjects[subject].label, labels, levels, MORE_IS_WORSE)
+                or shared
+            )
+    if shared is not None:
+        across = COLUMNS * width + (COLUMNS - 1) * gap
+        add_colour_bar(figure, shared, Place(0.85, 0.52, across, 0.12), "mean offset (m)", levels)
     return figure
 
 

@@ -1,0 +1,142 @@
+"""Command `compare`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.evaluations import evaluation_at, perceived_text
+from marey_client.cli.improvements import SHOWN, Evaluation, found_by, print_found
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.following import FINDINGS_JOB, Wait
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_message, print_table
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
+from marey_schemas.documents.evaluations import MOST_COMPARED
+from marey_schemas.wording import counted
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+COMPARE = OptionsOf("marey_schemas.queue.job_params:CompareParams")
+PRINTED_METRICS = (
+    ("offset_mean", "offset m"),
+    ("abs_se_v", "speed error m/s"),
+    ("abs_se_omega_deg", "turn error degrees/s"),
+    ("pose_cost_mean", "pose cost m"),
+    ("transitions_per_s", "switches 1/s"),
+)
+"""Metrics in the printed tables; --json and the report contain all metrics."""
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the command of this module."""
+    add_command(app, compare, params=COMPARE, job=FINDINGS_JOB)
+
+
+def compare(
+    context: typer.Context,
+    before: Evaluation,
+    others: Annotated[
+        list[str],
+        typer.Argument(
+            help=f"The evaluation after the change, or up to {MOST_COMPARED - 1} evaluations of other sets of clips, "
+            "with the same trials. Create them with `marey evaluate --normaliser BEFORE`."
+        ),
+    ],
+    params: Chosen,
+    job: Chosen,
+    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
+    wait: Wait = True,
+    as_json: AsJson = False,
+) -> None:
+    """Show what changed between two evaluations, trial by trial, or compare several sets of clips with the first."""
+    if out is not None and not wait:
+        raise WrongUsage(
+            "--out writes the result of the job, but --no-wait does not wait for the result; leave out one of "
+            "the two options"
+        )
+    if len(others) >= MOST_COMPARED:
+        raise WrongUsage(f"{1 + len(others)} evaluations cannot be compared at once; choose up to {MOST_COMPARED}")
+    with connect(context) as marey:
+        first, *rest = (evaluation_at(marey, place) for place in (before, *others))
+        if any(one.project != first.project for one in rest):
+            raise WrongUsage("all evaluations must be in one project")
+        found = found_by(marey, first, first.compare_request(*rest, **params), job, wait, as_json)
+        if found is None:
+            return
+        document = found.document()
+        if out is not None:
+            found.save_report(out)
+    print_found(found, document, as_json, _print_several if len(others) > 1 else _print_comparison)
+    if out is not None and not as_json:
+        print_message(f"report: {out}")
+
+
+def _print_several(document: Mapping[str, Any]) -> None:
+    """Print the metrics of several evaluations beside each other, with the verdict on each change from the first."""
+    documents = (document, *document["others"])
+    found = [{one["metric"]: one for one in each["metrics"]} for each in documents]
+    rows = []
+    for name, label in PRINTED_METRICS:
+        if all(name in each for each in found):
+            row = [label, f"{found[0][name]['before']:.4f}"]
+            for each in found:
+                row += [f"{each[name]['after']:.4f}", each[name]["verdict"]]
+            rows.append(row)
+    names = [each["names"]["after"] for each in documents]
+    columns = ["metric", document["names"]["before"]]
+    for name in names:
+        columns += [name, ""]
+    print_table(columns, rows, right=[columns[1], *names])
+    typer.echo(f"Each verdict is that of the change from {document['names']['before']}; --out writes a report.")
+
+
+def _print_comparison(document: Mapping[str, Any]) -> None:
+    changed = document["changed"]
+    moved = [one for one in changed if not one["same_motion"]]
+    if not changed:
+        typer.echo(f"No trial changed: the results of all {document['trials']} trials are identical, bit for bit.")
+    elif not moved:
+        typer.echo(
+            f"The character moves in the same way in every trial; {len(changed)} of {document['trials']} trials use "
+            "other clips."
+        )
+    else:
+        typer.echo(f"{len(moved)} of {document['trials']} trials changed.")
+    metrics = {one["metric"]: one for one in document["metrics"]}
+    rows = [
+        (label, f"{one['before']:.4f}", f"{one['after']:.4f}", f"{one['change']:+.4f}",
+         "" if one["low"] is None else f"{one['low']:+.4f} to {one['high']:+.4f}", one["verdict"])
+        for name, label in PRINTED_METRICS if (one := metrics.get(name)) is not None
+    ]  # fmt: skip
+    columns = ("metric", "before", "after", "change", "95 % interval", "verdict")
+    print_table(columns, rows, right=columns[1:5])
+    _print_perceived(document)
+    if moved:
+        worst = sorted(moved, key=lambda one: -_rise(one))[:SHOWN]
+        rows_of_trials = [
+            (one["trial"], _metres(one["offset_mean_before"]), _metres(one["offset_mean_after"])) for one in worst
+        ]
+        columns_of_trials = ("changed trials, the worst first", "offset before m", "after m")
+        print_table(columns_of_trials, rows_of_trials, right=columns_of_trials[1:])
+    for name, label in (("removed", "removed"), ("added", "added"), ("newly_unused", "newly unused")):
+        if document[name]:
+            typer.echo(f"{label}: {counted(len(document[name]), 'clip')}")
+
+
+def _print_perceived(document: Mapping[str, Any]) -> None:
+    """Print the perceptual distances of transitions, if an evaluation has them."""
+    for name in ("before", "after"):
+        if (perceived := document.get(f"perceived_{name}")) is not None:
+            typer.echo(f"{name}: {perceived_text(perceived)}")
+
+
+def _rise(one: Mapping[str, Any]) -> float:
+    return float((one["offset_mean_after"] or 0.0) - (one["offset_mean_before"] or 0.0))
+
+
+def _metres(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"

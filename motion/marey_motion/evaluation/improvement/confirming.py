@@ -1,0 +1,187 @@
+"""Confirmation of suggestions: their effects are measured in replicates that had no part in choosing them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TypeVar
+
+from marey_motion.evaluation.improvement.effects import (
+    Effect,
+    chance_of,
+    confirmation_replicates,
+    corrected_effects,
+    effect_between,
+    effect_of,
+)
+from marey_motion.evaluation.improvement.filling import Addition
+from marey_motion.evaluation.improvement.redundancy import PlannedRemoval
+from marey_motion.evaluation.improvement.resimulation import Resimulation, Sources
+from marey_motion.evaluation.improvement.selection import clips_by_source, joined, without_rows, without_sources
+from marey_motion.evaluation.improvement.unused import Unused
+from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.running import CancelCallback
+from marey_motion.matching.database import MatchingDatabase
+from marey_schemas.options.improvement import SuggestionOptions
+
+ProgressCallback = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Confirmed:
+    """Effects that were measured in replicates without a part in the choice of the suggestions.
+
+    Parameters
+    ----------
+    chance : standard deviation of each headline metric of the unchanged set over these replicates
+    unused : effect of removing all unused clips; None if there are none
+    ranges : effect of removing all unused clips and ranges, compared with the unchanged set; None if there are none
+    plan : planned removals with their confirmed effects
+    additions : clips to add; the first ones with their confirmed effects
+    """
+
+    chance: Mapping[str, float]
+    unused: Effect | None
+    ranges: Effect | None
+    plan: tuple[PlannedRemoval, ...]
+    additions: tuple[Addition, ...]
+
+
+Step = TypeVar("Step", PlannedRemoval, Addition)
+Value = TypeVar("Value")
+
+
+def confirm(
+    database: MatchingDatabase,
+    result: EvaluationResult,
+    how: SuggestionOptions,
+    unused: Unused,
+    plan: Sequence[PlannedRemoval],
+    additions: Sequence[Addition],
+    collections: Mapping[str, MatchingDatabase],
+    *,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+    cancelled: CancelCallback | None = None,
+) -> Confirmed | None:
+    """Measure the effects of suggestions in other replicates than those from which they were chosen.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the set
+    result : EvaluationResult    its evaluation
+    how : SuggestionOptions    number and seed of the replicates
+    unused : Unused    what no trial needs
+    plan : sequence of PlannedRemoval    removals from the set without its unused clips
+    additions : sequence of Addition    clips to add, in order
+    collections : mapping of str to MatchingDatabase    where these clips come from, by name
+    threads : int, optional    threads to use, one per processor if None
+    progress : callable, optional    called as progress(done, total, name)
+    cancelled : callable, optional    returns True to stop
+
+    Returns
+    -------
+    Confirmed or None    the effects; None if the options ask for no replicates to confirm them
+
+    Raises
+    ------
+    EvaluationCancelled    if cancelled
+    """
+    if not how.confirmation_replicates:
+        return None
+    simulated = _to_simulate(additions, how.simulated_additions)
+    stages = _Stages(2 + len(plan) + 2 * len(simulated) + bool(unused.ranges), progress)
+
+    def simulation(of: MatchingDatabase) -> Resimulation:
+        return Resimulation(
+            of,
+            result.options,
+            trials=[one.trial for one in result.trials],
+            replicates=confirmation_replicates(how),
+            seed=how.confirmation_seed,
+            threads=threads,
+            progress=stages.within,
+            cancelled=cancelled,
+        )
+
+    confirming = simulation(_with_added(database, simulated, collections))
+    outside = frozenset(confirming.sources.keys() - clips_by_source(database.clips).keys())
+    gone = outside | {clip.source for clip in unused.clips}
+    added = _addition_effects(confirming, how, simulated, outside, stages)
+    whole = stages.next(confirming.by_replicate(outside))
+    ranges = None
+    if unused.ranges:
+        cut = simulation(without_rows(database, unused.rows))
+        ranges = stages.next(effect_between(how.objective, whole, cut.by_replicate()))
+    return Confirmed(
+        chance=chance_of(confirming, outside),
+        unused=stages.next(effect_of(confirming, how.objective, outside, gone)) if unused.clips else None,
+        ranges=ranges,
+        plan=_with_effects(plan, _plan_effects(confirming, how, plan, gone, stages)),
+        additions=(*_with_effects(simulated, added), *(step for step in additions if step not in simulated)),
+    )
+
+
+class _Stages:
+    """Progress over several simulations as one count, with a thousand units for each."""
+
+    def __init__(self, count: int, progress: ProgressCallback | None) -> None:
+        self._count, self._ended = count, 0
+        self._tell = progress or (lambda _done, _total, _note: None)
+
+    def within(self, done: int, total: int, note: str) -> None:
+        """Report the progress of the current simulation."""
+        self._tell(1000 * self._ended + 1000 * done // max(total, 1), 1000 * self._count, note)
+
+    def next(self, found: Value) -> Value:
+        """Report the end of the current simulation; return what it found."""
+        self._ended += 1
+        self._tell(1000 * self._ended, 1000 * self._count, "")
+        return found
+
+
+def _to_simulate(additions: Sequence[Addition], most: int) -> list[Addition]:
+    """Choose the first additions of the set's skeleton; a clip that is in two collections is simulated once."""
+    same = {step.filling.source: step for step in reversed(additions) if not step.filling.needs_retarget}
+    return [step for step in additions if same.get(step.filling.source) is step][:most]
+
+
+def _with_added(
+    database: MatchingDatabase, steps: Sequence[Addition], collections: Mapping[str, MatchingDatabase]
+) -> MatchingDatabase:
+    """Return a database of the set and of the clips that some steps add."""
+    for name in dict.fromkeys(step.filling.collection for step in steps):
+        wanted = {step.filling.source for step in steps if step.filling.collection == name}
+        other = collections[name]
+        database = joined(database, without_sources(other, clips_by_source(other.clips).keys() - wanted))
+    return database
+
+
+def _addition_effects(
+    confirming: Resimulation, how: SuggestionOptions, steps: Sequence[Addition], outside: Sources, stages: _Stages
+) -> tuple[Effect, ...]:
+    """Measure the effect of each addition; `outside` are the sources of all additions."""
+    states = [outside]
+    for step in steps:
+        states.append(states[-1] - {step.filling.source})
+    # The set with all additions comes first: what needs none of them is then not simulated again without them.
+    for absent in reversed(states[1:]):
+        stages.next(confirming.outcomes(absent))
+    return corrected_effects([stages.next(effect_of(confirming, how.objective, *pair)) for pair in pairwise(states)])
+
+
+def _plan_effects(
+    confirming: Resimulation, how: SuggestionOptions, plan: Sequence[PlannedRemoval], gone: Sources, stages: _Stages
+) -> tuple[Effect, ...]:
+    """Measure the effect of each removal of a plan; `gone` are the sources that are absent before the first."""
+    effects = []
+    for step in plan:
+        after = gone | {step.removal.source}
+        effects.append(stages.next(effect_of(confirming, how.objective, gone, after)))
+        gone = after
+    return corrected_effects(effects)
+
+
+def _with_effects(steps: Sequence[Step], effects: Sequence[Effect]) -> tuple[Step, ...]:
+    return tuple(replace(step, confirmed=effect) for step, effect in zip(steps, effects, strict=True))

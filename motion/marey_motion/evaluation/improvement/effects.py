@@ -1,0 +1,169 @@
+"""Effects of changes of a set of clips on its trials: estimated in some replicates, confirmed in others.
+
+The best of many candidates is also the luckiest. So an effect that was the reason for a choice says
+too much, and must be measured again in replicates that had no part in the choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from marey_motion.evaluation.compare import OBJECTIVE, MetricChange, corrected_family, paired_change
+from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, objective_value
+from marey_motion.evaluation.improvement.resimulation import Resimulation, Sources
+from marey_motion.evaluation.result import TrialResult
+from marey_schemas.documents.evaluations import CONFIDENCE
+from marey_schemas.options.improvement import ConfirmedEffects, ObjectiveOptions
+
+Replicates = Sequence[Sequence[TrialResult]]
+"""Results of all trials, for each replicate."""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Effect of one change of a set of clips, over replicates that are paired.
+
+    Parameters
+    ----------
+    objective : change of the objective, metres; its term for the amount of data is left out where a saving of data is
+        stated beside it
+    headlines : change of each headline metric, by name, in its unit
+    """
+
+    objective: MetricChange
+    headlines: Mapping[str, MetricChange]
+
+    @property
+    def nothing(self) -> bool:
+        """Whether no headline metric changed in any replicate."""
+        return all(change.verdict == "same" for change in self.headlines.values())
+
+    def improves(self, tried: int) -> bool:
+        """Check whether the objective falls by more than chance explains.
+
+        Parameters
+        ----------
+        tried : int    number of effects that were tested together with this one
+
+        Returns
+        -------
+        bool    False, too, if there are too few replicates to know
+        """
+        p = self.objective.p
+        return self.objective.change < 0.0 and p is not None and p * tried <= 1.0 - CONFIDENCE
+
+
+def estimation_replicates(options: ConfirmedEffects) -> range:
+    """Return the numbers of the replicates in which effects are estimated.
+
+    Parameters
+    ----------
+    options : ConfirmedEffects    how many
+
+    Returns
+    -------
+    range    the first numbers, which are those of the evaluation
+    """
+    return range(options.estimation_replicates)
+
+
+def confirmation_replicates(options: ConfirmedEffects, turn: int = 0) -> range:
+    """Return the numbers of the replicates in which effects are confirmed; they had no part in any choice.
+
+    Parameters
+    ----------
+    options : ConfirmedEffects    how many
+    turn : int    0 for the first confirmation, 1 for one in yet other replicates
+
+    Returns
+    -------
+    range    numbers that are not among the estimating ones
+    """
+    first = options.estimation_replicates + turn * options.confirmation_replicates
+    return range(first, first + options.confirmation_replicates)
+
+
+def effect_between(
+    objective: ObjectiveOptions, before: Replicates, after: Replicates, data_s: tuple[float, float] = (0.0, 0.0)
+) -> Effect:
+    """Compute the effect of a change from the trials before and after it.
+
+    Parameters
+    ----------
+    objective : ObjectiveOptions    weights of the objective
+    before, after : sequence of sequence of TrialResult    the same replicates in the same order
+    data_s : pair of float    seconds of data before and after, whose price is part of the objective
+
+    Returns
+    -------
+    Effect    with probabilities that are not corrected for other effects
+    """
+    means = [[headline_means(one) for one in side] for side in (before, after)]
+    values = [
+        np.array([[objective_value(objective, one, seconds) for one in side]])
+        for side, seconds in zip((before, after), data_s, strict=True)
+    ]
+    headlines = {}
+    for name in HEADLINES:
+        first, second = (np.array([[one[name] for one in side]]) for side in means)
+        headlines[name] = paired_change(name, first, second)
+    return Effect(paired_change(OBJECTIVE, values[0], values[1]), headlines)
+
+
+def effect_of(
+    simulation: Resimulation, objective: ObjectiveOptions, before: Sources, after: Sources, *, with_data: bool = False
+) -> Effect:
+    """Simulate the effect of a change of a set, in the replicates of a simulation.
+
+    Parameters
+    ----------
+    simulation : Resimulation    the trials
+    objective : ObjectiveOptions    weights of the objective
+    before, after : frozenset of str    sources that are not in the set, before and after the change
+    with_data : bool    whether the objective includes the price of the data
+
+    Returns
+    -------
+    Effect    with probabilities that are not corrected for other effects
+    """
+    data_s = (simulation.seconds(before), simulation.seconds(after)) if with_data else (0.0, 0.0)
+    return effect_between(objective, simulation.by_replicate(before), simulation.by_replicate(after), data_s)
+
+
+def corrected_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Correct the probabilities of several effects that are reported together, each metric for the number of effects.
+
+    Parameters
+    ----------
+    effects : sequence of Effect    with uncorrected probabilities
+
+    Returns
+    -------
+    tuple of Effect    in the same order
+    """
+    objectives = corrected_family([effect.objective for effect in effects])
+    headlines = {name: corrected_family([effect.headlines[name] for effect in effects]) for name in HEADLINES}
+    return tuple(
+        replace(effect, objective=objectives[place], headlines={name: headlines[name][place] for name in HEADLINES})
+        for place, effect in enumerate(effects)
+    )
+
+
+def chance_of(simulation: Resimulation, removed: Sources) -> dict[str, float]:
+    """Measure how far chance alone moves the headline metrics of a set from one replicate to the next.
+
+    Parameters
+    ----------
+    simulation : Resimulation    the trials
+    removed : frozenset of str    sources that are not in the set
+
+    Returns
+    -------
+    dict of str to float    standard deviation of each headline metric over the replicates, in the unit of the metric;
+        empty if there is one replicate only
+    """
+    means = [headline_means(one) for one in simulation.by_replicate(removed)]
+    return {name: float(np.std([one[name] for one in means], ddof=1)) for name in HEADLINES} if len(means) > 1 else {}
