@@ -47,6 +47,14 @@ NOTHING_DONE = "nothing-done"
 """Code of the failure of a job that refused all of its inputs."""
 
 
+def nothing_done(result: Mapping[str, Any]) -> bool:
+    """Return whether the result of a job lists refused inputs, but neither outputs nor inputs without a finding.
+
+    `outputs` is the number of outputs; `empty` lists inputs that the job could use, and in which it found nothing.
+    """
+    return bool(result.get("refused")) and not result.get("outputs") and not result.get("empty")
+
+
 class InputSpec(Answer):
     """Declaration of a named input of a job kind."""
 

@@ -442,8 +442,9 @@ def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it
     (source,) = [skeleton for skeleton in project.skeletons.list() if skeleton.id != studio.id]
     source.put_mapping(source.mapping().model_copy(update={"confidence": 0.2}))
     sources = [CollectionInput(collection="raw")]
-    ended = marey.jobs.wait(project.retarget(sources, studio.id, into="doubtful").id, timeout_s=60)
-    assert [refusal["code"] for refusal in ended.result["refused"]] == ["mapping-uncertain"]
+    with pytest.raises(errors.JobUnsuccessful, match="none of 1 clip can be retargeted") as doubtful:
+        marey.jobs.wait(project.retarget(sources, studio.id, into="doubtful").id, timeout_s=60)
+    assert doubtful.value.job.failure.code == "nothing-done"
     place = f"{project.name}/{source.id}"
     assert "revision 3" in run("skeleton", "map", place, "--confirm").stderr
     known = source.mapping().joints["left_ankle"]

@@ -256,17 +256,19 @@ def test_a_fan_out_of_which_a_task_fails_commits_nothing_and_its_retry_everythin
     assert [one.job for one in gaits.log()] == [again]
 
 
-@pytest.mark.parametrize("made", [(), ("a",)])
-def test_a_fan_out_that_refused_all_inputs_has_failed(gaits: CommittingDesk, made: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(("made", "empty"), [((), []), (("a",), []), ((), ["thing 3"])])
+def test_a_fan_out_that_refused_all_inputs_has_failed(
+    gaits: CommittingDesk, made: tuple[str, ...], empty: list[str]
+) -> None:
     things = gaits.desk.things(4)
     job = gaits.submit("square", into="made", inputs={"things": tuple(ItemInput(item=one) for one in things)})
     for number, lease in enumerate(gaits.desk.claim_many()):
         if number == 1 and made:
             gaits.desk.stage(lease, *made)
         refused = [{"name": f"thing {number}", "detail": "it has no feet"}]
-        gaits.desk.complete(lease, result={"refused": refused})
+        gaits.desk.complete(lease, result={"refused": refused, "empty": empty})
     ended = gaits.job(job)
-    if made:
+    if made or empty:
         assert ended.state == "succeeded"
     else:
         assert ended.failure is not None
