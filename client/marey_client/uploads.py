@@ -75,8 +75,13 @@ def upload(project: ProjectItems, found: FoundFiles, options: ImportOptions, not
 def outcomes_text(entries: Sequence[ImportEntry]) -> str:
     """Return the numbers of files by their outcomes, and the number of frames, as text."""
     counts = Counter(map(_outcome, entries))
-    outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
-    frames = sum(entry.frames or 0 for entry in entries)
+    changed = sum(entry.skeleton_changed for entry in entries)
+    words = {one: f"{counts[one]} {one}" for one in OUTCOMES}
+    words[NEW_REVISION] = counted(counts[NEW_REVISION], NEW_REVISION)
+    if changed:
+        words[NEW_REVISION] += f" (skeleton changed{'' if changed == counts[NEW_REVISION] else f' in {changed}'})"
+    outcomes = ", ".join(words[one] for one in OUTCOMES if counts[one])
+    frames = sum(entry.frames or 0 for entry in entries if entry.error is None)
     return f"{counted(len(entries), 'file')}: {outcomes}; {counted(frames, 'frame')}"
 
 

@@ -34,6 +34,9 @@ class ImportKeywords(TypedDict, total=False):
     trust_options: bool
     """Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise such files are
     refused."""
+    replace_skeleton: bool
+    """Make a new revision of a clip or model of the same name, even if the file has another skeleton; otherwise such
+    files are refused."""
     trim_rest_pose: bool
     """Remove rest poses at the beginning and at the end of each clip."""
     tags: list[str] | tuple[str, ...]

@@ -70,6 +70,7 @@ class ImportedItem:
     """An item to store: its name, collection, tags and documents.
 
     `name` identifies the item within the import: other items refer to it as `{"output": name}` until it is stored.
+    With `same_skeleton`, it is not stored if an item of this name has another skeleton.
     """
 
     name: str
@@ -79,6 +80,7 @@ class ImportedItem:
     parts: Mapping[str, Tree]
     tags: Sequence[str] = ()
     reuse: Literal["by_name", "by_content"] = "by_name"
+    same_skeleton: bool = False
 
 
 @dataclass(frozen=True)
@@ -163,4 +165,7 @@ def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str
     -------
     ImportedItem    the item
     """
-    return ImportedItem(file.planned.name, kind, item_name, file.collection, parts, file.options.tags)
+    return ImportedItem(
+        file.planned.name, kind, item_name, file.collection, parts, file.options.tags,
+        same_skeleton=not file.options.replace_skeleton,
+    )  # fmt: skip

@@ -55,6 +55,11 @@ class ImportOptions(Options):
         description="Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise such "
         "files are refused.",
     )
+    replace_skeleton: bool = Field(
+        False,
+        description="Make a new revision of a clip or model of the same name, even if the file has another skeleton; "
+        "otherwise such files are refused.",
+    )
     trim_rest_pose: bool = Field(False, description="Remove rest poses at the beginning and at the end of each clip.")
     tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS, description="Tags that every clip gets.")
     subject: str | None = Field(None, max_length=255, description="The performer.")

@@ -217,6 +217,9 @@ class JobOutput(Answer):
     kind: Kind
     revision: int
     created: bool = Field(description="False if the item had the same content before.")
+    skeleton_changed: bool = Field(
+        False, description="Whether the new revision has another skeleton than the revision before."
+    )
     purged: bool = Field(
         False, description="Whether the item has been deleted for good since the job made it; if so, `name` is empty."
     )

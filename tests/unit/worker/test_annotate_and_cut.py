@@ -63,7 +63,7 @@ def test_joints_of_pauses_are_named_as_in_the_skeleton_or_as_standard_joints(pro
         project.staged.clear()
     assert staged[0]["annotation"] == staged[1]["annotation"]
     unknown = {"proposal": {"method": "velocity_minima", "joints": ["tail"]}}
-    with pytest.raises(JobRefused, match="none of 2 clips can be annotated; .* tail") as refused:
+    with pytest.raises(JobRefused, match=r"none of 2 clips can be annotated; .* tail") as refused:
         annotate.run(project, AnnotateParams.model_validate(unknown))
     assert (refused.value.code, project.staged) == ("nothing-done", [])
 
