@@ -29,6 +29,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, PurgeAnswer, PurgeRequest
 from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.search import SimilarAnswer, SimilarRequest
+from marey_schemas.skeleton_merges import SkeletonMergeAnswer, SkeletonMergeRequest
 
 
 class ProjectItems:
@@ -131,6 +132,28 @@ class ProjectItems:
         each with the objects that need it. Raises `Conflict` if `item` names a single item that something needs.
         """
         return purge_items(self.transport, self.name, PurgeRequest.model_validate(conditions))
+
+    def merge_skeletons(
+        self,
+        skeletons: Iterable[SkeletonHandle | str] = (),
+        *,
+        keep: SkeletonHandle | str | None = None,
+        dry_run: bool = False,
+    ) -> SkeletonMergeAnswer:
+        """Merge skeletons of one rig into one of them, to which their clips and models move. For maintainers.
+
+        Skeletons are handles, paths or ids; without `skeletons`, all duplicates of the project are merged. `keep` is
+        the skeleton that remains. With `dry_run`, nothing changes. Raises `Invalid` for skeletons of different rigs.
+        """
+        request = SkeletonMergeRequest(
+            skeletons=tuple(map(self._skeleton_id, skeletons)),
+            kept=None if keep is None else self._skeleton_id(keep),
+            dry_run=dry_run,
+        )
+        return self.transport.post(SkeletonMergeAnswer, f"/projects/{self.name}/skeleton-merges", request)
+
+    def _skeleton_id(self, skeleton: SkeletonHandle | str) -> str:
+        return (self.skeletons[skeleton] if isinstance(skeleton, str) else skeleton).id
 
     def purge_dataset(self, name: str, *, preview: bool = False) -> DatasetPurgeAnswer:
         """Delete a deleted dataset for good: versions, branches, tags and proposals. For owners of the project.

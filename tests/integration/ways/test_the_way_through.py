@@ -434,6 +434,25 @@ def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(
     assert ("rigs", 2) in used
 
 
+def test_duplicate_skeletons_are_previewed_and_merged(
+    project: ProjectHandle, takes: Path, run: CommandLine
+) -> None:
+    project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
+    (kept,) = project.skeletons
+    hierarchy = kept.hierarchy().model_dump(mode="json", by_alias=True)
+    hierarchy["joints"][0]["offset"][0] += 2.0
+    twin = project.skeletons.create("twin", {"hierarchy": hierarchy}, collection="skeletons")
+    walk = project.clips["raw/walk"]
+    walk.put_part("motion", {**walk.part("motion"), "skeleton": {"item": twin.id, "revision": 1}})
+    said = run("skeleton", "merge", project.name, "--dry-run").stderr
+    assert said.startswith(f"skeletons/twin would be merged into {kept.path}; 1 clip")
+    refused = run("skeleton", "merge", project.name, f"{project.name}/skeletons/twin", status=2).stderr
+    assert "either a project or skeletons in it" in refused
+    run("skeleton", "merge", f"{project.name}/skeletons/twin", "--keep", f"{project.name}/{kept.path}")
+    assert project.clips["raw/walk"].item.summary["skeleton"] == kept.id
+    assert project.merge_skeletons().rigs == ()
+
+
 def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it(
     project: ProjectHandle, marey: Marey, takes: Path, run: CommandLine
 ) -> None:
