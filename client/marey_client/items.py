@@ -160,14 +160,18 @@ class ItemHandle:
         revision: int | None = None,
         beside: TakenPaths | None = None,
         allow_expired_consent: str | None = None,
+        fold_positions: bool = False,
         **options: str | None,
     ) -> Path:
         """Write a revision of the item, by default the newest, to `folder` as a file of `format`; return its path.
 
         If several items are exported with the same `beside`, files of the same name get numbers. If the consent for a
         clip has ended, raises `Conflict`, unless `allow_expired_consent` gives a reason to export the clip
-        nevertheless. The server records the reason; the caller must be a maintainer or owner.
+        nevertheless. The server records the reason; the caller must be a maintainer or owner. `fold_positions` gives
+        positions to the root of a BVH file alone, for programs that ignore those of other joints.
         """
+        if fold_positions:
+            options |= {"fold_positions": "true"}
         if allow_expired_consent is not None:
             options |= {"allow_expired_consent": "true", "consent_reason": allow_expired_consent}
         return download(

@@ -13,6 +13,7 @@ from marey_motion.clip import Clip
 from marey_motion.errors import FormatError
 from marey_motion.formats.euler import euler_from_rotations
 from marey_motion.formats.frame_times import frame_time_to_write
+from marey_motion.formats.position_folding import with_folded_positions
 from marey_motion.importing.source import SourceInfo
 from marey_motion.importing.units import unit_in_metres
 from marey_motion.kernels import compiled
@@ -30,6 +31,7 @@ def write_bvh(
     unit: str | float = DEFAULT_UNIT,
     rotation_order: str = DEFAULT_ORDER,
     source: SourceInfo | None = None,
+    fold_positions: bool = False,
 ) -> bytes:
     """Write a clip as BVH, Y up.
 
@@ -40,6 +42,8 @@ def write_bvh(
     rotation_order : str    order of the rotations, outermost first; used for joints that have no order in `source`
     source : SourceInfo, optional    record of the file from which the clip was imported; joints of this file keep their
         rotation orders
+    fold_positions : bool    give positions to the root alone (see `with_folded_positions`), for programs that ignore
+        positions of other joints
 
     Returns
     -------
@@ -50,6 +54,8 @@ def write_bvh(
     FormatError    if a length in that unit has more than twelve digits before the decimal point, or if the frame rate
         is less than 1 Hz or more than 100 kHz
     """
+    if fold_positions:
+        clip = with_folded_positions(clip)
     order = _depth_first(clip.skeleton)
     axes = np.array([_axes_of(clip.skeleton, joint, rotation_order, source) for joint in order])
     scale = 1.0 / unit_in_metres(unit)

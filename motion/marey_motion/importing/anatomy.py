@@ -21,7 +21,6 @@ from marey_motion.skeleton import EndSite, Skeleton
 from marey_schemas.documents.standard_joints import SIDES
 from marey_schemas.lru import LruCache
 
-
 LEG_OF_STATURE = 0.491
 """Part of the stature that thigh and shank make together (Drillis and Contini, 1966)."""
 

@@ -434,9 +434,7 @@ def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(
     assert ("rigs", 2) in used
 
 
-def test_duplicate_skeletons_are_previewed_and_merged(
-    project: ProjectHandle, takes: Path, run: CommandLine
-) -> None:
+def test_duplicate_skeletons_are_previewed_and_merged(project: ProjectHandle, takes: Path, run: CommandLine) -> None:
     project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
     (kept,) = project.skeletons
     hierarchy = kept.hierarchy().model_dump(mode="json", by_alias=True)

@@ -46,6 +46,13 @@ def download(
     format: Annotated[str, typer.Option(help=f"{one_of(EXPORT_FORMATS)}.")] = "original",  # noqa: A002
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
+    fold_positions: Annotated[
+        bool,
+        typer.Option(
+            "--fold-positions",
+            help="Give positions to the root of BVH files alone, for programs that ignore those of other joints.",
+        ),
+    ] = False,
     restored: Annotated[
         bool, typer.Option(help="Export aligned clips with the timing and position of their source clips.")
     ] = False,
@@ -64,7 +71,12 @@ def download(
         raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(EXPORT_FORMATS)}")
     address = Address.parse(place)
     with connect(context) as marey:
-        options = {"format": format, "unit": unit, "allow_expired_consent": allow_expired_consent}
+        options = {
+            "format": format,
+            "unit": unit,
+            "allow_expired_consent": allow_expired_consent,
+            "fold_positions": fold_positions,
+        }
         options |= {"time": "source"} if restored else {}
         written, refused = _download_all(_exported_at(marey, address), output, options)
     if as_json:
