@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
+from marey_schemas.names import FORMS
+
 NAMES_SHOWN = 5
 """Greatest number of names that a message lists."""
+
+
+_ABOUT_PATTERN = "String should match pattern '"
 
 
 def counted(number: int, noun: str) -> str:
@@ -29,9 +34,12 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     return by_lower[near[0]] if near else None
 
 
-def without_prefix(message: str) -> str:
-    """Return a message of pydantic without the prefix "Value error, ", which marks the text of a `ValueError`."""
-    return message.removeprefix("Value error, ")
+def plain_reason(message: str) -> str:
+    """Return a message of pydantic for people: without "Value error, ", and with words instead of a pattern."""
+    if not message.startswith(_ABOUT_PATTERN):
+        return message.removeprefix("Value error, ")
+    pattern = message[len(_ABOUT_PATTERN) : -1]
+    return f"the text must {FORMS.get(pattern, 'have another form; it may contain a character that is not allowed')}"
 
 
 def printable(text: str) -> str:

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.log_lines import usual_form
-from marey_schemas.wording import counted, without_prefix
+from marey_schemas.wording import counted, plain_reason
 from marey_server.process.settings import Settings
 
 PROGRESS_EVERY_S = 5.0
@@ -103,9 +103,7 @@ def read_settings(**given: Any) -> Settings:
     try:
         return Settings(**given)
     except ValidationError as error:
-        wrong = "; ".join(
-            f"{'.'.join(map(str, each['loc']))}: {without_prefix(each['msg'])}" for each in error.errors()
-        )
+        wrong = "; ".join(f"{'.'.join(map(str, each['loc']))}: {plain_reason(each['msg'])}" for each in error.errors())
         raise CommandFailed(f"invalid setting: {wrong}") from None
 
 

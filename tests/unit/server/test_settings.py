@@ -89,8 +89,8 @@ def test_audit_entries_may_be_kept_longer_or_for_ever() -> None:
     [
         ([{"name": "gpu", "most": 1}, {"name": "gpu", "most": 2}], "several pools have the name 'gpu'"),
         ([{"name": "gpu", "least": 2, "most": 1}], "least is 2, but must not be greater than most, which is 1"),
-        ([{"name": "GPU", "most": 1}], "should match pattern"),
-        ([{"name": "gpu", "most": 1, "labels": {"a=b": "c"}}], "should match pattern"),
+        ([{"name": "GPU", "most": 1}], "the text must"),
+        ([{"name": "gpu", "most": 1, "labels": {"a=b": "c"}}], "the text must"),
         ([{"name": "gpu", "most": 1, "cpu": 1}], "Extra inputs are not permitted"),
     ],
 )

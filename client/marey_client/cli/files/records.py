@@ -14,7 +14,7 @@ from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.invocation import QueryText, connect
 from marey_client.cli.terminal.output import print_message
 from marey_client.progress import progress
-from marey_schemas.wording import counted, without_prefix
+from marey_schemas.wording import counted, plain_reason
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -116,7 +116,7 @@ def _checked(given: Mapping[str, str], place: str) -> dict[str, Any]:
     except ValidationError as error:
         first = error.errors()[0]
         raise WrongUsage(
-            f"{place}, {'.'.join(map(str, first['loc']))}: {without_prefix(first['msg'])}, not {first['input']!r}"
+            f"{place}, {'.'.join(map(str, first['loc']))}: {plain_reason(first['msg'])}, not {first['input']!r}"
         ) from None
     return {name: getattr(checked, name) for name in given}
 
