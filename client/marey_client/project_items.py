@@ -25,12 +25,12 @@ from marey_client.jobs import Jobs
 from marey_client.keywords.asking import PurgeKeywords, SimilarKeywords
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
+from marey_schemas.documents.skeleton_merges import SkeletonMergeAnswer, SkeletonMergeRequest
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, PurgeAnswer, PurgeRequest
 from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.search import SimilarAnswer, SimilarRequest
-from marey_schemas.skeleton_merges import SkeletonMergeAnswer, SkeletonMergeRequest
 
 
 class ProjectItems:

@@ -28,6 +28,7 @@ from marey_client.cli import (
     searches,
     skeletons,
     tokens,
+    user_tables,
     viewing,
     webhooks,
 )
@@ -137,6 +138,7 @@ for register in (
     costs,
     capacity,
     accounts,
+    user_tables,
     tokens,
     projects,
     invitations,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.documents.skeleton_merges import SkeletonMergeAnswer, SkeletonMergeRequest
 from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineage, QueryExplanation, Revision, Staleness
 from marey_schemas.kinds import Kind
 from marey_schemas.lineage import LineageGraph, LineageRequest
 from marey_schemas.queries.grammar import MOST_CHARACTERS
 from marey_schemas.sizes import MIB
-from marey_schemas.skeleton_merges import SkeletonMergeAnswer, SkeletonMergeRequest
 from marey_server.errors import NotFoundProblem
 from marey_server.handlers.searching.similar import IndexSearcher
 from marey_server.http.declarations import Access, RequestBody, reads, writes

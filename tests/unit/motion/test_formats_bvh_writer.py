@@ -14,8 +14,7 @@ from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, MotionError
 from marey_motion.exporting import write_clip_file
 from marey_motion.formats import read_motion, write_motion
-from marey_motion.formats.bvh_writer import format_table, write_bvh
-from marey_motion.formats.position_folding import with_folded_positions
+from marey_motion.formats.bvh_writer import format_table, with_folded_positions, write_bvh
 from marey_motion.gait import generate_gait
 from marey_motion.importing.source import SourceInfo
 from marey_motion.kinematics import global_positions
@@ -68,7 +67,7 @@ def test_folded_positions_are_right_for_readers_that_ignore_those_below_the_root
         offsets=np.concatenate((np.zeros((1, 3)), body.offsets)),
         rest_rotations=np.concatenate(([[1.0, 0, 0, 0]], body.rest_rotations)),
     )
-    turned = np.tile(np.float32([0.8, 0.0, 0.6, 0.0]), (walk.frame_count, 1))
+    turned = np.tile(np.array([0.8, 0.0, 0.6, 0.0], np.float32), (walk.frame_count, 1))
     poses = np.concatenate((np.ones((walk.frame_count, 3), np.float32), turned, walk.poses[:, 3:]), axis=1)
     neck = still.index_of("Neck")
     stretch = still.offsets[neck] + np.linspace(-0.002, 0.002, walk.frame_count)[:, None]
@@ -80,7 +79,8 @@ def test_folded_positions_are_right_for_readers_that_ignore_those_below_the_root
         path = tmp_path / "written.bvh"
         path.write_bytes(write_clip_file(clip, "bvh", fold_positions=folded).data)
         loaded = positions_by_another_loader(path, only_root=True)
-        return np.linalg.norm(loaded * 0.01 - truth, axis=2).max(axis=0)
+        distances: np.ndarray = np.linalg.norm(loaded * 0.01 - truth, axis=2)
+        return distances.max(axis=0)
 
     assert error_m(folded=False)[1:].min() > 2.0
     below_neck = {joint for joint in range(still.joint_count) if neck in still.path_to_root(joint)}

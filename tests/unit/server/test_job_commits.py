@@ -307,6 +307,7 @@ def test_an_import_job_says_which_takes_are_revisions_and_refuses_other_skeleton
             )  # fmt: skip
         desk.complete(lease, result={"entries": entries, "clips": 2, "frames": 10})
         result = desk.job(job).result
+        assert result is not None
         return result, {one["name"]: one for one in result["entries"]}
 
     run(1.0, 0)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tests.support.store_fixtures import ALL_RIGHTS, Lab, motion_tree, skeleton_tree
 
+from marey_schemas.documents.skeleton_merges import SKELETON_MERGE, SkeletonMergeRequest
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
-from marey_schemas.skeleton_merges import SKELETON_MERGE, SkeletonMergeRequest
 from marey_server.errors import ApiProblem, ConflictProblem, ForbiddenProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import items, projects
 from marey_server.store.items import Draft

@@ -7,9 +7,9 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Row, Select, and_, exists, select, tuple_
 
+from marey_schemas.documents.skeleton_merges import SKELETON_MERGE
 from marey_schemas.items import Lineage, LineageEdge, Page, Revision, Staleness
 from marey_schemas.kinds import Kind
-from marey_schemas.skeleton_merges import SKELETON_MERGE
 from marey_schemas.tracing.context import HEADER
 from marey_server.errors import NotFoundProblem
 from marey_server.store import listing, projects

@@ -10,8 +10,7 @@ from typing import Any
 from sqlalchemy import or_
 
 from marey_schemas.access import Role
-from marey_schemas.kinds import Kind
-from marey_schemas.skeleton_merges import (
+from marey_schemas.documents.skeleton_merges import (
     MOST_MOVED,
     SKELETON_MERGE,
     MergedRig,
@@ -20,6 +19,7 @@ from marey_schemas.skeleton_merges import (
     SkeletonMergeAnswer,
     SkeletonMergeRequest,
 )
+from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, InvalidProblem, TooLargeProblem
 from marey_server.prepared_documents import digest_of_body
 from marey_server.store import documents, projects
