@@ -63,8 +63,12 @@ class UploadReport:
 def upload(project: ProjectItems, found: FoundFiles, options: ImportOptions, notice: Notice) -> UploadReport:
     """Import files that were found, and restore the take records of clips that an export wrote.
 
-    `options` without a unit get the unit of the export from which all files come, if there is one.
+    `options` without a unit get the unit of the export from which all files come, if there is one. Their skeleton is an
+    id or a path. Raises `NoSuchPath` if there is no such skeleton.
     """
+    if options.skeleton is not None:
+        found_id = project.skeletons[options.skeleton].id
+        options = ImportOptions.model_validate({**options.model_dump(exclude_unset=True), "skeleton": found_id})
     if found.unit is not None and not options.model_fields_set & {"unit", "unit_scale_m"}:
         options = ImportOptions.model_validate({**options.model_dump(exclude_unset=True), "unit": found.unit})
     entries = project.imports.upload(found.files, options, notice=notice)

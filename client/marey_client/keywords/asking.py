@@ -18,7 +18,8 @@ class ImportKeywords(TypedDict, total=False):
     collection: str
     """Folder of the project that receives the clips."""
     skeleton: str | None
-    """Item id of the skeleton that the clips must use; absent: an equal skeleton of the project, or a new one."""
+    """Item id of the skeleton that the clips must use; `marey upload` and Python also take its path. Absent: an equal
+    skeleton of the project, or a new one."""
     unit: Literal["mm", "cm", "inch", "cmu", "dm", "ft", "m"] | None
     """Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."""
     unit_scale_m: float | None

@@ -31,8 +31,8 @@ class ImportOptions(Options):
     collection: CollectionPath = Field("", description="Folder of the project that receives the clips.")
     skeleton: str | None = Field(
         None,
-        description="Item id of the skeleton that the clips must use; absent: an equal skeleton of the project, or a "
-        "new one.",
+        description="Item id of the skeleton that the clips must use; `marey upload` and Python also take its path. "
+        "Absent: an equal skeleton of the project, or a new one.",
     )
     unit: LengthUnit | None = Field(
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."

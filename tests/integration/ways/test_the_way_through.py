@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -432,6 +433,35 @@ def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(
     assert "left_elbow" in after.info().source.details["missing"]
     used = {(edge.role, edge.revision) for edge in after.lineage().inputs}
     assert ("rigs", 2) in used
+
+
+def test_a_project_says_what_it_holds_what_is_stale_and_takes_paths_and_revisions(
+    project: ProjectHandle, marey: Marey, takes: Path, run: CommandLine
+) -> None:
+    name = project.name
+    run("upload", str(takes / "walk.bvh"), "--project", name, "--collection", "raw")
+    (own,) = project.skeletons
+    run(
+        "upload",
+        str(takes / "walk.bvh"),
+        "--project",
+        name,
+        "--collection",
+        "again",
+        "--skeleton",
+        f"{name}/{own.path}",
+    )
+    assert project.clips["again/walk"].item.summary["skeleton"] == own.id
+    run("retarget", f"{name}/raw", "--to", f"{name}/{own.path}", "--into", "made")
+    assert "nothing is stale among 4 items" in run("stale", name).stderr
+    walk = project.clips["raw/walk"]
+    walk.put_info(walk.info().model_copy(update={"comment": "changed"}))
+    assert "made/raw/walk" in run("stale", f"{name}/made").stdout
+    assert json.loads(run("stale", name, "--json").stdout)[0]["because"][0]["revision"] == 1
+    assert "comment" not in run("show", f"{name}/raw/walk", "--revision", "1", "--part", "info").stdout
+    run("download", f"{name}/raw/walk", "--revision", "1", "--format", "bvh", "-o", "out")
+    held = run("df", name).stdout
+    assert re.search(rf"{name} +4 +0\.\d+ MiB", held), held
 
 
 def test_duplicate_skeletons_are_previewed_and_merged(project: ProjectHandle, takes: Path, run: CommandLine) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from marey_client.cli.addresses import Address
-from marey_client.cli.revisions import find_revision, find_version
+from marey_client.cli.revisions import RevisionNumber, at_revision, find_revision, find_version
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message
@@ -44,6 +44,7 @@ def download(
         ),
     ],
     format: Annotated[str, typer.Option(help=f"{one_of(EXPORT_FORMATS)}.")] = "original",  # noqa: A002
+    revision: RevisionNumber = None,
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
     fold_positions: Annotated[
@@ -69,7 +70,7 @@ def download(
     """
     if format not in EXPORT_FORMATS:
         raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(EXPORT_FORMATS)}")
-    address = Address.parse(place)
+    address = Address.parse(at_revision(place, revision))
     with connect(context) as marey:
         options = {
             "format": format,
