@@ -15,7 +15,7 @@ NEVER_ARRIVED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 """Failures after which the server cannot have seen the request."""
 
 TRIES_IN_SILENCE = 3
-"""Number of tries after which the caller is told; the waits before take less than two seconds together."""
+"""Number of tries after which waits are reported; the waits before take less than two seconds together."""
 
 BUSY_STATUSES = frozenset({429, 502, 503, 504})
 """HTTP statuses that mean "not now": the server has done nothing."""
@@ -48,8 +48,8 @@ class Retries:
         backoff = Backoff(self.first_s, self.longest_s, random_unit=self.random_unit)
         return backoff.delay_s(tried) + (retry_after_s or 0.0)
 
-    def tell(self, url: str, tried: int, elapsed_s: float, *, busy: bool) -> None:
-        """Tell the caller, after the first waits, that the server does not answer and how long tries go on."""
+    def report_wait(self, url: str, tried: int, elapsed_s: float, *, busy: bool) -> None:
+        """Report, after the first waits, that the server does not answer and how long tries go on."""
         if self.notice is not None and tried >= TRIES_IN_SILENCE:
             left_s = max(1, round(self.total_s - elapsed_s))
             self.notice(f"{url} {'is busy' if busy else 'does not answer'}; trying again for {left_s} s")

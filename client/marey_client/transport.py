@@ -234,7 +234,7 @@ class Transport:
                 raise failure
             log.info("%s: %s; trying again in %.1f s", what, failure, delay_s)
             busy = isinstance(failure, RequestFailed)
-            self.retries.tell(self.url, tried, time.monotonic() - started, busy=busy)
+            self.retries.report_wait(self.url, tried, time.monotonic() - started, busy=busy)
             self.retries.sleep(delay_s)
         raise AssertionError("unreachable")
 

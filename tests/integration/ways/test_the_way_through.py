@@ -439,18 +439,10 @@ def test_a_project_says_what_it_holds_what_is_stale_and_takes_paths_and_revision
     project: ProjectHandle, marey: Marey, takes: Path, run: CommandLine
 ) -> None:
     name = project.name
-    run("upload", str(takes / "walk.bvh"), "--project", name, "--collection", "raw")
+    upload = ("upload", str(takes / "walk.bvh"), "--project", name, "--collection")
+    run(*upload, "raw")
     (own,) = project.skeletons
-    run(
-        "upload",
-        str(takes / "walk.bvh"),
-        "--project",
-        name,
-        "--collection",
-        "again",
-        "--skeleton",
-        f"{name}/{own.path}",
-    )
+    run(*upload, "again", "--skeleton", f"{name}/{own.path}")
     assert project.clips["again/walk"].item.summary["skeleton"] == own.id
     run("retarget", f"{name}/raw", "--to", f"{name}/{own.path}", "--into", "made")
     assert "nothing is stale among 4 items" in run("stale", name).stderr
