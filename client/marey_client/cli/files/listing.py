@@ -36,7 +36,7 @@ COLUMNS: dict[str, Callable[[Item], object]] = {
     "revision": lambda item: item.revision,
     "joints": lambda item: item.summary.get("joints"),
     "frames": lambda item: item.summary.get("frames"),
-    "Hz": lambda item: item.summary.get("frame_rate_hz"),
+    "Hz": lambda item: _rounded(item.summary.get("frame_rate_hz")),
     "seconds": lambda item: None if (given := item.summary.get("duration_s")) is None else round(given, 3),
     "warnings": lambda item: " ".join(item.summary.get("warnings", ())),
     "tags": lambda item: " ".join(item.tags),
@@ -294,6 +294,11 @@ def show(
         return print_pairs(_described(marey, item))
 
 
+def _rounded(value: object) -> object:
+    """Return a number with six digits for people; `--json` prints all digits."""
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
 def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
     """Yield names and values that describe an item; for a clip also its skeleton, source and warnings."""
     from marey_client.handles.clips import ClipHandle
@@ -304,8 +309,8 @@ def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
         if isinstance(item, ClipHandle) and name == "skeleton":
             yield name, f"{marey.project(item.project).skeletons.get(value).path} ({value})"
         elif name != "warnings":
-            yield name, value
-    yield from ((f"{FACET_PREFIX}{name}", value) for name, value in item.item.facets.items())
+            yield name, _rounded(value)
+    yield from ((f"{FACET_PREFIX}{name}", _rounded(value)) for name, value in item.item.facets.items())
     for edge in item.staleness().because:
         yield "stale", f"{edge.kind} {edge.name} has newer revisions than {edge.revision}"
     for name, one in item.item.parts.items():
