@@ -188,16 +188,16 @@ class PublishedOutputs:
         return self.columns.get("committed")
 
     def result(self, kind: str, result: dict[str, Any]) -> dict[str, Any]:
-        """Return the result of the job; that of an import says for each file what was published.
+        """Return the result of the job; the entries of an import say for each file what was published.
 
-        Raises `InvalidProblem` if the result of an import has no valid entries.
+        Raises `InvalidProblem` if an entry of an import is not valid.
         """
-        if kind != "import":
+        if kind != "import" or "entries" not in result:
             return result
         try:
             return published_result(result, {one["name"]: JobOutput.model_validate(one) for one in self.outputs})
         except ValidationError as error:
-            raise InvalidProblem("The result of an import must have one valid entry for each file.") from error
+            raise InvalidProblem("An entry in the result of an import is not valid.") from error
 
 
 JOB_COLUMNS = (
