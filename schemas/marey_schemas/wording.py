@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
-from marey_schemas.names import FORMS
-
 NAMES_SHOWN = 5
 """Greatest number of names that a message lists."""
 
@@ -38,6 +36,8 @@ def plain_reason(message: str) -> str:
     """Return a message of pydantic for people: without "Value error, ", and with words instead of a pattern."""
     if not message.startswith(_ABOUT_PATTERN):
         return message.removeprefix("Value error, ")
+    from marey_schemas.names import FORMS  # with pydantic, which the help of the command line does not load
+
     pattern = message[len(_ABOUT_PATTERN) : -1]
     return f"the text must {FORMS.get(pattern, 'have another form; it may contain a character that is not allowed')}"
 
