@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import TypeVar
 
+from marey_client.arguments import checked
 from marey_client.errors import UnexpectedAnswer
 from marey_client.handles.invitations import AccountInvitations
 from marey_client.paging import pages
@@ -92,7 +93,7 @@ class Users:
 
     def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
         """Revoke all tokens of a user, or only the tokens from `marey login`; the token of this client stays valid."""
-        return self.change(name, UserChange(end_tokens=which))
+        return self.change(name, checked(UserChange, end_tokens=which))
 
     def quotas(self, name: str) -> QuotasInUse:
         """Return the number of items and bytes that count towards a user's quotas, and the limits."""
@@ -104,7 +105,7 @@ class Users:
 
     def enable(self, name: str) -> User:
         """Enable a disabled user again, with the same password and tokens."""
-        return self.change(name, UserChange(disabled=False))
+        return self.change(name, checked(UserChange, disabled=False))
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ class Members:
             self.transport.send(
                 "PUT",
                 f"/projects/{self.project}/members/{user}",
-                content=as_json(MemberChange(role=role)),
+                content=as_json(checked(MemberChange, role=role)),
                 headers=ANY_STATE,
                 repeatable=True,
             ),
@@ -206,7 +207,7 @@ class FolderRoles:
 
     def put(self, folder: Collection, user: str, role: Role) -> FolderRole:
         """Set the role of a member in a folder: reader, contributor or maintainer."""
-        change = FolderRoleChange.model_validate({"role": role})
+        change = checked(FolderRoleChange, {"role": role})
         return read_model(
             FolderRole,
             self.transport.send(

@@ -19,11 +19,10 @@ from urllib.parse import urlsplit
 import httpx
 
 from marey_client.errors import BadAddress, BadCredentialFile, BadToken
-from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SERVER_VARIABLES
+from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SERVER_VARIABLES, SETTINGS_FILE
 
 DEFAULT_URL = f"http://{DEFAULT_HOST}:{DEFAULT_PORT}"
 DEFAULT_DATA = "marey-data"
-SETTINGS_FILE = "marey.toml"
 ADMIN_TOKEN = "admin.token"  # noqa: S105 - the name of a file
 log = logging.getLogger(__name__)
 

@@ -11,6 +11,10 @@ class MareyError(Exception):
     """Base class of all errors of Marey's client; the texts of the errors are written for people."""
 
 
+class BadArgument(MareyError, ValueError):
+    """An argument of a function of this package is not valid; the text names the argument."""
+
+
 # Nobody answered, or somebody else did
 
 

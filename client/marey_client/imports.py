@@ -27,10 +27,9 @@ from marey_schemas.imports import (
     ImportFile,
     ImportRequest,
     Refusal,
-    skeleton_output,
 )
 from marey_schemas.options.imports import ImportOptions
-from marey_schemas.queue.jobs import Job, JobOutput
+from marey_schemas.queue.jobs import Job
 
 if TYPE_CHECKING:
     from marey_schemas.datasets.exports import ExportedClip
@@ -243,8 +242,7 @@ class Imports:
         if response.status_code != 202:
             return read_model(ImportAnswer, response).entries
         job = self.jobs.wait(read_model(Job, response).id)
-        outputs = {output.name: output for output in self.jobs.outputs(job.id)}
-        return tuple(_with_item(entry, outputs) for entry in ImportAnswer.model_validate(job.result).entries)
+        return ImportAnswer.model_validate(job.result).entries
 
     def send(self, files: Sequence[LocalFile], *, notice: Notice | None = None) -> tuple[ImportFile, ...]:
         """Upload the bytes that the server does not have; return the files in the form of an import request.
@@ -283,16 +281,6 @@ def _refused_name(name: str) -> ImportEntry:
     shown = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in name)
     detail = "its name is too long, is not UTF-8, or contains line breaks or other control characters; rename the file"
     return ImportEntry(name=shown, status="failed", error=Refusal(code="file-name", detail=detail))
-
-
-def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEntry:
-    """Return the entry of a file in an import job, completed with the items that the job published for the file."""
-    skeleton = outputs.get(skeleton_output(entry.name))
-    made = outputs.get(entry.name) or skeleton
-    if made is None:
-        return entry
-    known = {"status": "created" if made.created else "unchanged", "item": made.item, "revision": made.revision}
-    return entry.model_copy(update={**known, "skeleton": skeleton.item if skeleton else None})
 
 
 def refusal_text(entry: ImportEntry) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, Unpack
 
+from marey_client.arguments import checked
 from marey_client.downloads import TakenPaths, download
 from marey_client.errors import NoSuchPath, NotFound
 from marey_client.keywords.asking import DifferenceKeywords, LineageKeywords
@@ -92,7 +93,7 @@ class ItemHandle:
 
         Raises `PreconditionFailed` if the item was changed since it was read.
         """
-        body = as_json(ItemRevert(revision=revision, message=message))
+        body = as_json(checked(ItemRevert, revision=revision, message=message))
         response = self.transport.send("POST", f"{self.url}/revert", content=body, headers=self._if_match())
         return self._renewed(read_model(Item, response))
 
@@ -122,7 +123,7 @@ class ItemHandle:
         `options` are those of `LineageOptions`, such as `direction="inputs"` and `depth=1`. Raises `NotFound` if there
         is no such revision.
         """
-        request = LineageRequest.model_validate({"revision": revision, **options})
+        request = checked(LineageRequest, {"revision": revision, **options})
         params = request.model_dump(mode="json", exclude_defaults=True)
         return self.transport.get(LineageGraph, f"{self.url}/lineage-graph", params)
 
@@ -145,8 +146,9 @@ class ItemHandle:
         compared. `options` are those of `DifferenceOptions`, such as `threshold_deg=5`; `plot` requests values to draw.
         Raises `NotFound` if there is no such revision.
         """
-        request = DifferenceRequest.model_validate(
-            {"from": before, "to": after, "to_item": None if other is None else other.id, "plot": plot, **options}
+        request = checked(
+            DifferenceRequest,
+            {"from": before, "to": after, "to_item": None if other is None else other.id, "plot": plot, **options},
         )
         params = request.model_dump(mode="json", by_alias=True, exclude_defaults=True)
         tree, _ = self.transport.get_tree(f"{self.url}/difference", params)
@@ -160,14 +162,18 @@ class ItemHandle:
         revision: int | None = None,
         beside: TakenPaths | None = None,
         allow_expired_consent: str | None = None,
+        fold_positions: bool = False,
         **options: str | None,
     ) -> Path:
         """Write a revision of the item, by default the newest, to `folder` as a file of `format`; return its path.
 
         If several items are exported with the same `beside`, files of the same name get numbers. If the consent for a
         clip has ended, raises `Conflict`, unless `allow_expired_consent` gives a reason to export the clip
-        nevertheless. The server records the reason; the caller must be a maintainer or owner.
+        nevertheless. The server records the reason; the caller must be a maintainer or owner. `fold_positions` gives
+        positions to the root of a BVH file alone, for programs that ignore those of other joints.
         """
+        if fold_positions:
+            options |= {"fold_positions": "true"}
         if allow_expired_consent is not None:
             options |= {"allow_expired_consent": "true", "consent_reason": allow_expired_consent}
         return download(
@@ -309,7 +315,9 @@ class Items(Generic[Handle]):
         message: str = "",
     ) -> Handle:
         """Create an item from its parts, which may contain numpy arrays. Raises `Conflict` if the name is taken."""
-        wanted = ItemCreate(name=name, collection=collection, tags=several(tags), parts=dict(parts), message=message)
+        wanted = checked(
+            ItemCreate, name=name, collection=collection, tags=several(tags), parts=dict(parts), message=message
+        )
         response = self.transport.send_tree("POST", self.url, wanted.model_dump(by_alias=True))
         return self._handle(read_model(Item, response))
 

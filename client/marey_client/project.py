@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Unpack
 
 from marey_client.access import Members, change_quotas
+from marey_client.arguments import checked
 from marey_client.audit import AuditConditions, read_audit
 from marey_client.handles.bisections import read_range
 from marey_client.handles.coverage_streams import CoverageStreams
@@ -132,7 +133,7 @@ class ProjectHandle(JobSubmission):
         in notebooks; `shown` overrides this. Uploading the same files again changes nothing. Raises the errors of
         `find_files`, and `NotFound` if there is no such project.
         """
-        found, chosen = find_files(places), ImportOptions.model_validate(options)
+        found, chosen = find_files(places), checked(ImportOptions, options)
         self.read()  # a missing project is an error before any bytes are sent
         with progress(shown) as advance:
             return upload(self, found, chosen, advance)
@@ -169,7 +170,7 @@ class ProjectHandle(JobSubmission):
         """
         handle = self.datasets.at(dataset)
         evaluations = VersionEvaluations(
-            self, handle, metric, EvaluateParams.model_validate(options),
+            self, handle, metric, checked(EvaluateParams, options),
             path=path, into=into, normaliser=normaliser, priority=priority, cache=cache, on_progress=on_progress,
         )  # fmt: skip
         return find_crossing(read_range(handle, good, bad, first_parent=first_parent), evaluations, limit, on_measured)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Unpack
 
+from marey_client.arguments import checked
 from marey_client.blobs import Blobs
 from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.clips import ClipHandle
@@ -24,6 +25,7 @@ from marey_client.jobs import Jobs
 from marey_client.keywords.asking import PurgeKeywords, SimilarKeywords
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
+from marey_schemas.documents.skeleton_merges import SkeletonMergeAnswer, SkeletonMergeRequest
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, PurgeAnswer, PurgeRequest
@@ -113,8 +115,9 @@ class ProjectItems:
         clip = self.clips[clip] if isinstance(clip, str) else clip
         first, end = (frames, frames + 1) if isinstance(frames, int) else frames
         named = {} if metric is None else {"metric": metric if isinstance(metric, str) else metric.id}
-        request = SimilarRequest.model_validate(
-            {"clip": clip.id, "revision": clip.item.revision, "frames": (first, end), **named, **options}
+        request = checked(
+            SimilarRequest,
+            {"clip": clip.id, "revision": clip.item.revision, "frames": (first, end), **named, **options},
         )
         return self.transport.post(SimilarAnswer, f"/projects/{self.name}/similar", request)
 
@@ -130,7 +133,30 @@ class ProjectItems:
         `preview=True`, nothing changes. Items that something still needs are not purged; the answer lists these items,
         each with the objects that need it. Raises `Conflict` if `item` names a single item that something needs.
         """
-        return purge_items(self.transport, self.name, PurgeRequest.model_validate(conditions))
+        return purge_items(self.transport, self.name, checked(PurgeRequest, conditions))
+
+    def merge_skeletons(
+        self,
+        skeletons: Iterable[SkeletonHandle | str] = (),
+        *,
+        keep: SkeletonHandle | str | None = None,
+        dry_run: bool = False,
+    ) -> SkeletonMergeAnswer:
+        """Merge skeletons of one rig into one of them, to which their clips and models move. For maintainers.
+
+        Skeletons are handles, paths or ids; without `skeletons`, all duplicates of the project are merged. `keep` is
+        the skeleton that remains. With `dry_run`, nothing changes. Raises `Invalid` for skeletons of different rigs.
+        """
+        request = checked(
+            SkeletonMergeRequest,
+            skeletons=tuple(map(self._skeleton_id, skeletons)),
+            kept=None if keep is None else self._skeleton_id(keep),
+            dry_run=dry_run,
+        )
+        return self.transport.post(SkeletonMergeAnswer, f"/projects/{self.name}/skeleton-merges", request)
+
+    def _skeleton_id(self, skeleton: SkeletonHandle | str) -> str:
+        return (self.skeletons[skeleton] if isinstance(skeleton, str) else skeleton).id
 
     def purge_dataset(self, name: str, *, preview: bool = False) -> DatasetPurgeAnswer:
         """Delete a deleted dataset for good: versions, branches, tags and proposals. For owners of the project.
@@ -138,7 +164,7 @@ class ProjectItems:
         `name` is the name or the id of the dataset. With `preview`, nothing changes, and the answer says what cites the
         versions. Raises `Conflict` if something cites a version.
         """
-        request = DatasetPurgeRequest(dataset=name, preview=preview)
+        request = checked(DatasetPurgeRequest, dataset=name, preview=preview)
         return self.transport.post(DatasetPurgeAnswer, f"/projects/{self.name}/dataset-purges", request)
 
     def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
@@ -174,12 +200,12 @@ class Collections:
 
     def create(self, path: str) -> Collection:
         """Create a folder, with its parents if they are missing."""
-        return self.transport.post(Collection, self.url, CollectionCreate(path=path))
+        return self.transport.post(Collection, self.url, checked(CollectionCreate, path=path))
 
     def move(self, collection: Collection, path: str) -> Collection:
         """Move or rename a folder with its contents."""
         state = {"If-Match": f'"{collection.rev}.json"'}
-        body = as_json(CollectionChange(path=path))
+        body = as_json(checked(CollectionChange, path=path))
         return read_model(
             Collection, self.transport.send("PATCH", f"{self.url}/{collection.id}", content=body, headers=state)
         )

@@ -14,6 +14,9 @@ from marey_schemas.backoff import Backoff
 NEVER_ARRIVED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 """Failures after which the server cannot have seen the request."""
 
+TRIES_IN_SILENCE = 3
+"""Number of tries after which waits are reported; the waits before take less than two seconds together."""
+
 BUSY_STATUSES = frozenset({429, 502, 503, 504})
 """HTTP statuses that mean "not now": the server has done nothing."""
 
@@ -28,6 +31,7 @@ class Retries:
     first_s : longest wait before the second try, in seconds; the wait doubles with each further try
     longest_s : limit of the doubled wait, in seconds
     total_s : longest time between the first try and the start of the last one, in seconds
+    notice : called with a text before the waits after the second try
     sleep, random_unit : replaceable in tests; `random_unit` draws from [0, 1)
     """
 
@@ -35,6 +39,7 @@ class Retries:
     first_s: float = 0.25
     longest_s: float = 15.0
     total_s: float = 90.0
+    notice: Callable[[str], None] | None = field(default=None, repr=False)
     sleep: Callable[[float], None] = field(default=time.sleep, repr=False)
     random_unit: Callable[[], float] = field(default=random.random, repr=False)
 
@@ -42,6 +47,12 @@ class Retries:
         """Return how many seconds to wait after `tried` tries; at least as long as the server requested."""
         backoff = Backoff(self.first_s, self.longest_s, random_unit=self.random_unit)
         return backoff.delay_s(tried) + (retry_after_s or 0.0)
+
+    def report_wait(self, url: str, tried: int, elapsed_s: float, *, busy: bool) -> None:
+        """Report, after the first waits, that the server does not answer and how long tries go on."""
+        if self.notice is not None and tried >= TRIES_IN_SILENCE:
+            left_s = max(1, round(self.total_s - elapsed_s))
+            self.notice(f"{url} {'is busy' if busy else 'does not answer'}; trying again for {left_s} s")
 
 
 ONCE = Retries(tries=1)

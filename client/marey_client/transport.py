@@ -233,6 +233,8 @@ class Transport:
             if not again or late or tried >= most:
                 raise failure
             log.info("%s: %s; trying again in %.1f s", what, failure, delay_s)
+            busy = isinstance(failure, RequestFailed)
+            self.retries.report_wait(self.url, tried, time.monotonic() - started, busy=busy)
             self.retries.sleep(delay_s)
         raise AssertionError("unreachable")
 

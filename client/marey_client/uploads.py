@@ -63,8 +63,12 @@ class UploadReport:
 def upload(project: ProjectItems, found: FoundFiles, options: ImportOptions, notice: Notice) -> UploadReport:
     """Import files that were found, and restore the take records of clips that an export wrote.
 
-    `options` without a unit get the unit of the export from which all files come, if there is one.
+    `options` without a unit get the unit of the export from which all files come, if there is one. Their skeleton is an
+    id or a path. Raises `NoSuchPath` if there is no such skeleton.
     """
+    if options.skeleton is not None:
+        found_id = project.skeletons[options.skeleton].id
+        options = ImportOptions.model_validate({**options.model_dump(exclude_unset=True), "skeleton": found_id})
     if found.unit is not None and not options.model_fields_set & {"unit", "unit_scale_m"}:
         options = ImportOptions.model_validate({**options.model_dump(exclude_unset=True), "unit": found.unit})
     entries = project.imports.upload(found.files, options, notice=notice)
@@ -75,8 +79,13 @@ def upload(project: ProjectItems, found: FoundFiles, options: ImportOptions, not
 def outcomes_text(entries: Sequence[ImportEntry]) -> str:
     """Return the numbers of files by their outcomes, and the number of frames, as text."""
     counts = Counter(map(_outcome, entries))
-    outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
-    frames = sum(entry.frames or 0 for entry in entries)
+    changed = sum(entry.skeleton_changed for entry in entries)
+    words = {one: f"{counts[one]} {one}" for one in OUTCOMES}
+    words[NEW_REVISION] = counted(counts[NEW_REVISION], NEW_REVISION)
+    if changed:
+        words[NEW_REVISION] += f" (skeleton changed{'' if changed == counts[NEW_REVISION] else f' in {changed}'})"
+    outcomes = ", ".join(words[one] for one in OUTCOMES if counts[one])
+    frames = sum(entry.frames or 0 for entry in entries if entry.error is None)
     return f"{counted(len(entries), 'file')}: {outcomes}; {counted(frames, 'frame')}"
 
 

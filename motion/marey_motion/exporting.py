@@ -20,6 +20,7 @@ from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.formats import DEFAULT_UNIT, format_named
 from marey_schemas.item_files import ItemToExport
+from marey_schemas.options.exporting import MotionFileOptions
 
 _CHANNELS: TypeAdapter[tuple[tuple[str, ...], ...]] = TypeAdapter(tuple[tuple[str, ...], ...])
 
@@ -41,7 +42,12 @@ class ExportedFile:
 
 
 def write_clip_file(
-    clip: Clip, file_format: str, *, unit: str | float = DEFAULT_UNIT, info: Mapping[str, Any] | None = None
+    clip: Clip,
+    file_format: str,
+    *,
+    unit: str | float = DEFAULT_UNIT,
+    info: Mapping[str, Any] | None = None,
+    fold_positions: bool = False,
 ) -> ExportedFile:
     """Write a clip in one of `marey_schemas.formats.MOTION_FORMATS`.
 
@@ -52,6 +58,7 @@ def write_clip_file(
     unit : str or float    unit of length, by name or in metres; used by formats without a fixed unit
     info : mapping, optional    the clip's `info` document, which contains the rotation orders of the imported file;
         Euler angles get these orders
+    fold_positions : bool    in formats with position channels, give positions to the root alone
 
     Returns
     -------
@@ -66,15 +73,14 @@ def write_clip_file(
     if len(row.units) > 1:
         options["unit"] = unit
     if row.euler:
-        options["source"] = _source(clip, info or {})
+        options |= {"source": _source(clip, info or {}), "fold_positions": fold_positions}
     return ExportedFile(write_motion(clip, file_format, **options), row.endings[0], row.media_type)
 
 
 def write_motion_file(
     source: ItemToExport,
-    file_format: str,
+    options: MotionFileOptions,
     *,
-    unit: str | float = DEFAULT_UNIT,
     time: Literal["canonical", "source"] = "canonical",
     skeleton: Skeleton | None = None,
 ) -> ExportedFile:
@@ -83,8 +89,7 @@ def write_motion_file(
     Parameters
     ----------
     source : ItemToExport    the item's documents; `hierarchy` is needed unless `skeleton` is given
-    file_format : str    one of `marey_schemas.formats.MOTION_FORMATS`
-    unit : str or float    unit of length, by name or in metres; used by formats without a fixed unit
+    options : MotionFileOptions    format, one of `marey_schemas.formats.MOTION_FORMATS`, and its options
     time : str    for an aligned clip: "canonical" writes the aligned frames, "source" the restored original clip
     skeleton : Skeleton, optional    the skeleton, if it was already made from `hierarchy`
 
@@ -104,7 +109,9 @@ def write_motion_file(
             clip = restored_clip(clip, AlignmentInfo.model_validate(source.parts["info"]).model_dump())
     except ValidationError as error:
         raise MotionError(str(error), code="bad-document") from error
-    return write_clip_file(clip, file_format, unit=unit, info=source.parts.get("info"))
+    return write_clip_file(
+        clip, options.format, unit=options.unit, info=source.parts.get("info"), fold_positions=options.fold_positions
+    )
 
 
 def _source(clip: Clip, info: Mapping[str, Any]) -> SourceInfo | None:

@@ -91,6 +91,11 @@ class User(Answer):
     administrator: bool
     disabled: bool
     created_at: datetime
+    last_seen_at: datetime | None = Field(
+        None,
+        description="Latest use of a token or an identity of the user, to the hour; null if there is none, or if the "
+        "caller is no administrator. Uses of tokens that were deleted do not count.",
+    )
     rev: int
 
 

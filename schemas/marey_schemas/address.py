@@ -3,6 +3,8 @@
 API = "/api/v1"
 """Prefix of the paths of the REST API. Other paths, such as those of health checks, do not have this prefix."""
 
+SETTINGS_FILE = "marey.toml"
+"""Name of the file with the settings of a server, in its working directory."""
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460
 

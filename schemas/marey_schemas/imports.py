@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import Field, StringConstraints
 
@@ -41,10 +42,15 @@ class ImportEntry(Answer):
     """Result of importing one file."""
 
     name: str
-    status: Literal["created", "unchanged", "failed", "companion"]
+    status: Literal["created", "unchanged", "failed", "companion"] = Field(
+        description="created: the item, or a new revision of it if `revision` is greater than 1."
+    )
     item: str | None = None
     revision: int | None = None
     skeleton: str | None = None
+    skeleton_changed: bool = Field(
+        False, description="Whether the new revision has another skeleton than the revision before."
+    )
     frames: int | None = None
     warnings: tuple[Check, ...] = ()
     error: Refusal | None = None
@@ -66,6 +72,72 @@ def skeleton_output(file_name: str) -> str:
 def notes_output(file_name: str, layer: str) -> str:
     """Return the name that an import job gives to its output with an annotation of a file's clip."""
     return f"{file_name}#notes {layer}"
+
+
+class Made(Protocol):
+    """Revision that was published for a file."""
+
+    @property
+    def item(self) -> str:
+        """Id of the item."""
+
+    @property
+    def revision(self) -> int:
+        """Number of the revision."""
+
+    @property
+    def created(self) -> bool:
+        """Whether the revision is new."""
+
+    @property
+    def skeleton_changed(self) -> bool:
+        """Whether the revision before the new one has another skeleton."""
+
+
+SKELETON_DIFFERS = Refusal(
+    code="skeleton-differs",
+    detail="an item of this name exists with another skeleton; import the file into another folder, or give it a new "
+    "revision with the skeleton of this file by --replace (in requests: replace_skeleton=true)",
+)
+"""Reason for which nothing is published for a file: it would change the skeleton of an item."""
+
+
+def published_entry(entry: ImportEntry, made: Mapping[str, Made]) -> ImportEntry:
+    """Return the entry of a file that was read, completed with what was published for the file.
+
+    `made` contains the published revisions by the names of their drafts. If it lacks the file, the file is refused,
+    because an item of this name has another skeleton. Files without an own item, such as skeletons, have the skeleton.
+    """
+    refused = entry.error is not None and entry.error.code == SKELETON_DIFFERS.code
+    if entry.status not in ("created", "unchanged") and not refused:
+        return entry
+    skeleton = made.get(skeleton_output(entry.name))
+    main = made.get(entry.name) or (skeleton if entry.frames is None else None)
+    if main is None:
+        return entry.model_copy(update={"status": "failed", "error": SKELETON_DIFFERS})
+    return entry.model_copy(
+        update={
+            "status": "created" if main.created else "unchanged",
+            "item": main.item,
+            "revision": main.revision,
+            "skeleton": None if skeleton is None else skeleton.item,
+            "skeleton_changed": main.skeleton_changed,
+            "error": None,
+        }
+    )
+
+
+def published_result(result: Mapping[str, Any], made: Mapping[str, Made]) -> dict[str, Any]:
+    """Return the result of an import job with its entries completed; `made` as in `published_entry`."""
+    read = ImportAnswer.model_validate(result).entries
+    entries = [published_entry(entry, made) for entry in read]
+    stored = [entry for entry in entries if entry.error is None]
+    return {
+        **result,
+        "entries": [entry.model_dump(mode="json", exclude_none=True) for entry in entries],
+        "clips": sum(entry.frames is not None for entry in stored),
+        "frames": sum(entry.frames or 0 for entry in stored),
+    }
 
 
 class ImportAnswer(Answer):

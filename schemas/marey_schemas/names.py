@@ -5,30 +5,49 @@ from typing import Annotated
 
 from pydantic import StringConstraints
 
-ProjectName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$")]
+SLUG = r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$"
+"""Pattern of names that are parts of URLs."""
+_USER = r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$"
+_NAME = r"^[^/\x00-\x1f\x7f]+$"
+_PATH = r"^(?:[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*)?$"
+_TAG = r"^[^,\x00-\x1f\x7f]+$"
+DIGEST_PATTERN = r"^sha256:[0-9a-f]{64}$"
+REF = r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,126}[A-Za-z0-9])?$"
+"""Pattern of names of branches and tags."""
+
+_SLUG_WORDS = "have at most 64 lower-case letters, digits, {signs}, and begin and end with a letter or a digit"
+FORMS = {
+    SLUG: _SLUG_WORDS.format(signs="- and _"),
+    _USER: _SLUG_WORDS.format(signs="dots, - and _"),
+    _NAME: "contain no slash and no control characters, such as line breaks, and not be empty",
+    _PATH: "be names joined by single slashes, without a slash at its beginning or end",
+    _TAG: "contain no comma and no control characters, such as line breaks, and not be empty",
+    DIGEST_PATTERN: "be sha256: followed by 64 hexadecimal digits in lower case",
+    REF: "have at most 128 letters, digits, dots, - and _, and begin and end with a letter or a digit",
+}
+"""What texts with a pattern must do, in words, for messages to people."""
+
+ProjectName = Annotated[str, StringConstraints(pattern=SLUG)]
 """Name of a project: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
 
-UserName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$")]
+UserName = Annotated[str, StringConstraints(pattern=_USER)]
 
 MAX_NAME_LENGTH = 255
 
-ItemName = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME_LENGTH, pattern=r"^[^/\x00-\x1f\x7f]+$")]
+ItemName = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME_LENGTH, pattern=_NAME)]
 """Name of an item: any printable text without a slash."""
 
 NameSuffix = Annotated[str, StringConstraints(max_length=64, pattern=r"^[^/\x00-\x1f\x7f]*$")]
 """Text that can be appended to a name."""
 
-CollectionPath = Annotated[
-    str, StringConstraints(max_length=1024, pattern=r"^(?:[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*)?$")
-]
+CollectionPath = Annotated[str, StringConstraints(max_length=1024, pattern=_PATH)]
 """Path of a collection: names joined by `/`, without a leading or trailing slash; the empty path is the root."""
 
-Tag = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^,\x00-\x1f\x7f]+$")]
+Tag = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=_TAG)]
 
 MOST_TAGS = 64
 """Greatest number of tags of an item."""
 
-DIGEST_PATTERN = r"^sha256:[0-9a-f]{64}$"
 Digest = Annotated[str, StringConstraints(pattern=DIGEST_PATTERN)]
 """Digest of bytes: `sha256:` and 64 hexadecimal digits."""
 
@@ -45,7 +64,7 @@ MAX_LABEL_LENGTH = 255
 
 Label = Annotated[str, StringConstraints(min_length=1, max_length=MAX_LABEL_LENGTH)]
 
-LayerName = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^/\x00-\x1f\x7f]+$")]
+LayerName = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=_NAME)]
 
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 

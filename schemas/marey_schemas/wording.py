@@ -9,6 +9,9 @@ NAMES_SHOWN = 5
 """Greatest number of names that a message lists."""
 
 
+_ABOUT_PATTERN = "String should match pattern '"
+
+
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun, in the plural unless the number is 1: "1 frame", "103,568 trajectories"."""
     if number == 1:
@@ -29,9 +32,14 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     return by_lower[near[0]] if near else None
 
 
-def without_prefix(message: str) -> str:
-    """Return a message of pydantic without the prefix "Value error, ", which marks the text of a `ValueError`."""
-    return message.removeprefix("Value error, ")
+def plain_reason(message: str) -> str:
+    """Return a message of pydantic for people: without "Value error, ", and with words instead of a pattern."""
+    if not message.startswith(_ABOUT_PATTERN):
+        return message.removeprefix("Value error, ")
+    from marey_schemas.names import FORMS  # with pydantic, which the help of the command line does not load
+
+    pattern = message[len(_ABOUT_PATTERN) : -1]
+    return f"the text must {FORMS.get(pattern, 'have another form; it may contain a character that is not allowed')}"
 
 
 def printable(text: str) -> str:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import sqlite3
 import sys
 import time
-from collections.abc import Callable, Coroutine, Iterator
+import tomllib
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -20,10 +22,11 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from marey_schemas.address import SETTINGS_FILE
 from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.log_lines import usual_form
-from marey_schemas.wording import counted, without_prefix
-from marey_server.process.settings import Settings
+from marey_schemas.wording import counted, plain_reason
+from marey_server.process.settings import PREFIX, Settings
 
 PROGRESS_EVERY_S = 5.0
 
@@ -103,10 +106,26 @@ def read_settings(**given: Any) -> Settings:
     try:
         return Settings(**given)
     except ValidationError as error:
-        wrong = "; ".join(
-            f"{'.'.join(map(str, each['loc']))}: {without_prefix(each['msg'])}" for each in error.errors()
-        )
+        wrong = "; ".join(f"{_setting_at(each['loc'], given)}: {plain_reason(each['msg'])}" for each in error.errors())
         raise CommandFailed(f"invalid setting: {wrong}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CommandFailed(f"{SETTINGS_FILE} cannot be read as TOML: {error}") from None
+    except OSError as error:
+        raise CommandFailed(f"{error.filename or SETTINGS_FILE} cannot be read: {error.strerror}") from None
+
+
+def _setting_at(steps: Sequence[int | str], given: Mapping[str, Any]) -> str:
+    """Return the name of a setting, after the file and the line that set it unless a flag or a variable did."""
+    name, whole = str(steps[0]) if steps else "", ".".join(map(str, steps))
+    if given.get(name) is not None or f"{PREFIX}{name}".upper() in map(str.upper, os.environ):
+        return whole
+    try:
+        lines = Path(SETTINGS_FILE).read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return whole
+    sets = re.compile(rf"\s*\[*\s*[\"']?{re.escape(name)}[\"']?\s*[=.\]]")
+    number = next((number for number, line in enumerate(lines, 1) if sets.match(line)), None)
+    return whole if number is None else f"{SETTINGS_FILE}, line {number}: {whole}"
 
 
 def upgrade(*, while_serving: bool = False, finish: bool = False, **settings: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from marey_schemas.problems import FieldError
-from marey_schemas.wording import without_prefix
+from marey_schemas.wording import plain_reason
 
 MAX_ERRORS = 50
 
@@ -36,7 +36,7 @@ def field_errors(
         FieldError(
             pointer=pointer(_steps(entry["loc"], tree, may_lack_last=entry["type"] == "missing")),
             code=entry["type"].replace("_", "-"),
-            detail=without_prefix(entry["msg"]),
+            detail=plain_reason(entry["msg"]),
         )
         for entry in entries[:MAX_ERRORS]
     ]

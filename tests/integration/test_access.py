@@ -144,6 +144,7 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "GET /projects/{project}/webhooks/{webhook}/deliveries": "owner",
         "GET /projects/{project}/webhooks/{webhook}/deliveries/{delivery}": "owner",
         "POST /projects/{project}/webhooks/{webhook}/deliveries/{delivery}/redeliver": "owner",
+        "POST /projects/{project}/skeleton-merges": "maintainer",
         "POST /projects/{project}/purges": "owner",
         "POST /projects/{project}/dataset-purges": "owner",
         "PUT /projects/{project}/collections/{collection}/roles/{user}": "owner",

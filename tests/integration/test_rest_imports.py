@@ -205,6 +205,10 @@ def test_the_original_comes_back_byte_for_byte_under_its_name(owner: httpx.Clien
 def test_an_exported_bvh_moves_as_the_imported_one(owner: httpx.Client) -> None:
     item = send(owner, {"walk.bvh": bvh()}, unit="cm").json()["entries"][0]["item"]
     exported = owner.get(f"/projects/lab/clips/{item}/export", params={"format": "bvh", "unit": "m"})
+    folded = owner.get(f"/projects/lab/clips/{item}/export", params={"format": "bvh", "fold_positions": "true"})
+    assert folded.content.count(b"position") == 3
+    refused = owner.get(f"/projects/lab/clips/{item}/export", params={"format": "npz", "fold_positions": "true"})
+    assert (refused.status_code, "use bvh" in refused.text) == (400, True)
     assert exported.headers["Content-Disposition"].startswith('attachment; filename="walk.bvh"')
     ours = read_motion(exported.content, "walk.bvh").clip
     theirs = read_motion(bvh(), "walk.bvh").clip

@@ -11,12 +11,17 @@ from pymotion.rotations import quat_np
 from tests.support.tiers import is_soak
 
 
-def positions_by_another_loader(path: Path) -> NDArray[np.float64]:
-    """Return the joint positions (F, J, 3) of a BVH file, in the unit and the axes of the file."""
+def positions_by_another_loader(path: Path, *, only_root: bool = False) -> NDArray[np.float64]:
+    """Return the joint positions (F, J, 3) of a BVH file, in the unit and the axes of the file.
+
+    With `only_root`, position channels of other joints are ignored, as some programs do.
+    """
     loader = BVH()
     loader.load(str(path))
-    rotations, positions, parents, *_ = loader.get_data()
+    rotations, positions, parents, offsets, *_ = loader.get_data()
     turned, placed = rotations.copy(), positions.copy()
+    if only_root:
+        positions[:, 1:] = offsets[1:]
     for joint, parent in enumerate(parents):
         if joint:
             turned[:, joint] = quat_np.mul(turned[:, parent], rotations[:, joint])

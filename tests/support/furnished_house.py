@@ -108,6 +108,7 @@ BODIES: dict[str, Any] = {
     },
     "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
+    "SkeletonMergeRequest": {"dry_run": True},
     "PurgeRequest": {"collection": "", "preview": True},
     "DatasetPurgeRequest": {"dataset": "deleted", "preview": True},
     "ItemRevert": {"revision": 1},

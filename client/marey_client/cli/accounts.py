@@ -17,6 +17,7 @@ from marey_schemas.sizes import DAY_S, LOGIN_DAYS, LONGEST_LOGIN_DAYS
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
+    from marey_schemas.access import User
 
 user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage users (for administrators).")
 
@@ -161,10 +162,21 @@ def list_users(context: typer.Context, as_json: AsJson = False) -> None:
     if as_json:
         return print_json(users)
     rows = [
-        (one.name, one.display_name, _yes(one.administrator), _yes(one.disabled), one.created_at.date())
+        (
+            one.name,
+            one.display_name,
+            _yes(one.administrator),
+            _yes(one.disabled),
+            one.created_at.date(),
+            _seen(one),
+        )
         for one in users
     ]
-    return print_table(("name", "shown as", "administrator", "disabled", "since"), rows)
+    return print_table(("name", "shown as", "administrator", "disabled", "since", "last seen"), rows)
+
+
+def _seen(one: User) -> str:
+    return "" if one.last_seen_at is None else f"{one.last_seen_at:%Y-%m-%d %H} h"
 
 
 @user.command("show")

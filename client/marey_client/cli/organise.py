@@ -24,7 +24,7 @@ from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.invocation import AsJson, QueryText, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.progress import progress
-from marey_schemas.wording import counted
+from marey_schemas.wording import counted, plain_reason
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
@@ -270,7 +270,7 @@ def _with_tags(thing: Thing, added: Sequence[str], removed: Set[str]) -> ItemCha
     try:
         return ItemChange(tags=tuple(tags))
     except ValidationError as error:
-        reason = error.errors(include_url=False)[0]["msg"]
+        reason = plain_reason(error.errors(include_url=False)[0]["msg"])
         raise WrongUsage(
             f"{thing.place} cannot have {counted(len(tags), 'tag')}: {reason}; nothing was changed"
         ) from None

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.terminal.failures import WrongUsage
@@ -20,6 +22,16 @@ if TYPE_CHECKING:
 
 _REVISION = re.compile(r"(.+)@([1-9][0-9]{0,8})")
 _VERSION = re.compile(r"([^/@]+)@([^/@]+)(?:/(.+))?")
+
+
+RevisionNumber = Annotated[
+    int | None, typer.Option("--revision", min=1, help="Number of the revision; the same as @NUMBER after the name.")
+]
+
+
+def at_revision(place: str, revision: int | None) -> str:
+    """Return the address of a revision of the item at `place`; without a revision, `place` itself."""
+    return place if revision is None else f"{place.rstrip('/')}@{revision}"
 
 
 def require_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tuple[Any, int | None]:

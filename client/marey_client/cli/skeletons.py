@@ -1,4 +1,4 @@
-"""Commands `skeleton map` and `skeleton axes`."""
+"""Commands `skeleton map`, `skeleton axes` and `skeleton merge`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from typing import Annotated
 
 import typer
 
-from marey_client.cli.addresses import Address, require_item
+from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 
 skeleton = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Edit the joint mapping and the joint axes of skeletons."
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="Edit the joint mapping and the joint axes of skeletons, and merge skeletons.",
 )
 
 
@@ -94,6 +96,45 @@ def joint_axes(
         return print_json(shown)
     rows = [(name, _text(axes.twist), _text(axes.swing)) for name, axes in shown.items()]
     return print_table(("joint", "twist", "swing"), rows)
+
+
+@skeleton.command("merge")
+def merge(
+    context: typer.Context,
+    places: Annotated[
+        list[str], typer.Argument(help="A project, or skeletons of one rig: project/folder/name, or project/id.")
+    ],
+    keep: Annotated[
+        str | None, typer.Option(help="The skeleton that remains: project/folder/name, or project/id.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be merged, and change nothing.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Merge skeletons of one rig, such as those of takes that an earlier version gave a skeleton each.
+
+    Skeletons are one rig if they differ only in the offset of the root, in offsets that the motions replace, or by
+    rounding. Clips and models get a new revision with the kept skeleton and the same motion; the others are deleted.
+    """
+    from marey_schemas.kinds import Kind
+
+    addresses = addresses_in_one_project([*places, *([keep] if keep else ())])
+    if len(places) > 1 and any(not one.path for one in addresses):
+        raise WrongUsage("name either a project or skeletons in it, not both")
+    with connect(context) as marey:
+        project = marey.project(addresses[0].project)
+        found = [require_item(marey, one, [Kind.SKELETON]) for one in addresses if one.path]
+        kept = found.pop() if keep else None
+        answer = project.merge_skeletons(found, keep=kept, dry_run=dry_run)
+    if as_json:
+        return print_json(answer)
+    for rig in answer.rigs:
+        for one in rig.merged:
+            moved = ", ".join(f"{n} {kind if n == 1 else Kind(kind).plural}" for kind, n in sorted(one.moved.items()))
+            done = "would be merged" if answer.dry_run else "merged"
+            print_message(f"{one.path} {done} into {rig.kept.path}; {moved or 'nothing used it'}")
+    if not answer.rigs:
+        print_message("no skeletons of one rig; nothing to merge")
+    return None
 
 
 def _assigned(assignments: list[str], known: set[str], mapped: Mapping[str, str]) -> dict[str, str]:

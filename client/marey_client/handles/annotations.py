@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from marey_client.arguments import checked
 from marey_client.items import ItemHandle
 from marey_client.one_or_several import several
 from marey_client.transport import as_json, read_model
@@ -27,7 +28,7 @@ class AnnotationHandle(ItemHandle):
         annotation was changed since it was read, and `RequestFailed` if a command cannot be applied; the text of the
         error names this command.
         """
-        change = AnnotationChange.model_validate({"commands": several(commands), "message": message})
+        change = checked(AnnotationChange, {"commands": several(commands), "message": message})
         response = self.transport.send(
             "POST", f"{self.url}/commands", content=as_json(change), headers=self._if_match()
         )

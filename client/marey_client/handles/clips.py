@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Unpack
 
+from marey_client.arguments import checked
 from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.edits import Commands, preview_edit
 from marey_client.items import Items
@@ -48,7 +49,7 @@ class ClipHandle(PosesHandle):
 
         `content` has the fields `segments` and `keyframes` of `Annotation`; without these, the annotation is empty.
         """
-        document = Annotation.model_validate({"clip": self.as_input().model_dump(), "layer": layer, **content})
+        document = checked(Annotation, {"clip": self.as_input().model_dump(), "layer": layer, **content})
         return Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle).create(
             name or f"{self.name} {layer}",
             {"annotation": document.model_dump(mode="json", by_alias=True)},
@@ -73,6 +74,6 @@ class ClipHandle(PosesHandle):
 
         `options` are those of `AnnotationImport`, such as `layer="phases"` or `end_index="exclusive"`.
         """
-        wanted = AnnotationImport.model_validate({"document": document, **options})
+        wanted = checked(AnnotationImport, {"document": document, **options})
         made = self.transport.post(Item, f"{self.url}/annotations", wanted)
         return AnnotationHandle(self.transport, self.project, made)

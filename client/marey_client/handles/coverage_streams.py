@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.arguments import checked
 from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Transport, read_model
@@ -44,8 +45,9 @@ class CoverageStreams:
         coverage is the initial state. `options` are those of `CoverageStreamCreate`, for example
         `turn_rates_deg_s=(-90, 0, 90)`.
         """
-        request = CoverageStreamCreate.model_validate(
-            {"frame_rate_hz": frame_rate_hz, "skeleton": skeleton, "evaluation": evaluation, **options}
+        request = checked(
+            CoverageStreamCreate,
+            {"frame_rate_hz": frame_rate_hz, "skeleton": skeleton, "evaluation": evaluation, **options},
         )
         return CoverageStreamHandle(self.transport, self.url, self.transport.post(CoverageStream, self.url, request))
 

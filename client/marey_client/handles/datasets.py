@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from marey_client.arguments import checked
 from marey_client.errors import Conflict, NotFound, RequestFailed
 from marey_client.handles.versions import DatasetHandle
 from marey_client.paging import pages
@@ -47,7 +48,7 @@ class Datasets:
 
     def create(self, name: str, *, collection: str | None = None, description: str = "") -> DatasetHandle:
         """Create a dataset, whose commits record the content of the folder `collection` if one is given."""
-        request = DatasetCreate(name=name, collection=collection, description=description)
+        request = checked(DatasetCreate, name=name, collection=collection, description=description)
         self.transport.post(Dataset, self.url, request)
         return self.at(name)
 

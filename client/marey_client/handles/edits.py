@@ -7,6 +7,7 @@ from typing import Any, Unpack
 
 from pydantic import BaseModel
 
+from marey_client.arguments import checked
 from marey_client.items import ItemHandle, Items
 from marey_client.keywords.asking import EditPreviewKeywords
 from marey_client.one_or_several import several
@@ -62,7 +63,7 @@ def as_edit(commands: EditDocument | Command | Sequence[Command], *, title: str 
     """Return commands as the document of an edit. Raises `ValidationError`, which names the faulty command."""
     if isinstance(commands, EditDocument):
         return commands if not title else commands.model_copy(update={"title": title})
-    return EditDocument.model_validate({"title": title, "commands": several(commands)})
+    return checked(EditDocument, {"title": title, "commands": several(commands)})
 
 
 def preview_edit(
@@ -77,13 +78,9 @@ def preview_edit(
     `options` are those of `EditPreviewRequest`.
     """
     if isinstance(commands, EditHandle):
-        request = EditPreviewRequest.model_validate(
-            {"edit": commands.as_input().model_dump(), "frames": frames, **options}
-        )
+        request = checked(EditPreviewRequest, {"edit": commands.as_input().model_dump(), "frames": frames, **options})
     else:
-        request = EditPreviewRequest.model_validate(
-            {"commands": as_edit(commands).commands, "frames": frames, **options}
-        )
+        request = checked(EditPreviewRequest, {"commands": as_edit(commands).commands, "frames": frames, **options})
     response = transport.send(
         "POST", f"{url}/edit-preview", content=as_json(request), headers={"Accept": BLOCKS}, repeatable=True
     )

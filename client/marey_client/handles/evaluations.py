@@ -11,6 +11,8 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.arguments import checked
+from marey_client.errors import BadArgument
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.findings import Findings
 from marey_client.handles.metrics import Metric, metric_choice
@@ -70,7 +72,7 @@ class EvaluationHandle(ReportedHandle):
         """Write the walk graph to a file, as GraphML or JSON according to the ending of `path`; return the path."""
         form = Path(path).suffix.lower().removeprefix(".")
         if form not in ("json", "graphml"):
-            raise ValueError(f"{path}: the file name of a walk graph must end in .json or .graphml")
+            raise BadArgument(f"{path}: the file name of a walk graph must end in .json or .graphml")
         return saved(path, self._walk_graph(form, trial))
 
     def _walk_graph(self, form: str, trial: str | None) -> bytes:
@@ -123,28 +125,28 @@ class EvaluationHandle(ReportedHandle):
     def compare_request(self, *others: EvaluationHandle, **options: Unpack[CompareKeywords]) -> JobCreate:
         """Return the job request of `compare`; `options` are those of `CompareParams`."""
         if not 0 < len(others) < MOST_COMPARED:
-            raise ValueError(f"between 2 and {MOST_COMPARED} evaluations can be compared, not {1 + len(others)}")
+            raise BadArgument(f"between 2 and {MOST_COMPARED} evaluations can be compared, not {1 + len(others)}")
         after, *further = (other.as_input() for other in others)
         inputs: dict[str, Any] = {"before": self.as_input(), "after": after}
         if further:
             inputs["others"] = further
-        return job_request("compare", inputs, CompareParams.model_validate(options))
+        return job_request("compare", inputs, checked(CompareParams, options))
 
     def suggest_request(
         self, candidates: Places[ClipHandle] = (), *, metric: Metric | None = None, **options: Unpack[SuggestKeywords]
     ) -> JobCreate:
         """Return the job request of `suggest`; `options` are those of `SuggestParams`."""
         chosen, named = metric_choice(metric)
-        params = SuggestParams.model_validate({**options, **named})
+        params = checked(SuggestParams, {**options, **named})
         return job_request("suggest", {**self._with_candidates(candidates), **chosen}, params)
 
     def optimise_request(self, candidates: Places[ClipHandle] = (), **options: Unpack[OptimiseKeywords]) -> JobCreate:
         """Return the job request of `optimise`; `options` are those of `OptimiseParams`."""
-        return job_request("optimise", self._with_candidates(candidates), OptimiseParams.model_validate(options))
+        return job_request("optimise", self._with_candidates(candidates), checked(OptimiseParams, options))
 
     def sweep_request(self, **options: Unpack[SweepKeywords]) -> JobCreate:
         """Return the job request of `sweep`; `options` are those of `SweepParams`."""
-        return job_request("sweep", {"evaluation": self.as_input()}, SweepParams.model_validate(options))
+        return job_request("sweep", {"evaluation": self.as_input()}, checked(SweepParams, options))
 
     def _with_candidates(self, candidates: Places[ClipHandle]) -> dict[str, Any]:
         inputs: dict[str, Any] = {"evaluation": self.as_input()}

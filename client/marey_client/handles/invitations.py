@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import timedelta
 
+from marey_client.arguments import checked
 from marey_client.paging import pages
 from marey_client.transport import Transport
 from marey_schemas.access import Role
@@ -40,7 +41,7 @@ class Invitations(_OpenInvitations):
         open invitations.
         """
         lifetime_s = int(lifetime.total_seconds())
-        request = InvitationCreate(role=role, expires_in_s=lifetime_s, uses=uses, note=note)
+        request = checked(InvitationCreate, role=role, expires_in_s=lifetime_s, uses=uses, note=note)
         return self.transport.post(NewInvitation, self.url, request, repeatable=False)
 
 
@@ -61,7 +62,12 @@ class AccountInvitations(_OpenInvitations):
         Only the answer contains the code; send the code to the invited people. Raises `Conflict` if there are too many
         open invitations.
         """
-        request = AccountInvitationCreate(
-            project=project, role=role, expires_in_s=int(lifetime.total_seconds()), uses=uses, note=note
+        request = checked(
+            AccountInvitationCreate,
+            project=project,
+            role=role,
+            expires_in_s=int(lifetime.total_seconds()),
+            uses=uses,
+            note=note,
         )
         return self.transport.post(NewInvitation, self.url, request, repeatable=False)

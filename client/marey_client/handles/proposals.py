@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from marey_client.arguments import checked
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, read_model
 from marey_schemas.datasets.merges import Resolution
@@ -34,7 +35,7 @@ class Proposals:
 
     def open(self, title: str, source: str, *, into: str = MAIN, description: str = "") -> ProposalHandle:
         """Propose to merge a version into a branch. If the version is a branch, its later commits are included."""
-        request = ProposalCreate(title=title, source=source, target=into, description=description)
+        request = checked(ProposalCreate, title=title, source=source, target=into, description=description)
         return self.at(self.transport.post(Proposal, self.url, request).number)
 
     def list(self, state: ProposalState | None = None) -> Iterator[Proposal]:
@@ -70,7 +71,7 @@ class ProposalHandle:
 
         `path` and `kind` name the entry; `frames` is the first frame and the end, which is not included.
         """
-        request = CommentCreate(text=text, path=path, kind=kind, frames=frames)
+        request = checked(CommentCreate, text=text, path=path, kind=kind, frames=frames)
         return self.transport.post(Comment, f"{self.url}/comments", request)
 
     def comments(self) -> Iterator[Comment]:
@@ -79,7 +80,7 @@ class ProposalHandle:
 
     def review(self, verdict: Verdict, text: str = "", *, commit: str | None = None) -> Review:
         """Review the newest commit. Raises `Conflict` if `commit` is given and is not the newest commit."""
-        request = ReviewCreate(verdict=verdict, text=text, commit=commit)
+        request = checked(ReviewCreate, verdict=verdict, text=text, commit=commit)
         return self.transport.post(Review, f"{self.url}/reviews", request)
 
     def reviews(self) -> Iterator[Review]:

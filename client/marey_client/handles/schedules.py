@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from marey_client.arguments import checked
 from marey_client.jobs import Jobs
 from marey_client.paging import pages
 from marey_client.transport import Transport, as_json, read_model
@@ -42,7 +43,7 @@ class Schedules:
         Raises `Conflict` if the name is taken or the project has too many schedules, and `Invalid` if the expression,
         the time zone or the job is not valid.
         """
-        request = ScheduleCreate(
+        request = checked(ScheduleCreate,
             name=name, cron=cron, job=job, timezone=timezone, overlapping=overlapping, paused=paused,
             description=description,
         )  # fmt: skip

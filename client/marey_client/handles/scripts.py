@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from marey_client.arguments import checked
 from marey_client.paging import pages
 from marey_client.transport import Transport
 from marey_schemas.queue.commits import OutputsCommit
@@ -72,7 +73,7 @@ class ScriptHandle:
         If the consent for an input clip has ended, the run fails, unless `allow_expired_consent` gives a reason.
         Raises `Invalid` if a value or an input is wrong.
         """
-        request = ScriptRunCreate(
+        request = checked(ScriptRunCreate,
             values=dict(values or {}), inputs=dict(inputs or {}), into=into, seed=seed, message=message,
             commit=OutputsCommit.of(commit), allow_expired_consent=allow_expired_consent is not None,
             consent_reason=allow_expired_consent,

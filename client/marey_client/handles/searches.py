@@ -8,6 +8,7 @@ from typing import Any, Unpack
 
 from pydantic import BaseModel
 
+from marey_client.arguments import checked
 from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.handles.reports import ReportedHandle
 from marey_client.jobs import Jobs, OnProgress, job_request
@@ -79,9 +80,9 @@ class SearchableHandle(ReportedHandle):
 
     def tree_request(self, **options: Unpack[TreeKeywords]) -> JobCreate:
         """Return the job request of `make_tree`; `options` are those of `TreeParams`."""
-        return job_request("tree", {"model": self.as_input()}, TreeParams.model_validate(options))
+        return job_request("tree", {"model": self.as_input()}, checked(TreeParams, options))
 
 
 def search_request(constraints: Constraints, **options: Unpack[SearchKeywords]) -> SearchRequest:
     """Return a search request with the given constraints; `options` are further fields of `SearchRequest`."""
-    return SearchRequest.model_validate({"constraints": several(constraints), **options})
+    return checked(SearchRequest, {"constraints": several(constraints), **options})

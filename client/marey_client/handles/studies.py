@@ -9,6 +9,8 @@ from datetime import timedelta
 from itertools import combinations
 from typing import Any, Unpack
 
+from marey_client.arguments import checked
+from marey_client.errors import BadArgument
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.findings import Findings
 from marey_client.items import ItemHandle, Items
@@ -47,7 +49,7 @@ class StudyHandle(ItemHandle):
 
         Only maintainers and owners may do this. Raises `Conflict` if the project has too many participants.
         """
-        request = StudyLinksCreate(count=count, expires_in_s=int(lifetime.total_seconds()))
+        request = checked(StudyLinksCreate, count=count, expires_in_s=int(lifetime.total_seconds()))
         return self.transport.post(NewStudyLinks, f"{self.url}/participants", request, repeatable=False)
 
     def participants(self) -> Iterator[StudyParticipant]:
@@ -77,7 +79,7 @@ class StudyHandle(ItemHandle):
 
     def analyse_request(self, **options: Unpack[AnalyseStudyKeywords]) -> JobCreate:
         """Return the job request of `analyse`."""
-        params = AnalyseStudyParams.model_validate(options)
+        params = checked(AnalyseStudyParams, options)
         return job_request("analyse_study", {"study": self.as_input()}, params)
 
 
@@ -101,7 +103,7 @@ class Studies(Items[StudyHandle]):
         `StudyDocument`, such as `trials`, `seconds` and `seed`. Raises `Conflict` if the name is taken.
         """
         if labels is not None and len(labels) != len(clips):
-            raise ValueError(f"there are {len(labels)} labels for {len(clips)} clips; give one label for each clip")
+            raise BadArgument(f"there are {len(labels)} labels for {len(clips)} clips; give one label for each clip")
         named: Sequence[str | None] = [None] * len(clips) if labels is None else labels
         motions = tuple(
             StudyMotion(clip=RevisionRef(item=clip.id, revision=clip.item.revision), label=label)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict, Unpack
 
 from marey_client.access import ANY_STATE
+from marey_client.arguments import checked
 from marey_client.errors import NotFound
 from marey_client.handles.bisections import Bisection, IsBad, OnStep, bisect, read_range
 from marey_client.handles.proposals import Proposals
@@ -95,7 +96,8 @@ class DatasetHandle:
         If the answer is lost, the request is sent again and returns the commit that was made the first time. Raises
         `Conflict` if `expected` is given and is not the newest commit of the branch.
         """
-        request = CommitCreate(
+        request = checked(
+            CommitCreate,
             branch=branch,
             message=message,
             changes=None if changes is None else tuple(changes),
@@ -154,7 +156,8 @@ class DatasetHandle:
         Raises `Conflict` with the code `merge-conflicts` if both sides have changed the same part of an entry and
         `resolutions` do not decide it; the `context` of the error then has the fields of `MergeAnswer`.
         """
-        request = MergeRequest(
+        request = checked(
+            MergeRequest,
             into=into,
             version=version,
             message=message,
@@ -180,7 +183,7 @@ class DatasetHandle:
         return self._pick("reverts", version, options)
 
     def _pick(self, resource: str, version: str, options: PickOptions) -> MergeAnswer:
-        request = PickRequest(version=version, write_id=secrets.token_hex(16), **options)
+        request = checked(PickRequest, version=version, write_id=secrets.token_hex(16), **options)
         return self.transport.post(MergeAnswer, f"{self.url}/{resource}", request)
 
     def blame(self, path: str, kind: Kind, version: str = MAIN) -> EntryOrigins:
@@ -218,7 +221,7 @@ class DatasetHandle:
 
         Raises `Conflict` if the folder has changes that no commit has recorded, unless `discard` is true.
         """
-        request = CheckoutRequest(version=version, query=query, paths=tuple(paths), discard=discard)
+        request = checked(CheckoutRequest, version=version, query=query, paths=tuple(paths), discard=discard)
         return self.transport.post(CheckoutAnswer, f"{self.url}/checkout", request, repeatable=False)
 
     def archive(
@@ -319,11 +322,11 @@ class DatasetHandle:
 
     def create_branch(self, name: str, at: str = MAIN) -> Ref:
         """Create a branch at a version."""
-        return self._create(RefCreate(name=name, kind=RefKind.BRANCH, at=at))
+        return self._create(checked(RefCreate, name=name, kind=RefKind.BRANCH, at=at))
 
     def create_tag(self, name: str, at: str = MAIN) -> Ref:
         """Create a tag at a version. A tag never moves."""
-        return self._create(RefCreate(name=name, kind=RefKind.TAG, at=at))
+        return self._create(checked(RefCreate, name=name, kind=RefKind.TAG, at=at))
 
     def _create(self, request: RefCreate) -> Ref:
         return self.transport.post(Ref, f"{self.url}/refs", request)

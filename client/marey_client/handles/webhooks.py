@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 
+from marey_client.arguments import checked
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.event_kinds import DEFAULT_WEBHOOK_KINDS, ProjectEventKind
@@ -38,7 +39,7 @@ class Webhooks:
         Only the answer contains the secret. Raises `Invalid` if the server does not send to this URL, and `Conflict` if
         the project has too many webhooks.
         """
-        request = WebhookCreate(url=url, kinds=tuple(kinds), description=description)
+        request = checked(WebhookCreate, url=url, kinds=tuple(kinds), description=description)
         return self.transport.post(NewWebhook, self.url, request, repeatable=False)
 
     def list(self) -> Iterator[Webhook]:

@@ -18,8 +18,8 @@ class ImportKeywords(TypedDict, total=False):
     collection: str
     """Folder of the project that receives the clips."""
     skeleton: str | None
-    """Item id of the skeleton that the clips must use; absent: an equal skeleton of the project, or a new one. The
-    command also accepts project/folder/name."""
+    """Item id of the skeleton that the clips must use; `marey upload` and Python also take its path. Absent: an equal
+    skeleton of the project, or a new one."""
     unit: Literal["mm", "cm", "inch", "cmu", "dm", "ft", "m"] | None
     """Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."""
     unit_scale_m: float | None
@@ -39,6 +39,9 @@ class ImportKeywords(TypedDict, total=False):
     """Whether a section of an annotation in a file of Marey's predecessor includes its frame `end_idx`, as in the
     predecessor's editor, or ends before this frame, as in its time warping. Absent: exclusive if sections would overlap
     otherwise, else inclusive."""
+    replace_skeleton: bool
+    """Make a new revision of a clip or model of the same name, even if the file has another skeleton; otherwise such
+    files are refused."""
     trim_rest_pose: bool
     """Remove rest poses at the beginning and at the end of each clip."""
     tags: list[str] | tuple[str, ...]

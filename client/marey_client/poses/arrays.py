@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
+from marey_client.errors import BadArgument
 from marey_client.items import ItemHandle
 from marey_client.one_or_several import several
 from marey_schemas.documents.clips import MotionDocument
@@ -83,15 +84,15 @@ def frames_text(frames: slice | None) -> str | None:
     if frames is None:
         return None
     if not isinstance(frames, slice):
-        raise ValueError(f"frames: give a range such as slice(0, 120), not {frames!r}")
+        raise BadArgument(f"frames: give a range such as slice(0, 120), not {frames!r}")
     if frames.step not in (None, 1):
-        raise ValueError(
+        raise BadArgument(
             f"frames: only ranges with a step of 1 can be requested, not {frames.step}; request "
             "the range, then take every n-th frame of the arrays"
         )
     bounds: tuple[Any, Any] = (frames.start, frames.stop)
     if any(bound is not None and bound < 0 for bound in bounds):
-        raise ValueError(
+        raise BadArgument(
             "frames: negative bounds are not possible, because frames are counted from the start of the clip"
         )
     return ":".join("" if bound is None else str(bound) for bound in bounds)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from marey_client.errors import BadArgument
 from marey_client.extras import room
 from marey_client.poses.arrays import PosedItem, frames_text
 from marey_client.poses.kinematics import rig_of
@@ -32,7 +33,7 @@ class MotionPicture:
         """Write the picture to a file, as SVG; return the path."""
         path = Path(path)
         if path.suffix.lower() != ".svg":
-            raise ValueError(f"{path}: the file name of the picture must end in .svg")
+            raise BadArgument(f"{path}: the file name of the picture must end in .svg")
         path.write_text(self.svg, encoding="utf-8")
         return path
 
@@ -40,11 +41,11 @@ class MotionPicture:
 def draw_poses(clip: PosedItem, frames: slice | None, moments: int) -> MotionPicture:
     """Draw a motion at some moments, at equal distances; only their frames are read."""
     if not 1 <= moments <= MOST_MOMENTS:
-        raise ValueError(f"moments: a picture shows 1 to {MOST_MOMENTS} moments, not {moments}")
+        raise BadArgument(f"moments: a picture shows 1 to {MOST_MOMENTS} moments, not {moments}")
     frames_text(frames)
     chosen = range(*(frames or slice(None)).indices(clip.frames))
     if not chosen:
-        raise ValueError(f"frames: {clip.path!r} has {clip.frames} frames; the range contains none of them")
+        raise BadArgument(f"frames: {clip.path!r} has {clip.frames} frames; the range contains none of them")
     drawing = room("marey_reports.drawing.strips", FIGURES_EXTRA)
     documents = room("marey_motion.documents", FIGURES_EXTRA)
     skeleton = documents.skeleton_from_document(rig_of(clip).hierarchy)

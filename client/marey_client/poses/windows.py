@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from marey_client.errors import BadArgument
 from marey_client.poses.arrays import Joints
 from marey_client.poses.handle import PosesHandle
 
@@ -52,9 +53,9 @@ class MotionWindows:
     ) -> None:
         stride = frames if stride is None else stride
         if frames < 1 or stride < 1:
-            raise ValueError(f"frames and stride must be at least 1, not {frames} and {stride}")
+            raise BadArgument(f"frames and stride must be at least 1, not {frames} and {stride}")
         if content not in Content.__args__:  # type: ignore[attr-defined]
-            raise ValueError(f"content: {content!r} is none of {', '.join(Content.__args__)}")  # type: ignore[attr-defined]
+            raise BadArgument(f"content: {content!r} is none of {', '.join(Content.__args__)}")  # type: ignore[attr-defined]
         self.frames, self.content, self.joints, self.seed = frames, content, joints, seed
         clips = tuple(clips)
         _require_one("frame rate", {clip.path: clip.frame_rate_hz for clip in clips}, "choose clips of one frame rate")
@@ -93,12 +94,12 @@ class MotionWindows:
         take, or if there are fewer groups than parts.
         """
         if not shares or not all(0 < share < float("inf") for share in shares.values()):
-            raise ValueError(f"shares: every part needs a share above 0, not {dict(shares)}")
+            raise BadArgument(f"shares: every part needs a share above 0, not {dict(shares)}")
         groups: dict[str, list[MotionWindow]] = {}
         for window in self.windows:
             groups.setdefault(_group_of(window.clip, by), []).append(window)
         if len(groups) < len(shares):
-            raise ValueError(f"there are {len(groups)} groups by {by}, fewer than the {len(shares)} parts")
+            raise BadArgument(f"there are {len(groups)} groups by {by}, fewer than the {len(shares)} parts")
         order = np.random.default_rng(seed).permutation(sorted(groups))
         wanted = {name: share / sum(shares.values()) * len(self.windows) for name, share in shares.items()}
         parts: dict[str, list[str]] = {name: [] for name in shares}
@@ -124,7 +125,7 @@ def _require_one(what: str, values: Mapping[str, float], remedy: str) -> None:
     examples = {value: path for path, value in reversed(list(values.items()))}
     if len(examples) > 1:
         told = ", ".join(f"{value:g} in {path!r}" for value, path in sorted(examples.items())[:4])
-        raise ValueError(f"the clips have more than one {what}: {told}; {remedy}")
+        raise BadArgument(f"the clips have more than one {what}: {told}; {remedy}")
 
 
 def _group_of(clip: PosesHandle, by: SplitBy) -> str:
@@ -132,5 +133,5 @@ def _group_of(clip: PosesHandle, by: SplitBy) -> str:
         return clip.id
     group = clip.item.summary.get(by)
     if group is None:
-        raise ValueError(f"{clip.path!r} has no {by}; record it with `marey record`, or split by clip")
+        raise BadArgument(f"{clip.path!r} has no {by}; record it with `marey record`, or split by clip")
     return str(group)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Unpack
 
+from marey_client.arguments import checked
 from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.jobs import JobHandle
@@ -150,7 +151,7 @@ class JobSubmission(ProjectItems):
         `options` are the other fields of `AnnotateParams`.
         """
         method = {"method": proposal} if isinstance(proposal, str) else proposal
-        request = annotate_request(self, clips, AnnotateParams.model_validate({"proposal": method, **options}))
+        request = annotate_request(self, clips, checked(AnnotateParams, {"proposal": method, **options}))
         return self._submit(request, into=into, priority=priority, cache=cache, commit=commit)
 
     def cut(
@@ -167,7 +168,7 @@ class JobSubmission(ProjectItems):
 
         `options` are those of `CutParams`, for example `labels=("step_left", "step_right")` or `by_label=True`.
         """
-        request = cut_request(self, annotations, CutParams.model_validate(options))
+        request = cut_request(self, annotations, checked(CutParams, options))
         return self._submit(request, into=into, priority=priority, cache=cache, commit=commit)
 
     def index(
@@ -178,7 +179,7 @@ class JobSubmission(ProjectItems):
         `options` are those of `IndexParams`. If the top folder has an index with this name, it is updated: clips at
         revisions that it has are not read again, and it loses the clips that are not given.
         """
-        request = index_request(self, clips, IndexParams.model_validate(options))
+        request = index_request(self, clips, checked(IndexParams, options))
         return self.submit(request.model_copy(update={"priority": priority, "cache": cache}))
 
     def align(
@@ -199,7 +200,7 @@ class JobSubmission(ProjectItems):
         labels, the default for `annotations` is the annotations of the clips. With a `metric`, perceptual distances are
         the costs of poses.
         """
-        request = align_request(self, clips, annotations, AlignParams.model_validate(options), metric)
+        request = align_request(self, clips, annotations, checked(AlignParams, options), metric)
         return self._submit(request, into=into, priority=priority, cache=cache, commit=commit)
 
     def edit(
@@ -240,7 +241,7 @@ class JobSubmission(ProjectItems):
         `normaliser` is another evaluation, or the id of one: its scaling of features is used, so that the results of
         both evaluations can be compared. With a `metric`, the perceptual distances of transitions are measured, too.
         """
-        request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser, metric)
+        request = evaluate_request(self, clips, checked(EvaluateParams, options), normaliser, metric)
         return self._submit(request, into=into, priority=priority, cache=cache, commit=commit)
 
     def distances(
@@ -278,7 +279,7 @@ class JobSubmission(ProjectItems):
         `QualityParams`, for example `rate_hz=60`. `handles.findings.Quality` reads the result. The numbers are also
         facets of the clips.
         """
-        request = quality_request(self, clips, reference, contacts, QualityParams.model_validate(options))
+        request = quality_request(self, clips, reference, contacts, checked(QualityParams, options))
         return self.submit(request.model_copy(update={"seed": seed, "priority": priority, "cache": cache}))
 
     def evaluation(self, job: Job, *, on_progress: OnProgress | None = None) -> EvaluationHandle:
@@ -300,7 +301,7 @@ class JobSubmission(ProjectItems):
 
         `options` are those of `ModelParams`, for example `name="step"` or `spatial_share=0.98`.
         """
-        request = model_request(self, aligned, ModelParams.model_validate(options))
+        request = model_request(self, aligned, checked(ModelParams, options))
         seeded = request.model_copy(update={"seed": seed})
         return self._submit(seeded, into=into, priority=priority, cache=cache, commit=commit)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias, Unpack
 
+from marey_client.arguments import checked
 from marey_client.errors import NoAnnotations
 from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.clips import ClipHandle
@@ -122,10 +123,10 @@ def edit_request(project: ProjectItems, clips: Clips, commands: Commands, option
     if isinstance(commands, EditHandle):
         edit = commands.document(revision=commands.item.revision)
         inputs["edit"] = commands.as_input()
-        params = EditParams.model_validate(options)
+        params = checked(EditParams, options)
     else:
         edit = as_edit(commands)
-        params = EditParams.model_validate({**options, "commands": edit.commands})
+        params = checked(EditParams, {**options, "commands": edit.commands})
     if edit.sources:
         inputs["sources"] = tuple(ItemInput(item=item) for item in edit.sources)
     if edited := project.edited_rigs(items_at(project.clips, clips)):
@@ -167,7 +168,7 @@ def distances_request(
     clips = resolved(project.clips, clips)
     found = list(items_at(project.clips, clips))
     chosen, named = metric_choice(metric)
-    params = DistancesParams.model_validate({**options, **named})
+    params = checked(DistancesParams, {**options, **named})
     inputs: dict[str, Any] = {"clips": as_inputs(clips), **chosen}
     if len(edited := project.edited_rigs(found)) == 1:
         (inputs["rig"],) = edited
@@ -228,7 +229,7 @@ def plan_model(
     """
     files = [one for one in takes if isinstance(one, LocalFile)] if isinstance(takes, Sequence) else []
     known = _of_files(project, files, options, notice) if files else _of_clips(project, takes, layer)  # type: ignore[arg-type]
-    return ModelPlan.model_validate({"name": name, "into": name, **known, **choices})
+    return checked(ModelPlan, {"name": name, "into": name, **known, **choices})
 
 
 def _of_files(

@@ -6,6 +6,8 @@ rotation channels. This is the most common layout. Positions replace offsets, as
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,7 @@ from marey_motion.formats.frame_times import frame_time_to_write
 from marey_motion.importing.source import SourceInfo
 from marey_motion.importing.units import unit_in_metres
 from marey_motion.kernels import compiled
+from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import Skeleton
 from marey_schemas.formats import DEFAULT_UNIT
 
@@ -30,6 +33,7 @@ def write_bvh(
     unit: str | float = DEFAULT_UNIT,
     rotation_order: str = DEFAULT_ORDER,
     source: SourceInfo | None = None,
+    fold_positions: bool = False,
 ) -> bytes:
     """Write a clip as BVH, Y up.
 
@@ -40,6 +44,8 @@ def write_bvh(
     rotation_order : str    order of the rotations, outermost first; used for joints that have no order in `source`
     source : SourceInfo, optional    record of the file from which the clip was imported; joints of this file keep their
         rotation orders
+    fold_positions : bool    give positions to the root alone (see `with_folded_positions`), for programs that ignore
+        positions of other joints
 
     Returns
     -------
@@ -50,12 +56,54 @@ def write_bvh(
     FormatError    if a length in that unit has more than twelve digits before the decimal point, or if the frame rate
         is less than 1 Hz or more than 100 kHz
     """
+    if fold_positions:
+        clip = with_folded_positions(clip)
     order = _depth_first(clip.skeleton)
     axes = np.array([_axes_of(clip.skeleton, joint, rotation_order, source) for joint in order])
     scale = 1.0 / unit_in_metres(unit)
     lines = _hierarchy(clip, order, axes, scale)
     lines += ["MOTION", f"Frames: {clip.frame_count}", f"Frame Time: {frame_time_to_write(clip.frame_rate_hz)!r}", ""]
     return "\n".join(lines).encode() + format_table(_channel_values(clip, order, axes, scale))
+
+
+def with_folded_positions(clip: Clip) -> Clip:
+    """Make a clip in which only the root is translated.
+
+    Some exporters write the path of the body to the hips below a root that stands still. The root takes over the motion
+    of such a joint: the joint that carries more than half of the joints, and is nearest to the root. It and the joints
+    below it stay exactly where they were. The other translated joints get their median translations as offsets, so the
+    joints below them move by what their bones stretch.
+
+    Parameters
+    ----------
+    clip : Clip    F frames, any translated joints
+
+    Returns
+    -------
+    Clip    F frames without translations; its skeleton has other offsets if several joints were translated
+    """
+    if clip.translations is None:
+        return clip
+    skeleton = clip.skeleton
+    offsets = skeleton.offsets.copy()
+    carrier = _carrier(skeleton, clip.translated_joints)
+    for slot, joint in enumerate(clip.translated_joints):
+        if joint != carrier:
+            offsets[joint] = np.median(clip.translations[:, slot].astype(np.float64), axis=0)
+    still = Clip(replace(skeleton, offsets=offsets), clip.frame_rate_hz, clip.poses)
+    if carrier is None:
+        return still
+    poses = clip.poses.copy()
+    poses[:, :3] += global_positions(clip)[:, carrier] - global_positions(still)[:, carrier]
+    return replace(still, poses=poses)
+
+
+def _carrier(skeleton: Skeleton, translated: tuple[int, ...]) -> int | None:
+    """Return the translated joint nearest to the root with more than half of the joints at or below it, or None."""
+    below: NDArray[np.int64] = np.ones(skeleton.joint_count, np.int64)
+    for joint in range(skeleton.joint_count - 1, 0, -1):
+        below[skeleton.parents[joint]] += below[joint]
+    return next((joint for joint in translated if 2 * below[joint] > skeleton.joint_count), None)
 
 
 def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: SourceInfo | None) -> list[int]:

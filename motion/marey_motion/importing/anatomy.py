@@ -18,7 +18,11 @@ from marey_motion.importing.landmarks import KEPT_SKELETONS, Landmarks, find_lan
 from marey_motion.importing.source import SourceMotion
 from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
 from marey_motion.skeleton import EndSite, Skeleton
+from marey_schemas.documents.standard_joints import SIDES
 from marey_schemas.lru import LruCache
+
+LEG_OF_STATURE = 0.491
+"""Part of the stature that thigh and shank make together (Drillis and Contini, 1966)."""
 
 
 class Anatomy:
@@ -44,6 +48,20 @@ class Anatomy:
         if not landmarks.feet or landmarks.hips is None:
             return None
         return float(np.mean([path_length(self.skeleton, landmarks.hips, foot) for foot in landmarks.feet])) or None
+
+    @cached_property
+    def stature(self) -> float | None:
+        """Stature in the skeleton's unit, estimated from thighs and shanks; None if they are unknown or have no length.
+
+        The trunk is not used, because rigs place the joint of the head differently.
+        """
+        joints = self.mapping.joints
+        legs = [
+            path_length(self.skeleton, self.skeleton.index_of(hip), self.skeleton.index_of(ankle))
+            for side in SIDES
+            if (hip := joints.get(f"{side}_hip")) and (ankle := joints.get(f"{side}_ankle"))
+        ]
+        return float(np.mean(legs)) / LEG_OF_STATURE if any(legs) else None
 
     @cached_property
     def hierarchy(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from marey_motion.documents import skeleton_from_document
 from marey_motion.formats.predecessor.graph import PredecessorGraph
-from marey_motion.importing.anatomy import anatomy_of
+from marey_motion.importing.anatomy import Anatomy, anatomy_of
 from marey_motion.importing.plan import PlannedFile
 from marey_motion.importing.siblings import AxisFinding
 from marey_motion.skeleton import Skeleton
@@ -73,6 +73,7 @@ class ImportedItem:
     """An item to store: its name, collection, tags and documents.
 
     `name` identifies the item within the import: other items refer to it as `{"output": name}` until it is stored.
+    With `same_skeleton`, it is not stored if an item of this name has another skeleton.
     """
 
     name: str
@@ -82,6 +83,7 @@ class ImportedItem:
     parts: Mapping[str, Tree]
     tags: Sequence[str] = ()
     reuse: Literal["by_name", "by_content"] = "by_name"
+    same_skeleton: bool = False
 
 
 @dataclass(frozen=True)
@@ -148,8 +150,17 @@ def skeleton_item(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
     anatomy = anatomy_of(skeleton)
     parts = {"hierarchy": anatomy.hierarchy}
     name = skeleton_output(file.planned.name)
-    item_name = "animal" if anatomy.mapping.is_animal else anatomy.mapping.rig or "skeleton"
-    return ImportedItem(name, Kind.SKELETON, item_name, SKELETON_COLLECTION, parts, reuse="by_content")
+    return ImportedItem(name, Kind.SKELETON, _skeleton_name(anatomy), SKELETON_COLLECTION, parts, reuse="by_content")
+
+
+def _skeleton_name(anatomy: Anatomy) -> str:
+    """Return the name of a new skeleton, such as `mixamo (178 cm)`: the rig, with the stature if it can be measured."""
+    mapping = anatomy.mapping
+    if mapping.is_animal:
+        return "animal"
+    if mapping.rig is None:
+        return "skeleton"
+    return mapping.rig if anatomy.stature is None else f"{mapping.rig} ({round(100 * anatomy.stature)} cm)"
 
 
 def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str, Tree]) -> ImportedItem:
@@ -166,4 +177,7 @@ def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str
     -------
     ImportedItem    the item
     """
-    return ImportedItem(file.planned.name, kind, item_name, file.collection, parts, file.options.tags)
+    return ImportedItem(
+        file.planned.name, kind, item_name, file.collection, parts, file.options.tags,
+        same_skeleton=not file.options.replace_skeleton,
+    )  # fmt: skip

@@ -10,13 +10,13 @@ from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.datasets.protection import Protection
-from marey_schemas.names import CollectionPath
+from marey_schemas.names import REF, SLUG, CollectionPath
 
 MAIN = "main"
 """Name of the branch that every dataset has from the beginning."""
-DatasetName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$")]
+DatasetName = Annotated[str, StringConstraints(pattern=SLUG)]
 
-RefName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,126}[A-Za-z0-9])?$")]
+RefName = Annotated[str, StringConstraints(pattern=REF)]
 """Name of a branch or a tag; it is part of URLs."""
 
 Version = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}(?:~[0-9]{1,4})?$")]

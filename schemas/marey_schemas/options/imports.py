@@ -31,8 +31,8 @@ class ImportOptions(Options):
     collection: CollectionPath = Field("", description="Folder of the project that receives the clips.")
     skeleton: str | None = Field(
         None,
-        description="Item id of the skeleton that the clips must use; absent: an equal skeleton of the project, or a "
-        "new one. The command also accepts project/folder/name.",
+        description="Item id of the skeleton that the clips must use; `marey upload` and Python also take its path. "
+        "Absent: an equal skeleton of the project, or a new one.",
     )
     unit: LengthUnit | None = Field(
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."
@@ -60,6 +60,11 @@ class ImportOptions(Options):
         description="Whether a section of an annotation in a file of Marey's predecessor includes its frame `end_idx`, "
         "as in the predecessor's editor, or ends before this frame, as in its time warping. Absent: exclusive if "
         "sections would overlap otherwise, else inclusive.",
+    )
+    replace_skeleton: bool = Field(
+        False,
+        description="Make a new revision of a clip or model of the same name, even if the file has another skeleton; "
+        "otherwise such files are refused.",
     )
     trim_rest_pose: bool = Field(False, description="Remove rest poses at the beginning and at the end of each clip.")
     tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS, description="Tags that every clip gets.")

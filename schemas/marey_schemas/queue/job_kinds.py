@@ -61,7 +61,7 @@ RETARGET = KindDeclaration(
     description="Transfers the motion of clips to another skeleton.",
     params=job_params.RetargetParams,
     implementation="marey_worker.kinds.retarget:run",
-    version=3,
+    version=4,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to retarget."),
         "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton to retarget to."),
@@ -72,6 +72,7 @@ RETARGET = KindDeclaration(
     batch_size=16,
     place_counts=True,
     named_after="clips",
+    refusing_all_fails=True,
 )
 
 EXPORT = KindDeclaration(
@@ -118,7 +119,7 @@ ANNOTATE = KindDeclaration(
     description="Proposes segments and keyframes of clips: steps, pauses, or reaches of a hand.",
     params=job_params.AnnotateParams,
     implementation="marey_worker.kinds.annotate:run",
-    version=1,
+    version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to annotate."),
         "rigs": RIGS,
@@ -127,6 +128,7 @@ ANNOTATE = KindDeclaration(
     fan_out="clips",
     batch_size=16,
     named_after="clips",
+    refusing_all_fails=True,
 )
 
 CUT = KindDeclaration(
@@ -134,7 +136,7 @@ CUT = KindDeclaration(
     description="Cuts clips along the segments of their annotations, and keeps the keyframes of each piece.",
     params=job_params.CutParams,
     implementation="marey_worker.kinds.cut:run",
-    version=2,
+    version=3,
     inputs={
         "annotations": InputSpec(
             kind=Kind.ANNOTATION, many=True, description="The annotations; each refers to a clip and its revision."
@@ -150,6 +152,7 @@ CUT = KindDeclaration(
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
     place_counts=True,
     never_cached_without=("clips",),
+    refusing_all_fails=True,
 )
 
 ALIGN = KindDeclaration(

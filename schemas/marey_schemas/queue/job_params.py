@@ -10,7 +10,6 @@ from pydantic import Field, field_validator, model_validator
 from marey_schemas.base import Request
 from marey_schemas.consents import ConsentOverride
 from marey_schemas.editing.edits import MOST_COMMANDS, EditCommand
-from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, ExportFormat, WrittenUnit
 from marey_schemas.imports import ImportFile
 from marey_schemas.names import (
     MAX_NAME_LENGTH,
@@ -26,6 +25,7 @@ from marey_schemas.names import (
 from marey_schemas.options.alignment import AlignOptions
 from marey_schemas.options.annotations import Proposal, Seconds
 from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.exporting import MotionFileOptions
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.options.improvement import OptimisationOptions, SuggestionOptions, SweepOptions
 from marey_schemas.options.matching import FeatureWeights
@@ -334,10 +334,5 @@ class RetargetParams(RetargetOptions, SuffixedResults):
     )
 
 
-class ExportParams(ConsentOverride):
+class ExportParams(MotionFileOptions, ConsentOverride):
     """Parameters of jobs of the kind `export`: one archive of files."""
-
-    format: ExportFormat = Field(DEFAULT_FORMAT, description="Format of the files.")
-    unit: WrittenUnit = Field(
-        DEFAULT_UNIT, description="Unit of length of the files, for formats without a fixed unit."
-    )

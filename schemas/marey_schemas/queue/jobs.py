@@ -47,6 +47,14 @@ NOTHING_DONE = "nothing-done"
 """Code of the failure of a job that refused all of its inputs."""
 
 
+def nothing_done(result: Mapping[str, Any]) -> bool:
+    """Return whether the result of a job lists refused inputs, but neither outputs nor inputs without a finding.
+
+    `outputs` is the number of outputs; `empty` lists inputs that the job could use, and in which it found nothing.
+    """
+    return bool(result.get("refused")) and not result.get("outputs") and not result.get("empty")
+
+
 class InputSpec(Answer):
     """Declaration of a named input of a job kind."""
 
@@ -209,6 +217,9 @@ class JobOutput(Answer):
     kind: Kind
     revision: int
     created: bool = Field(description="False if the item had the same content before.")
+    skeleton_changed: bool = Field(
+        False, description="Whether the new revision has another skeleton than the revision before."
+    )
     purged: bool = Field(
         False, description="Whether the item has been deleted for good since the job made it; if so, `name` is empty."
     )

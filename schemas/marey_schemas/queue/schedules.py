@@ -8,13 +8,13 @@ from typing import Annotated, Any
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.names import Message
+from marey_schemas.names import SLUG, Message
 from marey_schemas.queue.jobs import JobCreate
 
 MAX_CRON_LENGTH = 100
 MAX_TIMEZONE_LENGTH = 64
 
-ScheduleName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$")]
+ScheduleName = Annotated[str, StringConstraints(pattern=SLUG)]
 """Name of a schedule: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
 
 Cron = Annotated[

@@ -14,7 +14,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.consents import ConsentOverride
 from marey_schemas.formats import FORMATS, WHOLE_FORMATS, ExportFormat
 from marey_schemas.kinds import Kind
-from marey_schemas.names import CollectionPath, Message
+from marey_schemas.names import SLUG, CollectionPath, Message
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import InputSpec, JobInput, JobState, Resources
 from marey_schemas.queue.own_pods import Image
@@ -43,7 +43,7 @@ LONGEST_NAME = 63
 WORKER_S, WORKER_MB = 1800, 2048
 """Seconds and MiB that a worker may use beside the script, for example to fetch the commit."""
 
-ScriptName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$")]
+ScriptName = Annotated[str, StringConstraints(pattern=SLUG)]
 """Name of a script: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
 
 FieldName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,62}$")]

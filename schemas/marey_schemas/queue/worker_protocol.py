@@ -176,6 +176,9 @@ class StagedOutput(Request):
         "collection gets a new revision if its content differs; by_content: an item with equal parts, anywhere in the "
         "project, is used unchanged. If there is no such item, a new one is created.",
     )
+    same_skeleton: bool = Field(
+        False, description="Publish nothing if the existing item has another skeleton; its own skeleton neither."
+    )
 
 
 class StageRequest(Request):

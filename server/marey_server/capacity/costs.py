@@ -11,7 +11,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from marey_schemas.wording import without_prefix
+from marey_schemas.wording import plain_reason
 from marey_server.capacity.simulation import QueueCosts, RequestCosts
 
 MEASURED = Path(__file__).with_name("measured_costs.toml")
@@ -93,7 +93,7 @@ class MeasuredCosts(_Table):
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
-            raise UnusableCosts(f"{path}: {where}: {without_prefix(first['msg'])}") from error
+            raise UnusableCosts(f"{path}: {where}: {plain_reason(first['msg'])}") from error
         except OSError as error:
             raise UnusableCosts(f"{path}: {error.strerror}") from error
         except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -10,13 +10,12 @@ from marey_schemas.consents import ConsentOverride
 from marey_schemas.formats import (
     DEFAULT_END_INDEX,
     DEFAULT_FORM,
-    DEFAULT_UNIT,
     EXPORT_MEDIA_TYPES,
     AnnotationForm,
     EndIndex,
     ExportFormat,
-    WrittenUnit,
 )
+from marey_schemas.options.exporting import MotionFileOptions
 from marey_server.handlers.items import kind_of
 from marey_server.http.caching import REVALIDATED
 from marey_server.http.declarations import Access, Bytes, reads
@@ -30,14 +29,11 @@ from marey_server.motions.exporting import ExportTime
 from marey_server.motions.predecessor_exports import ExportLayout, ExportPart, PredecessorOptions
 from marey_server.store import items
 
-"""Cache control of exports: whether an export is allowed, and what it contains, may change."""
 
-
-class ExportQuery(ConsentOverride):
+class ExportQuery(MotionFileOptions, ConsentOverride):
     """Query parameters of an export: the format and the options of the file."""
 
     format: ExportFormat = Field("original", description="File format; original: the file exactly as it was imported.")
-    unit: WrittenUnit = Field(DEFAULT_UNIT, description="Unit of length of a BVH file.")
     end_index: EndIndex | None = Field(
         None,
         description="For annotations in the predecessor's format: whether a segment includes its frame `end_idx`. "
@@ -111,7 +107,7 @@ class Export(BlobSender):
                 )
         source = await self.look_up(exporting.read_source, *place, permitted=permitted)
         self.holding.grow(source.size_bytes)
-        order = partial(exporting.export_order, source.item, query.format, query.unit, query.time, options)
+        order = partial(exporting.export_order, source.item, MotionFileOptions.of(query), query.time, options)
         file = await self.compute_apart(exporting.EXPORT_ITEM, order, ComputedFile.unpack)
         headers = {"Content-Disposition": attachment(file.name), "Cache-Control": REVALIDATED}
         return Reply(file.data, media_type=file.media_type, headers=headers)

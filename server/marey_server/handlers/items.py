@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.documents.skeleton_merges import SkeletonMergeAnswer, SkeletonMergeRequest
 from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineage, QueryExplanation, Revision, Staleness
 from marey_schemas.kinds import Kind
 from marey_schemas.lineage import LineageGraph, LineageRequest
@@ -129,6 +130,24 @@ class ItemsOfKind(IndexSearcher):
             kind_of(kind),
             prepared,
         )
+
+
+class SkeletonMerges(Resource):
+    """Merges of the skeletons of a project."""
+
+    path = "/projects/{project}/skeleton-merges"
+    tag = "Items"
+
+    @writes(access=Access.MAINTAINER, body=SkeletonMergeRequest, answer=SkeletonMergeAnswer, idempotency="key")
+    async def post(self, project: str, body: SkeletonMergeRequest) -> Rendered:
+        """Merge skeletons of one rig that differ only in ways that mean nothing, or preview the merge.
+
+        Clips, aligned clips and models of a merged skeleton get a revision that uses the kept one and has the same
+        motion; the merged skeletons are deleted. Results computed from the clips do not become stale.
+        """
+        if body.dry_run:
+            return await self.render_document(Reply(await self.look_up(items.merge_skeletons, project, body)))
+        return await self.answer(items.merge_skeletons, project, body)
 
 
 class ItemResource(Resource):
@@ -286,6 +305,7 @@ class ExplanationResource(IndexSearcher):
 RESOURCES: tuple[type[Resource], ...] = (
     ExplanationResource,
     ItemsOfKind,
+    SkeletonMerges,
     ItemResource,
     ItemRestoration,
     ItemReversion,

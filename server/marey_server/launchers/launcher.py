@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from marey_schemas.queue.log_lines import LogForm
-from marey_schemas.wording import without_prefix
+from marey_schemas.wording import plain_reason
 from marey_server.process.data_folder import worker_token_file
 
 ENTRY_POINTS = "marey.launchers"
@@ -89,7 +89,7 @@ def read_options(model: type[Options], given: Mapping[str, Any], launcher: str) 
     try:
         return model.model_validate(dict(given))
     except ValidationError as error:
-        reasons = {".".join(map(str, one["loc"])): without_prefix(one["msg"]) for one in error.errors()}
+        reasons = {".".join(map(str, one["loc"])): plain_reason(one["msg"]) for one in error.errors()}
         faults = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
         raise LauncherUnusable(f"options of the launcher {launcher}: {faults}") from None
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from marey_schemas.encoding import codecs
-from marey_schemas.formats import ExportFormat, WrittenUnit
 from marey_schemas.item_files import ItemToExport, OriginalFile, item_as_json, original_of_clip
 from marey_schemas.kinds import Kind
+from marey_schemas.options.exporting import MotionFileOptions
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import ComputedFile, Message, pack_tree, unpack_tree
 from marey_server.motions.predecessor_exports import (
@@ -39,8 +39,7 @@ class ExportOrder(Message):
     parts: dict[str, bytes]
     hierarchy: bytes | None
     tags: tuple[str, ...] | None
-    format: ExportFormat
-    unit: WrittenUnit
+    file: MotionFileOptions
     time: ExportTime
     options: PredecessorOptions
 
@@ -151,9 +150,7 @@ def find_original(
     )
 
 
-def export_order(
-    source: ItemToExport, file_format: ExportFormat, unit: WrittenUnit, time: ExportTime, options: PredecessorOptions
-) -> bytes:
+def export_order(source: ItemToExport, file: MotionFileOptions, time: ExportTime, options: PredecessorOptions) -> bytes:
     """Return the packed message that asks a child process to write the file of an item."""
     return ExportOrder(
         item=source.item,
@@ -164,8 +161,7 @@ def export_order(
         parts={part: pack_tree(tree) for part, tree in source.parts.items()},
         hierarchy=None if source.hierarchy is None else pack_tree(source.hierarchy),
         tags=None if source.tags is None else tuple(source.tags),
-        format=file_format,
-        unit=unit,
+        file=file,
         time=time,
         options=options,
     ).pack()
@@ -177,11 +173,11 @@ def export_order(
 def export_item(packed: bytes) -> bytes:
     """Carry out an `ExportOrder` and return a packed `ComputedFile`."""
     order = ExportOrder.unpack(packed)
-    return write_file(order.source(), order.format, order.unit, order.time, order.options).pack()
+    return write_file(order.source(), order.file, order.time, order.options).pack()
 
 
 def write_file(
-    source: ItemToExport, file_format: ExportFormat, unit: WrittenUnit, time: ExportTime, options: PredecessorOptions
+    source: ItemToExport, file: MotionFileOptions, time: ExportTime, options: PredecessorOptions
 ) -> ComputedFile:
     """Return the file of an item in a format. Raises `InvalidProblem` if the format cannot represent the item."""
     if time == "source" and source.kind is not Kind.PROCESSED:
@@ -190,10 +186,10 @@ def write_file(
             code="no-such-export",
         )
     beside = source.kind is Kind.PROCESSED and options.part == "alignment"
-    if file_format == "predecessor" and (beside or source.kind not in WITH_MOTION):
+    if file.format == "predecessor" and (beside or source.kind not in WITH_MOTION):
         name, data = write_predecessor(source.kind, source.name, source.parts, source.hierarchy, options)
         return ComputedFile(name=name, media_type=codecs.JSON, data=data)
-    if file_format == "json":
+    if file.format == "json":
         return ComputedFile(name=f"{source.name}.json", media_type=codecs.JSON, data=item_as_json(source))
     if source.kind not in WITH_MOTION or source.hierarchy is None:
         raise InvalidProblem(
@@ -203,7 +199,7 @@ def write_file(
     from marey_motion.exporting import write_motion_file
 
     try:
-        written = write_motion_file(source, file_format, unit=unit, time=time)
+        written = write_motion_file(source, file, time=time)
     except MotionError as error:
         raise InvalidProblem(str(error), code="cannot-be-exported") from error
     return ComputedFile(name=source.name + written.suffix, media_type=written.media_type, data=written.data)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from marey_schemas.access import Role
 from marey_schemas.documents.clips import Check
-from marey_schemas.imports import ImportEntry, Refusal, refused_entry
+from marey_schemas.imports import ImportEntry, Refusal, published_entry, refused_entry
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions, UpAxis
 from marey_server.access.folder_rights import FolderRoleProblem
@@ -34,7 +34,7 @@ REFUSED_ALTOGETHER = (401, 403, 404, 499, 503, 507)
 """HTTP status codes of errors that concern the whole request and not a single file."""
 
 MAIN_KINDS = (Kind.CLIP, Kind.PROCESSED, Kind.MODEL, Kind.GRAPH, Kind.SKELETON)
-"""Kinds of items that files contain, in the order in which the item of an answer's entry is chosen."""
+"""Kinds of items of which a file contains at least one."""
 
 READ_FILE = "marey_server.motions.reading:read_file"
 FIND_MAPPING = "marey_server.motions.reading:find_mapping"
@@ -150,7 +150,8 @@ def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> 
         return PreparedImport(name, entry=refused_entry(name, found.refusal), axis=found.axis)
     drafts = tuple(
         Draft(
-            item.name, item.kind, item.item_name, item.documents(), item.collection, item.tags, reuse=item.reuse
+            item.name, item.kind, item.item_name, item.documents(), item.collection, item.tags, reuse=item.reuse,
+            same_skeleton=item.same_skeleton,
         )
         for item in found.items
     )  # fmt: skip
@@ -343,14 +344,15 @@ def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport], 
         new_bytes = blobs.put_uncounted(tx, sources, project_id=row.id) if sources else 0
         if new_bytes:
             daily.require_sendable(tx, sent_bytes + new_bytes)
-        drafts: dict[str, tuple[Draft, ...]] = {
-            file.name: file.drafts if file.graph is None else (graph_draft(tx, row.name, file.graph),) for file in fresh
-        }
-        every = [draft for some in drafts.values() for draft in some]
+        every = [
+            draft
+            for file in fresh
+            for draft in (file.drafts if file.graph is None else (graph_draft(tx, row.name, file.graph),))
+        ]
         rights = rights_of_caller(tx, row)
-        published = iter(items.publish(tx, row, every, author_id=tx.principal.user_id, rights=rights))
-        made = {name: list(itertools.islice(published, len(some))) for name, some in drafts.items()}
-    return _Stored([file.entry or _entry(file, made[file.name]) for file in files], new_bytes)
+        published = items.publish(tx, row, every, author_id=tx.principal.user_id, rights=rights)
+        made = {one.name: one for one in published}
+    return _Stored([file.entry or _entry(file, made) for file in files], new_bytes)
 
 
 def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
@@ -375,20 +377,9 @@ def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
     return Draft(item.name, item.kind, item.item_name, parts, item.collection, item.tags, reuse=item.reuse)
 
 
-def _entry(file: PreparedImport, published: Sequence[Published]) -> ImportEntry:
-    made = {one.kind: one for one in published}
-    kinds = [kind for kind in MAIN_KINDS if kind in made]
-    if not kinds:  # a StopIteration of `next` would not be stored in the future, so the request would never end
+def _entry(file: PreparedImport, made: Mapping[str, Published]) -> ImportEntry:
+    if file.graph is None and not any(draft.kind in MAIN_KINDS for draft in file.drafts):
         wanted = ", ".join(MAIN_KINDS)
         raise RuntimeError(f"none of {wanted} was created from {file.name!r}; this is a server error")
-    main = made[kinds[0]]
-    skeleton = made.get(Kind.SKELETON)
-    return ImportEntry(
-        name=file.name,
-        status="created" if any(one.created for one in published if one.kind is main.kind) else "unchanged",
-        item=main.item,
-        revision=main.revision,
-        skeleton=skeleton.item if skeleton is not None else None,
-        frames=file.frames,
-        warnings=file.checks,
-    )
+    read = ImportEntry(name=file.name, status="created", frames=file.frames, warnings=file.checks)
+    return published_entry(read, made)

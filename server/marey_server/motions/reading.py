@@ -93,6 +93,7 @@ class ReadDraft(Message):
     parts: dict[str, ReadDocument]
     tags: tuple[str, ...]
     reuse: Literal["by_name", "by_content"]
+    same_skeleton: bool
 
     def documents(self) -> dict[str, PreparedDocument]:
         """Return the parts as prepared documents."""
@@ -190,7 +191,7 @@ def _read_item(item: ImportedItem) -> ReadDraft:
     return ReadDraft(
         name=item.name, kind=item.kind, item_name=item.item_name, collection=item.collection,
         parts={part: _read_document(item.kind, tree) for part, tree in item.parts.items()},
-        tags=tuple(item.tags), reuse=item.reuse,
+        tags=tuple(item.tags), reuse=item.reuse, same_skeleton=item.same_skeleton,
     )  # fmt: skip
 
 

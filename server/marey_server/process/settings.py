@@ -13,7 +13,7 @@ from urllib.parse import quote, urlsplit
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
-from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
+from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SETTINGS_FILE
 from marey_schemas.sizes import KIB, MIB
 from marey_server.process.secret_files import read_secret
 from marey_server.process.setting_groups.blob_settings import BlobSettings
@@ -33,7 +33,7 @@ PREFIX = "MAREY_"
 class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     """Settings of a server. The environment variable of the setting `data` is MAREY_DATA, and so on."""
 
-    model_config = SettingsConfigDict(env_prefix=PREFIX, toml_file="marey.toml", extra="forbid", frozen=True)
+    model_config = SettingsConfigDict(env_prefix=PREFIX, toml_file=SETTINGS_FILE, extra="forbid", frozen=True)
 
     data: Path = Field(
         Path("marey-data"), description="Folder of the database file, the administrator's token, and blobs."

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, func, insert, select, update
+from sqlalchemy import ColumnElement, Row, Table, func, insert, select, update
 
 from marey_schemas.access import EndTokens, QuotaChange, QuotasInUse, Scope, User, UserChange, UserCreate
 from marey_schemas.items import Page
@@ -27,7 +27,7 @@ from marey_server.store.ids import new_id
 from marey_server.store.invitations.validity import withdraw_unauthorised
 from marey_server.store.quotas import holdings, limits
 from marey_server.store.revs import ExpectedRev, change_row
-from marey_server.store.tables import invitation, schedule, user
+from marey_server.store.tables import identity, invitation, schedule, token, user
 from marey_server.store.transaction import Transaction
 
 FIRST_ADMINISTRATOR = "admin"
@@ -99,12 +99,20 @@ def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUs
     return limits.change_user_limits(tx, find_user(tx, name).id, name, change)
 
 
+def _latest_use(table: Table, name: str) -> ColumnElement[int | None]:
+    latest = select(func.max(table.c.last_used_us)).where(table.c.user_id == user.c.id)
+    return latest.correlate(user).scalar_subquery().label(name)
+
+
+_LATEST_USES = (_latest_use(token, "token_used_us"), _latest_use(identity, "identity_used_us"))
+
+
 def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
     """List all users in the order of their names. Only administrators may do this."""
     require_administrator(tx.principal)
     order = listing.parse_order("name", {"name": user.c.name}, unique="name")
-    rows, next_cursor = listing.read_page(tx, select(user), order, ["users"], cursor, limit)
-    return Page(items=tuple(_shown(row) for row in rows), next_cursor=next_cursor)
+    rows, next_cursor = listing.read_page(tx, select(user, *_LATEST_USES), order, ["users"], cursor, limit)
+    return Page(items=tuple(_shown(row, seen=_seen_us(row)) for row in rows), next_cursor=next_cursor)
 
 
 def change_user(
@@ -275,8 +283,13 @@ def _no_user(name: str) -> NotFoundProblem:
     return NotFoundProblem(f"There is no user {name!r} that you may see.", code="no-user")
 
 
-def _shown(row: Row[Any]) -> User:
+def _seen_us(row: Row[Any]) -> int | None:
+    return max((one for one in (row.token_used_us, row.identity_used_us) if one is not None), default=None)
+
+
+def _shown(row: Row[Any], seen: int | None = None) -> User:
     return User(
         id=row.id, name=row.name, display_name=row.display_name, administrator=row.administrator,
         disabled=row.disabled, created_at=datetime_of(row.created_us), rev=row.rev,
+        last_seen_at=None if seen is None else datetime_of(seen),
     )  # fmt: skip

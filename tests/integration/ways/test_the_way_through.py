@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -434,6 +435,44 @@ def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(
     assert ("rigs", 2) in used
 
 
+def test_a_project_says_what_it_holds_what_is_stale_and_takes_paths_and_revisions(
+    project: ProjectHandle, marey: Marey, takes: Path, run: CommandLine
+) -> None:
+    name = project.name
+    upload = ("upload", str(takes / "walk.bvh"), "--project", name, "--collection")
+    run(*upload, "raw")
+    (own,) = project.skeletons
+    run(*upload, "again", "--skeleton", f"{name}/{own.path}")
+    assert project.clips["again/walk"].item.summary["skeleton"] == own.id
+    run("retarget", f"{name}/raw", "--to", f"{name}/{own.path}", "--into", "made")
+    assert "nothing is stale among 4 items" in run("stale", name).stderr
+    walk = project.clips["raw/walk"]
+    walk.put_info(walk.info().model_copy(update={"comment": "changed"}))
+    assert "made/raw/walk" in run("stale", f"{name}/made").stdout
+    assert json.loads(run("stale", name, "--json").stdout)[0]["because"][0]["revision"] == 1
+    assert "comment" not in run("show", f"{name}/raw/walk", "--revision", "1", "--part", "info").stdout
+    run("download", f"{name}/raw/walk", "--revision", "1", "--format", "bvh", "-o", "out")
+    held = run("df", name).stdout
+    assert re.search(rf"{name} +4 +0\.\d+ MiB", held), held
+
+
+def test_duplicate_skeletons_are_previewed_and_merged(project: ProjectHandle, takes: Path, run: CommandLine) -> None:
+    project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
+    (kept,) = project.skeletons
+    hierarchy = kept.hierarchy().model_dump(mode="json", by_alias=True)
+    hierarchy["joints"][0]["offset"][0] += 2.0
+    twin = project.skeletons.create("twin", {"hierarchy": hierarchy}, collection="skeletons")
+    walk = project.clips["raw/walk"]
+    walk.put_part("motion", {**walk.part("motion"), "skeleton": {"item": twin.id, "revision": 1}})
+    said = run("skeleton", "merge", project.name, "--dry-run").stderr
+    assert said.startswith(f"skeletons/twin would be merged into {kept.path}; 1 clip")
+    refused = run("skeleton", "merge", project.name, f"{project.name}/skeletons/twin", status=2).stderr
+    assert "either a project or skeletons in it" in refused
+    run("skeleton", "merge", f"{project.name}/skeletons/twin", "--keep", f"{project.name}/{kept.path}")
+    assert project.clips["raw/walk"].item.summary["skeleton"] == kept.id
+    assert project.merge_skeletons().rigs == ()
+
+
 def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it(
     project: ProjectHandle, marey: Marey, takes: Path, run: CommandLine
 ) -> None:
@@ -442,8 +481,9 @@ def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it
     (source,) = [skeleton for skeleton in project.skeletons.list() if skeleton.id != studio.id]
     source.put_mapping(source.mapping().model_copy(update={"confidence": 0.2}))
     sources = [CollectionInput(collection="raw")]
-    ended = marey.jobs.wait(project.retarget(sources, studio.id, into="doubtful").id, timeout_s=60)
-    assert [refusal["code"] for refusal in ended.result["refused"]] == ["mapping-uncertain"]
+    with pytest.raises(errors.JobUnsuccessful, match="none of 1 clip can be retargeted") as doubtful:
+        marey.jobs.wait(project.retarget(sources, studio.id, into="doubtful").id, timeout_s=60)
+    assert doubtful.value.job.failure.code == "nothing-done"
     place = f"{project.name}/{source.id}"
     assert "revision 3" in run("skeleton", "map", place, "--confirm").stderr
     known = source.mapping().joints["left_ankle"]

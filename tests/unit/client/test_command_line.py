@@ -370,7 +370,7 @@ def test_a_token_that_is_refused_is_told_with_the_place_it_came_from(
     script: ScriptedServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refusal = problem(401, "bad-token", detail="The token is unknown, expired or revoked.")
-    monkeypatch.setattr("marey_client.marey.Marey", lambda url, token: answering(script, token))
+    monkeypatch.setattr("marey_client.marey.Marey", lambda url, token, **_options: answering(script, token))
     monkeypatch.setenv("MAREY_TOKEN", "marey_old")
     for anonymous, told in ((False, "the token comes from the variable MAREY_TOKEN; marey login"), (True, "unknown")):
         script.answers = [refusal]

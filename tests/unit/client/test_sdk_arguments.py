@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import httpx
@@ -11,10 +12,12 @@ import pytest
 from tests.support.scripted_server import ScriptedServer, folder
 
 from marey_client.downloads import saved_atomically
+from marey_client.errors import BadArgument, MareyError
 from marey_client.handles.clips import MotionArrays
 from marey_client.handles.edits import as_edit
 from marey_client.handles.searches import search_request
 from marey_client.imports import find_files
+from marey_client.project import ProjectHandle
 from marey_client.transport import BLOCKS
 from marey_schemas.encoding.codecs import decode_tree, encode_tree
 
@@ -139,3 +142,23 @@ def test_one_digest_one_folder_one_command_and_one_constraint_need_no_list(
     assert [command.command for command in as_edit({"command": "trim", "start": 1}).commands] == ["trim"]
     constraint = {"type": "root_position", "at": 0, "target_m": [0, 1]}
     assert search_request(constraint) == search_request([constraint])
+
+
+MISTAKES: dict[str, Callable[[ProjectHandle], object]] = {
+    "unit": lambda lab: lab.upload("/tmp", unit="parsec"),  # type: ignore[arg-type]
+    "name": lambda lab: lab.clips.create("a/b", {"motion": {}}),
+    "path": lambda lab: lab.collections.create("/a//b"),
+    "role": lambda lab: lab.members.put("ann", "emperor"),  # type: ignore[arg-type]
+    "samples": lambda lab: lab.evaluate("raw", samples=-1),  # type: ignore[call-arg]
+    "url": lambda lab: lab.webhooks.create("ftp://x", kinds=["item.created"]),
+    "commands": lambda lab: as_edit([{"command": "nope"}]),
+}
+
+
+@pytest.mark.parametrize("named", MISTAKES)
+def test_a_wrong_argument_is_an_error_of_this_package_that_names_it(script: ScriptedServer, named: str) -> None:
+    with pytest.raises(BadArgument, match=f"^{named}") as wrong:
+        MISTAKES[named](script.marey().project("lab"))
+    assert isinstance(wrong.value, MareyError)
+    assert isinstance(wrong.value, ValueError)
+    assert script.requests == []

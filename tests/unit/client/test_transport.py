@@ -302,6 +302,19 @@ def test_a_server_that_starts_again_is_waited_for() -> None:
     assert sum(patient.delay_s(tried, None) for tried in range(1, patient.tries)) > restart_s
 
 
+def test_a_long_wait_for_the_server_is_told_with_the_time_that_is_left(script: ScriptedServer) -> None:
+    told: list[str] = []
+    retries = Retries(tries=5, total_s=40.0, sleep=script.waited.append, notice=told.append)
+    script.answers = [ok({"user": None, "scopes": []}), LOST, LOST, LOST, LOST, ok({"user": None, "scopes": []})]
+    marey = script.marey(retries=retries)
+    marey.me()
+    assert told == []
+    marey.me()
+    assert [text.rpartition("//")[2].partition(" ")[2] for text in told] == [
+        "does not answer; trying again for 40 s"
+    ] * 2
+
+
 def test_a_rotation_whose_answer_was_lost_is_repeated_with_the_same_id(script: ScriptedServer) -> None:
     made = {
         "id": "token_2", "name": "w", "prefix": "bbb", "scopes": ["work"], "expires_at": None,

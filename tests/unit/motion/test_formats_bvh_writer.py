@@ -14,7 +14,8 @@ from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, MotionError
 from marey_motion.exporting import write_clip_file
 from marey_motion.formats import read_motion, write_motion
-from marey_motion.formats.bvh_writer import format_table, write_bvh
+from marey_motion.formats.bvh_writer import format_table, with_folded_positions, write_bvh
+from marey_motion.gait import generate_gait
 from marey_motion.importing.source import SourceInfo
 from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import Skeleton, same_hierarchy
@@ -55,6 +56,38 @@ def test_lengths_are_written_in_the_unit_asked_for(
     clip = tumbling(body)
     loaded = loaded_elsewhere(write_bvh(clip, unit=unit), tmp_path)
     assert np.abs(loaded * scale - global_positions(clip)).max() < 1e-4
+
+
+def test_folded_positions_are_right_for_readers_that_ignore_those_below_the_root(tmp_path: Path) -> None:
+    walk = generate_gait(1.2, 0.5, 4.0, 30.0)
+    body = walk.skeleton
+    still = Skeleton(
+        joint_names=("Reference", *body.joint_names),
+        parents=np.concatenate(([-1], body.parents + 1)).astype(np.int32),
+        offsets=np.concatenate((np.zeros((1, 3)), body.offsets)),
+        rest_rotations=np.concatenate(([[1.0, 0, 0, 0]], body.rest_rotations)),
+    )
+    turned = np.tile(np.array([0.8, 0.0, 0.6, 0.0], np.float32), (walk.frame_count, 1))
+    poses = np.concatenate((np.ones((walk.frame_count, 3), np.float32), turned, walk.poses[:, 3:]), axis=1)
+    neck = still.index_of("Neck")
+    stretch = still.offsets[neck] + np.linspace(-0.002, 0.002, walk.frame_count)[:, None]
+    moved = np.stack((walk.root_translations, stretch), axis=1)
+    clip = Clip(still, 30.0, poses, moved, (1, neck))
+    truth = global_positions(clip)
+
+    def error_m(*, folded: bool) -> np.ndarray:
+        path = tmp_path / "written.bvh"
+        path.write_bytes(write_clip_file(clip, "bvh", fold_positions=folded).data)
+        loaded = positions_by_another_loader(path, only_root=True)
+        distances: np.ndarray = np.linalg.norm(loaded * 0.01 - truth, axis=2)
+        return distances.max(axis=0)
+
+    assert error_m(folded=False)[1:].min() > 2.0
+    below_neck = {joint for joint in range(still.joint_count) if neck in still.path_to_root(joint)}
+    folded = error_m(folded=True)
+    assert max(folded[joint] for joint in range(1, still.joint_count) if joint not in below_neck) < 1e-4
+    assert max(folded[joint] for joint in below_neck) < 0.005
+    assert with_folded_positions(walk) is walk
 
 
 def test_an_unknown_unit_is_refused(body: Skeleton, tumbling: Callable[..., Clip]) -> None:

@@ -247,7 +247,7 @@ def test_a_chosen_skeleton_may_differ_in_what_the_motion_replaces() -> None:
 
 def test_a_skeleton_with_a_tail_is_called_an_animal() -> None:
     clip = generate_gait(1.2, 0.0, 1.0, 30.0)
-    assert read("walk.bvh", write_bvh(clip)).items[0].item_name == "hik"
+    assert read("walk.bvh", write_bvh(clip)).items[0].item_name == "hik (176 cm)"
     tailed = write_bvh(clip).replace(b"LeftShoulder", b"Tail01")
     options = ImportOptions(unit="cm", up_axis="y")
     assert read("dog.bvh", tailed, options=options).items[0].item_name == "animal"

@@ -1,5 +1,6 @@
 """Files of an import are stored together; a file that cannot be stored does not affect the others."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -52,6 +53,32 @@ def test_an_import_without_a_main_item_is_an_error_that_ends_the_request(lab: La
     edit = Draft("clean-up", Kind.EDIT, "clean-up", {"edit": {"commands": [{"command": "trim", "start": 1}]}}, "takes")
     with pytest.raises(RuntimeError, match=r"no clip, model, graph or skeleton was created from .walk\.bvh."):
         store(lab, PreparedImport("walk.bvh", drafts=(edit,)))
+
+
+def test_a_clip_gets_another_skeleton_only_on_request(lab: Lab) -> None:
+    def long_legs(*, asked: bool) -> Any:
+        file = read_file("walk.bvh", seed=1)
+        rig, clip = file.drafts
+        return replace(
+            file,
+            drafts=(
+                replace(rig, parts={"hierarchy": skeleton_tree(bone_m=9.0)}),
+                replace(clip, same_skeleton=not asked),
+            ),
+        )
+
+    def skeletons() -> int:
+        return len(lab.read(items.list_items, "lab", Kind.SKELETON).items)
+
+    (first,) = store(lab, read_file("walk.bvh"))
+    refused, other = store(lab, long_legs(asked=False), read_file("other.bvh"))
+    assert (refused.status, refused.error.code, refused.item) == ("failed", "skeleton-differs", None)
+    assert "--replace" in refused.error.detail
+    assert (other.status, skeletons()) == ("created", 1)
+    (changed,) = store(lab, long_legs(asked=True))
+    assert (changed.item, changed.revision, changed.skeleton_changed) == (first.item, 2, True)
+    (back,) = store(lab, long_legs(asked=False))
+    assert (back.status, back.revision, back.skeleton_changed, skeletons()) == ("unchanged", 2, False, 2)
 
 
 def test_the_same_take_twice_in_one_request_is_one_revision(lab: Lab) -> None:

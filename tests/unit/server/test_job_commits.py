@@ -8,12 +8,14 @@ import pytest
 from sqlalchemy import update
 from tests.support.committing_desk import CommittingDesk
 from tests.support.queue_desk import Desk, document
-from tests.support.store_fixtures import skeleton_tree
+from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_schemas.access import MemberChange, Role, UserCreate
 from marey_schemas.datasets.commits import CommitCreate, PutEntry, RemoveEntry
 from marey_schemas.datasets.naming import RefCreate, RefKind
 from marey_schemas.datasets.protection import ProtectionRule
+from marey_schemas.encoding.digests import digest_of
+from marey_schemas.imports import skeleton_output
 from marey_schemas.items import ItemChange
 from marey_schemas.kinds import Kind
 from marey_schemas.lineage import LineageRequest
@@ -21,7 +23,7 @@ from marey_schemas.queue.jobs import ItemInput, JobOutputsInput
 from marey_schemas.queue.worker_protocol import BatchCompletion, StagedOutput
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem
-from marey_server.store import datasets, events, fsck, items, members, users
+from marey_server.store import blobs, datasets, events, fsck, items, members, users
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import commits, completion, reading, retrying, staging
 from marey_server.store.retention import Retention, retire
@@ -256,23 +258,65 @@ def test_a_fan_out_of_which_a_task_fails_commits_nothing_and_its_retry_everythin
     assert [one.job for one in gaits.log()] == [again]
 
 
-@pytest.mark.parametrize("made", [(), ("a",)])
-def test_a_fan_out_that_refused_all_inputs_has_failed(gaits: CommittingDesk, made: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(("made", "empty"), [((), []), (("a",), []), ((), ["thing 3"])])
+def test_a_fan_out_that_refused_all_inputs_has_failed(
+    gaits: CommittingDesk, made: tuple[str, ...], empty: list[str]
+) -> None:
     things = gaits.desk.things(4)
     job = gaits.submit("square", into="made", inputs={"things": tuple(ItemInput(item=one) for one in things)})
     for number, lease in enumerate(gaits.desk.claim_many()):
         if number == 1 and made:
             gaits.desk.stage(lease, *made)
         refused = [{"name": f"thing {number}", "detail": "it has no feet"}]
-        gaits.desk.complete(lease, result={"refused": refused})
+        gaits.desk.complete(lease, result={"refused": refused, "empty": empty})
     ended = gaits.job(job)
-    if made:
+    if made or empty:
         assert ended.state == "succeeded"
     else:
         assert ended.failure is not None
         assert (ended.state, ended.failure.code) == ("failed", "nothing-done")
         assert "all inputs were refused; the first, thing " in ended.failure.detail
         assert gaits.head() is None
+
+
+def test_an_import_job_says_which_takes_are_revisions_and_refuses_other_skeletons(desk: Desk) -> None:
+    data = b"HIERARCHY"
+    desk.database.write(desk.user, blobs.put_blob, data)
+    names, digest = ("walk.bvh", "run.bvh"), digest_of(data)
+    files = [{"name": name, "blob": digest} for name in names]
+    entries = [{"name": name, "status": "created", "frames": 5} for name in names]
+
+    def run(bone_m: float, seed: int, **params: Any) -> Any:
+        job = desk.submit("import", params={"files": files, **params}, cache="refresh")
+        lease = desk.claim()
+        for name in names:
+            hierarchy = skeleton_tree(bone_m=bone_m if name == "walk.bvh" else 1.0)
+            rig = skeleton_output(name)
+            motion = motion_tree({"output": rig}, joints=3, seed=seed)
+            common = {"collection": "raw", "sources": {}}
+            desk.stage_outputs(
+                lease,
+                StagedOutput(
+                    name=rig, kind=Kind.SKELETON, item_name="rig", parts={"hierarchy": hierarchy},
+                    reuse="by_content", **common,
+                ),
+                StagedOutput(
+                    name=name, kind=Kind.CLIP, item_name=name, parts={"motion": motion},
+                    same_skeleton=not params.get("replace_skeleton"), **common,
+                ),
+            )  # fmt: skip
+        desk.complete(lease, result={"entries": entries, "clips": 2, "frames": 10})
+        result = desk.job(job).result
+        assert result is not None
+        return result, {one["name"]: one for one in result["entries"]}
+
+    run(1.0, 0)
+    result, told = run(9.0, 1)
+    assert told["walk.bvh"]["error"]["code"] == "skeleton-differs"
+    assert (told["run.bvh"]["status"], told["run.bvh"]["revision"], result["clips"]) == ("created", 2, 1)
+    _, told = run(9.0, 1, replace_skeleton=True)
+    assert (told["walk.bvh"]["revision"], told["walk.bvh"]["skeleton_changed"]) == (2, True)
+    assert told["run.bvh"]["status"] == "unchanged"
 
 
 def test_a_job_whose_tasks_are_gathered_commits_what_it_gathered(gaits: CommittingDesk) -> None:

@@ -7,6 +7,7 @@ import pytest
 from pydantic import ValidationError
 from sqlalchemy import make_url
 
+from marey_server.commands import CommandFailed, read_settings
 from marey_server.process.settings import Settings, misspelt_variables
 
 
@@ -124,3 +125,25 @@ def test_workers_on_this_machine_send_traces_to_the_same_collector(monkeypatch: 
     assert "OTEL_SERVICE_NAME" not in given
     with pytest.raises(ValidationError, match="not an address of a collector"):
         Settings(traces_endpoint="collector:4318")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("# ours\nport = 'abc'\n", "invalid setting: marey.toml, line 2: port: Input should be a valid integer"),
+        ("[server]\nport = 1\n", "invalid setting: marey.toml, line 1: server: Extra inputs"),
+        ("data = 'x'\nport ==\n", "marey.toml cannot be read as TOML: Invalid value (at line 2"),
+    ],
+)
+def test_a_wrong_settings_file_is_refused_with_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, told: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MAREY_PORT", raising=False)
+    (tmp_path / "marey.toml").write_text(text)
+    with pytest.raises(CommandFailed) as refused:
+        read_settings()
+    assert told in str(refused.value)
+    if "abc" in text:
+        with pytest.raises(CommandFailed, match=r"^invalid setting: port: "):
+            read_settings(port="xyz")

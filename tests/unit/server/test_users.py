@@ -82,7 +82,10 @@ def test_only_administrators_make_and_list_users(database: Database, chief: Prin
             database.read(who, users.list_users)
     with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, users.list_users)
-    assert [found.name for found in database.read(chief, users.list_users).items] == ["admin", "ann"]
+    made = database.write(ann, tokens.create_token, TokenCreate(name="t", scopes=("read",)))
+    database.write(SYSTEM, tokens.note_use, made.id)
+    found = database.read(chief, users.list_users).items
+    assert [(one.name, one.last_seen_at is not None) for one in found] == [("admin", False), ("ann", True)]
 
 
 def test_names_of_users_are_unique(database: Database, chief: Principal) -> None:

@@ -63,10 +63,9 @@ def test_joints_of_pauses_are_named_as_in_the_skeleton_or_as_standard_joints(pro
         project.staged.clear()
     assert staged[0]["annotation"] == staged[1]["annotation"]
     unknown = {"proposal": {"method": "velocity_minima", "joints": ["tail"]}}
-    result = annotate.run(project, AnnotateParams.model_validate(unknown))
-    assert not project.staged
-    assert [one["code"] for one in result["refused"]] == ["unknown-joint"] * 2
-    assert "tail" in result["refused"][0]["detail"]
+    with pytest.raises(JobRefused, match=r"none of 2 clips can be annotated; .* tail") as refused:
+        annotate.run(project, AnnotateParams.model_validate(unknown))
+    assert (refused.value.code, project.staged) == ("nothing-done", [])
 
 
 def test_a_piece_is_the_frames_of_its_segment_with_its_margins_and_keyframes(project: ProjectInMemory) -> None:
@@ -134,6 +133,9 @@ def test_layers_that_would_make_pieces_of_one_name_are_refused(project: ProjectI
 
 def test_an_annotation_that_goes_beyond_its_clip_keeps_no_other_from_being_cut(project: ProjectInMemory) -> None:
     annotated(project, segments=[{"label": "a", "start": 0, "end": 9999}])
+    with pytest.raises(JobRefused, match="none of 1 annotation can be cut; said/a0: ") as refused:
+        cut.run(project, CutParams())
+    assert (refused.value.code, project.staged) == ("nothing-done", [])
     annotated(project, segments=[{"label": "b", "start": 0, "end": 10}])
     result = cut.run(project, CutParams())
     assert (result["clips"], [one["name"] for one in result["refused"]]) == (1, ["said/a0"])

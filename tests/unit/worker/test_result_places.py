@@ -70,21 +70,13 @@ KINDS = {
 }
 
 
-def test_results_that_would_replace_what_they_are_made_of_are_refused(project: ProjectInMemory) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_job_whose_results_would_all_replace_what_they_are_made_of_fails(project: ProjectInMemory, kind: str) -> None:
     move(project, "game", collection="game", below="")
-    result = KINDS["retarget"](project)
-    assert (result["clips"], codes(result), project.staged) == (0, ["own-input"] * 2, [])
-    assert "game/left, which is an input" in result["refused"][0]["detail"]
-    assert "another folder" in result["refused"][0]["detail"]
-    assert KINDS["retarget"](project, suffix="-short")["clips"] == 2
-
-
-def test_an_edit_whose_results_would_all_replace_what_they_are_made_of_fails(project: ProjectInMemory) -> None:
-    move(project, "game", collection="game", below="")
-    with pytest.raises(JobRefused, match="game/left, which is an input of the job; choose another folder"):
-        KINDS["edit"](project)
-    assert project.staged == []
-    assert KINDS["edit"](project, suffix="-short")["clips"] == 2
+    with pytest.raises(JobRefused, match="game/left, which is an input of the job; choose another folder") as refused:
+        KINDS[kind](project)
+    assert (refused.value.code, project.staged) == ("nothing-done", [])
+    assert KINDS[kind](project, suffix="-short")["clips"] == 2
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -124,8 +116,9 @@ def add_annotation(project: ProjectInMemory, clip: str = "clip_left", revision: 
 def test_a_piece_that_would_replace_an_input_is_refused(project: ProjectInMemory) -> None:
     add_annotation(project)
     again(project, 1, item="clip_piece", name="left_a_01")
-    result = cut.run(project, CutParams())
-    assert (result["clips"], codes(result), project.staged) == (0, ["own-input"], [])
+    with pytest.raises(JobRefused, match="walks/left_a_01, which is an input of the job"):
+        cut.run(project, CutParams())
+    assert project.staged == []
     project.into = "pieces"
     assert cut.run(project, CutParams())["clips"] == 1
 

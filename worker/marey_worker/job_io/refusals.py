@@ -42,14 +42,14 @@ class Refusals:
         self._context.log(f"{shown}: {error}")
         self.entries.append({"name": shown, "item": pin.item, "code": code, "detail": str(error)})
 
-    def require_some(self, made: int, count: int, done: str) -> None:
+    def require_some(self, made: int, count: int, done: str, *, what: str = "clip") -> None:
         """Raise `JobRefused` if the job refused all of its `count` inputs and made nothing of them (`made` is 0).
 
-        `done` is what the job does, such as "edited". Tasks of a job that is split do not fail, because another task
-        may succeed; the server ends the whole job.
+        `done` is what the job does, such as "edited", and `what` an input. Tasks of a job that is split do not fail,
+        because another task may succeed; the server ends the whole job.
         """
         if self.entries and not made and self._context.task.size == 1:
-            raise JobRefused(NOTHING_DONE, f"none of {counted(count, 'clip')} can be {done}{self.first}")
+            raise JobRefused(NOTHING_DONE, f"none of {counted(count, what)} can be {done}{self.first}")
 
     @property
     def first(self) -> str:

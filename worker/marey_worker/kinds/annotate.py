@@ -34,7 +34,8 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
     """Annotate every clip of the job.
 
     A clip that cannot be annotated is listed as a refusal in the result, with code and reason. A clip in which nothing
-    is found gets no annotation. Raises `JobRefused` if two annotations would have the same name.
+    is found gets no annotation. Raises `JobRefused` if two annotations would have the same name, or if no clip can be
+    annotated.
     """
     propose = _proposal(params)
     rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
@@ -66,6 +67,7 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
             **({"rigs": (edited.as_input(),)} if edited else {}),
         }
         results.add(_output(pin, layer, layer_name, params, sources))
+    refusals.require_some(results.count + len(empty), len(pins), "annotated")
     results.flush()
     return {
         "annotations": results.count,

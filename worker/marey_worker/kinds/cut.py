@@ -31,7 +31,8 @@ from marey_worker.job_io.staged_results import StagedResults
 def run(context: Context, params: CutParams) -> dict[str, Any]:
     """Create a clip from every selected segment, and an annotation if the clip has keyframes or margins.
 
-    Raises `JobRefused` if no segment is selected, or if two pieces would have the same name.
+    Raises `JobRefused` if no segment is selected, if two pieces would have the same name, or if no annotation can be
+    used.
     """
     return _Cutting(context, params).run()
 
@@ -63,6 +64,7 @@ class _Cutting:
         labels: Counter[str] = Counter()
         todo = self._read()
         self._require_pieces(todo)
+        cut = 0
         for done, one in enumerate(todo):
             self._context.progress(done, len(todo), f"cutting {one.item.name}")
             try:
@@ -72,8 +74,10 @@ class _Cutting:
                 for output, label in self._pieces(one):
                     labels.update([label] if label else [])
                     self._results.add(output)
+                cut += bool(one.pieces)
             except UNUSABLE as error:
                 self._refusals.add(one.pin, error)
+        self._refusals.require_some(cut, len(self._context.inputs["annotations"]), "cut", what="annotation")
         self._results.flush()
         return {"clips": labels.total(), "labels": dict(sorted(labels.items())), "refused": self._refusals.entries}
 

@@ -17,6 +17,7 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.formats import ZIP_EPOCH
 from marey_schemas.item_files import ItemToExport, item_as_json, original_of_clip
 from marey_schemas.kinds import Kind
+from marey_schemas.options.exporting import MotionFileOptions
 from marey_schemas.queue.job_params import ExportParams
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_schemas.wording import counted
@@ -92,7 +93,7 @@ class ClipFiles:
         source = ItemToExport(pin.item, pin.kind, pin.name, pin.collection, pin.revision, parts, hierarchy)
         if self._params.format == "json":
             return _File(f"{_place(pin)}.json", item_as_json(source))
-        written = write_motion_file(source, self._params.format, unit=self._params.unit, skeleton=skeleton)
+        written = write_motion_file(source, MotionFileOptions.of(self._params), skeleton=skeleton)
         return _File(_place(pin) + written.suffix, written.data)
 
     def _original(self, pin: PinnedInput, info: dict[str, Any]) -> _File:

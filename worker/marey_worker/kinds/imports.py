@@ -155,6 +155,7 @@ class _Importing:
                 tags=tuple(item.tags),
                 parts=parts,
                 reuse=item.reuse,
+                same_skeleton=item.same_skeleton,
             )
         )
         if item.kind is Kind.MODEL:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from marey_client.cli.addresses import Address
-from marey_client.cli.revisions import find_revision, find_version
+from marey_client.cli.revisions import RevisionNumber, at_revision, find_revision, find_version
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message
@@ -44,6 +44,7 @@ def download(
         ),
     ],
     format: Annotated[str, typer.Option(help=f"{one_of(EXPORT_FORMATS)}.")] = "original",  # noqa: A002
+    revision: RevisionNumber = None,
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
     part: Annotated[
@@ -60,6 +61,13 @@ def download(
             "imported file, if the item is unchanged."
         ),
     ] = None,
+    fold_positions: Annotated[
+        bool,
+        typer.Option(
+            "--fold-positions",
+            help="Give positions to the root of BVH files alone, for programs that ignore those of other joints.",
+        ),
+    ] = False,
     restored: Annotated[
         bool, typer.Option(help="Export aligned clips with the timing and position of their source clips.")
     ] = False,
@@ -76,10 +84,16 @@ def download(
     """
     if format not in EXPORT_FORMATS:
         raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(EXPORT_FORMATS)}")
-    address = Address.parse(place)
+    address = Address.parse(at_revision(place, revision))
     with connect(context) as marey:
-        options = {"format": format, "unit": unit, "allow_expired_consent": allow_expired_consent}
-        options |= {"part": part, "layout": layout}
+        options = {
+            "format": format,
+            "unit": unit,
+            "allow_expired_consent": allow_expired_consent,
+            "fold_positions": fold_positions,
+            "part": part,
+            "layout": layout,
+        }
         options |= {"time": "source"} if restored else {}
         written, refused = _download_all(_exported_at(marey, address), output, options)
     if as_json:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address, find_item, kind_named
-from marey_client.cli.revisions import require_revision
+from marey_client.cli.holdings import outdated
+from marey_client.cli.revisions import RevisionNumber, at_revision, require_revision
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, QueryText, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
@@ -35,7 +36,7 @@ COLUMNS: dict[str, Callable[[Item], object]] = {
     "revision": lambda item: item.revision,
     "joints": lambda item: item.summary.get("joints"),
     "frames": lambda item: item.summary.get("frames"),
-    "Hz": lambda item: item.summary.get("frame_rate_hz"),
+    "Hz": lambda item: _rounded(item.summary.get("frame_rate_hz")),
     "seconds": lambda item: None if (given := item.summary.get("duration_s")) is None else round(given, 3),
     "warnings": lambda item: " ".join(item.summary.get("warnings", ())),
     "tags": lambda item: " ".join(item.tags),
@@ -120,7 +121,7 @@ def ls(
         if not folders and not items and marey.project(address.project).collections.at(address.path) is None:
             items = _items_called(marey, address)
         if stale:
-            items = _stale(items)
+            items = [one for one, _ in outdated(items)]
     items = _sorted(items, order[0], reverse=sort.startswith("-"))
     if as_json:
         return print_json({"collections": folders, "items": [one.item for one in items]})
@@ -191,13 +192,6 @@ def _sorted(items: Sequence[ItemHandle], column: str, *, reverse: bool) -> list[
     with_value = [one for one in items if values[one.id] not in (None, "")]
     without = [one for one in items if values[one.id] in (None, "")]
     return [*sorted(with_value, key=lambda one: values[one.id], reverse=reverse), *without]  # type: ignore[arg-type, return-value]
-
-
-def _stale(items: Sequence[ItemHandle]) -> list[ItemHandle]:
-    """Return the stale items, each made from at least one item that has a newer revision now."""
-    with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
-        answers = pool.map(lambda one: one.staleness().stale, items)
-        return [one for one, stale in zip(items, answers, strict=True) if stale]
 
 
 def _show_deleted(
@@ -278,6 +272,7 @@ def show(
             "`marey show` lists the parts."
         ),
     ] = None,
+    revision: RevisionNumber = None,
     history: Annotated[bool, typer.Option("--history", help="Show every revision and its inputs.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -285,18 +280,23 @@ def show(
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:
-        item, revision = require_revision(marey, Address.parse(place), list(Kind))
+        item, number = require_revision(marey, Address.parse(at_revision(place, revision)), list(Kind))
         if part is not None:
             from marey_schemas.encoding.codecs import encode_tree
 
-            return typer.echo(encode_tree(item.part(part, revision=revision), "application/json"))
+            return typer.echo(encode_tree(item.part(part, revision=number), "application/json"))
         if history:
             return _show_history(item, as_json)
-        if revision is not None:
-            return _show_revision(item, item.revision(revision), as_json)
+        if number is not None:
+            return _show_revision(item, item.revision(number), as_json)
         if as_json:
             return print_json(item.item)
         return print_pairs(_described(marey, item))
+
+
+def _rounded(value: object) -> object:
+    """Return a number with six digits for people; `--json` prints all digits."""
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
@@ -309,8 +309,8 @@ def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
         if isinstance(item, ClipHandle) and name == "skeleton":
             yield name, f"{marey.project(item.project).skeletons.get(value).path} ({value})"
         elif name != "warnings":
-            yield name, value
-    yield from ((f"{FACET_PREFIX}{name}", value) for name, value in item.item.facets.items())
+            yield name, _rounded(value)
+    yield from ((f"{FACET_PREFIX}{name}", _rounded(value)) for name, value in item.item.facets.items())
     for edge in item.staleness().because:
         yield "stale", f"{edge.kind} {edge.name} has newer revisions than {edge.revision}"
     for name, one in item.item.parts.items():

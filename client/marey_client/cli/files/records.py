@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -10,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address
+from marey_client.cli.files.csv_files import rows_of
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.invocation import QueryText, connect
 from marey_client.cli.terminal.output import print_message
 from marey_client.progress import progress
-from marey_schemas.wording import counted, without_prefix
+from marey_schemas.wording import counted, plain_reason
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -116,7 +116,7 @@ def _checked(given: Mapping[str, str], place: str) -> dict[str, Any]:
     except ValidationError as error:
         first = error.errors()[0]
         raise WrongUsage(
-            f"{place}, {'.'.join(map(str, first['loc']))}: {without_prefix(first['msg'])}, not {first['input']!r}"
+            f"{place}, {'.'.join(map(str, first['loc']))}: {plain_reason(first['msg'])}, not {first['input']!r}"
         ) from None
     return {name: getattr(checked, name) for name in given}
 
@@ -125,13 +125,7 @@ def _from_table(
     table: Path, clips: Sequence[ClipHandle], path: str, columns: Mapping[str, str]
 ) -> Iterator[_RecordChange]:
     """Yield the changes of a table. Raises `WrongUsage` with all wrong rows if there are any."""
-    try:
-        with table.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file, strict=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise WrongUsage(f"{table} cannot be read as a CSV file: {error}") from None
-    if not rows:
-        raise WrongUsage(f"{table} has no rows below its column names")
+    rows = rows_of(table)
     fields = {name: columns.get(name, name.strip().lower().replace(" ", "_")) for name in rows[0] if name}
     key = next((name for name, field in fields.items() if field in KEYS), None)
     if key is None:
@@ -181,7 +175,7 @@ def _keyed(clips: Sequence[ClipHandle], path: str, key: str) -> dict[str, list[C
 
 
 def _of_row(
-    row: Mapping[str | None, Any],
+    row: Mapping[str, Any],
     fields: Mapping[str, str],
     key: str,
     known: Mapping[str, list[ClipHandle]],

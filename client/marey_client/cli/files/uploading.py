@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from marey_schemas.imports import ImportEntry
 
 
-UPLOAD = OptionsOf("marey_schemas.options.imports:ImportOptions", short={"frame_rate_hz": "--fps"})
+UPLOAD = OptionsOf(
+    "marey_schemas.options.imports:ImportOptions", short={"frame_rate_hz": "--fps", "replace_skeleton": "--replace"}
+)
 WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not everything it has
 
 
@@ -43,6 +45,7 @@ def upload(
     """Import motion files. Refused files are listed with a reason.
 
     Importing the same file again changes nothing; a changed file of the same name becomes a new revision of its clip.
+    If it also has another skeleton, it is refused without --replace.
     Clips from a folder that `marey dataset export` wrote get the paths, take records and tags that they had in the
     export.
     """

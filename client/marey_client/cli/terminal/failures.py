@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from marey_schemas.wording import printable, without_prefix
+from marey_schemas.wording import plain_reason, printable
 
 FAILED, WRONG_USAGE = 1, 2
 INTERRUPTED = 130
@@ -41,15 +41,15 @@ def reported(*, verbose: bool) -> Iterator[None]:
     except Exception as error:
         from pydantic import ValidationError
 
-        from marey_client.errors import BadAddress, MareyError
+        from marey_client.errors import BadAddress, BadArgument, MareyError
         from marey_schemas.encoding.codecs import CodecError
 
         if isinstance(error, ValidationError):
             first = error.errors(include_url=False)[0]
             where = ".".join(str(step) for step in first["loc"])
-            text = without_prefix(first["msg"])
+            text = plain_reason(first["msg"])
             _exit(WRONG_USAGE, f"{where}: {text}" if where else text, verbose)
-        if isinstance(error, BadAddress | CodecError):
+        if isinstance(error, BadAddress | BadArgument | CodecError):
             _exit(WRONG_USAGE, str(error), verbose)
         if isinstance(error, UnicodeEncodeError):
             _exit(WRONG_USAGE, f"{error.object[:MOST_SHOWN]!r} is not text in UTF-8", verbose)

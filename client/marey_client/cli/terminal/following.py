@@ -15,7 +15,7 @@ from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.output import print_json, print_message, print_refused
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf
 from marey_client.progress import progress, show_progress
-from marey_schemas.wording import counted, without_prefix
+from marey_schemas.wording import counted, plain_reason
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
@@ -43,7 +43,7 @@ class _CommittingJob(OptionsOf):
         try:
             commit = CommitOptions.model_validate(_COMMIT.read(typed)).commit()
         except ValidationError as error:
-            raise WrongUsage(f"--commit-to: {without_prefix(error.errors()[0]['msg'])}") from None
+            raise WrongUsage(f"--commit-to: {plain_reason(error.errors()[0]['msg'])}") from None
         except ValueError as error:
             raise WrongUsage(str(error)) from None
         return {**self._job.read(typed), **({} if commit is None else {"commit": commit})}

@@ -103,8 +103,11 @@ def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Mare
         import logging
 
         logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    from marey_client.cli.terminal.output import print_message
+    from marey_client.retries import Retries
+
     found = credential_of(context)
-    with Marey(found.url, None if anonymous else found.bearer) as marey:
+    with Marey(found.url, None if anonymous else found.bearer, retries=Retries(notice=print_message)) as marey:
         try:
             yield marey
         except Unauthenticated as error:

@@ -31,7 +31,7 @@ from marey_client.cli.terminal.typed_values import (
     read_numbers,
     without_null,
 )
-from marey_schemas.wording import without_prefix
+from marey_schemas.wording import plain_reason
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -80,7 +80,7 @@ class OptionsOf:
         except ValidationError as error:
             for one in error.errors(include_url=False):
                 if one["type"] != "missing":  # that the command adds
-                    raise WrongUsage(f"{self._spelled(one['loc'])}{without_prefix(one['msg'])}") from None
+                    raise WrongUsage(f"{self._spelled(one['loc'])}{plain_reason(one['msg'])}") from None
         return chosen
 
     @cached_property

@@ -33,6 +33,7 @@ from marey_server.store.items.reading import (
     read_item,
     read_part,
 )
+from marey_server.store.items.skeleton_merges import merge_skeletons
 
 __all__ = [
     "Draft",
@@ -55,6 +56,7 @@ __all__ = [
     "list_revisions",
     "load_part",
     "load_parts",
+    "merge_skeletons",
     "permit_export",
     "prepare_part",
     "prepare_parts",

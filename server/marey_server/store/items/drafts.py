@@ -30,6 +30,8 @@ class Draft:
     `reuse`: `new` creates an item and refuses a name that is taken; `by_name` adds a revision to the item that has the
     name, or else creates an item; `by_content` uses any item of the project whose required parts are equal, or else
     creates an item.
+
+    With `same_skeleton`, nothing is published if the item that has the name has another skeleton.
     """
 
     name_in_batch: str
@@ -41,16 +43,21 @@ class Draft:
     sources: Mapping[str, Sequence[tuple[str, int]]] = field(default_factory=dict)
     reuse: Literal["by_name", "by_content", "new"] = "by_name"
     message: str = ""
+    same_skeleton: bool = False
     hidden: bool = False
     """Whether a new item is deleted from the beginning, so that no folder shows it before a checkout restores it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Revision published from a draft. `created` is false if the revision existed before."""
+    """Revision published from a draft. `created` is false if the revision existed before.
+
+    `skeleton_changed` says whether the revision before the new one has another skeleton.
+    """
 
     name: str
     item: str
     kind: Kind
     revision: int
     created: bool
+    skeleton_changed: bool = False

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from sqlalchemy import Row, Select, and_, select, tuple_
+from sqlalchemy import ColumnElement, Row, Select, and_, exists, select, tuple_
 
+from marey_schemas.documents.skeleton_merges import SKELETON_MERGE
 from marey_schemas.items import Lineage, LineageEdge, Page, Revision, Staleness
 from marey_schemas.kinds import Kind
 from marey_schemas.tracing.context import HEADER
@@ -115,11 +116,21 @@ def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[Li
     return tuple(LineageEdge(**row._mapping) for row in tx.execute(statement))
 
 
+def _has_newer_content(item_id: Any, number: Any) -> ColumnElement[bool]:
+    """Return the condition that an item has a later revision which was not made by a merge of skeletons."""
+    later, merge = revision.alias("later"), lineage.alias("merge")
+    is_merge = and_(
+        merge.c.item_id == later.c.item_id, merge.c.number == later.c.number, merge.c.role == SKELETON_MERGE
+    )
+    return exists().where(later.c.item_id == item_id, later.c.number > number, ~exists().where(is_merge))
+
+
 def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str) -> Staleness:
     """Return whether a direct or indirect input of the newest revision has a newer revision.
 
     An earlier revision of an item can be an input of the same item: the tree of a model is computed from its previous
-    revision. Such an input does not count as outdated, but its own inputs are examined.
+    revision. Such an input does not count as outdated, but its own inputs are examined. Revisions that a merge of
+    skeletons made do not count as newer, because the motion is the same.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     ancestry = (
@@ -133,6 +144,7 @@ def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str)
         tuple_(lineage.c.item_id, lineage.c.number).in_(select(ancestry.c.item_id, ancestry.c.number)),
         lineage.c.input_item_id != lineage.c.item_id,
         item.c.head > lineage.c.input_number,
+        _has_newer_content(lineage.c.input_item_id, lineage.c.input_number),
     )
     newer = select(lineage.c.item_id).join(item, item.c.id == lineage.c.input_item_id).where(outdated)
     stale = tx.execute(newer.limit(1)).first() is not None

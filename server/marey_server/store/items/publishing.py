@@ -26,6 +26,7 @@ from marey_server.store.items.drafts import Draft, Published
 from marey_server.store.items.loaded_drafts import LoadedDraft, load_drafts
 from marey_server.store.items.revisions import NewRevision, read_part_digests, write_head, write_revisions
 from marey_server.store.items.same_rigs import on_known_rigs
+from marey_server.store.items.skeleton_changes import skeleton_of, without_skeleton_changes
 from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
@@ -38,6 +39,9 @@ Tree = dict[str, Any]
 
 DRAFTS_TOGETHER = 256
 """Greatest number of drafts that are published with the same statements."""
+
+_HEAD = (item.c.id, item.c.head, item.c.creator_id, item.c.skeleton_id)
+"""Columns of an item that a draft may use or revise."""
 
 _RACES = 20
 """Greatest number of tries to publish a draft if concurrent writes interfere."""
@@ -58,8 +62,9 @@ def publish(
     In a document, `{"output": name}` refers to another draft and is replaced by the item and revision published from
     it. The draft of a model may have a sample tree. The tree's `model_digest` may be such a reference, too, and is
     replaced by the digest of the draft's model. With `refer_to_deleted`, documents may refer to items that are deleted.
-    If an item already has the content of a draft, no new revision is created. `rights` are the rights of the user who
-    publishes; they may be None only if all drafts are hidden.
+    If an item already has the content of a draft, no new revision is created. Nothing is published, and returned, for
+    drafts with `same_skeleton` that would change a skeleton (`skeleton_changes`). `rights` are the rights of the user
+    who publishes; they may be None only if all drafts are hidden.
 
     Raises `InvalidProblem` for a draft that is not valid, and `ConflictProblem` for a name that is taken. Raises
     `ForbiddenProblem` if `rights` do not allow writing to the folder of a new item or revision.
@@ -71,12 +76,13 @@ def publish(
     hold_off_purges(tx, project_row.id)
     require_places((draft for draft in drafts if draft.reuse != "by_content"), rights)
     publication = _Publication(tx, project_row, author_id, rights, job_id, refer_to_deleted)
-    for together in _in_turns(on_known_rigs(tx, project_row, load_drafts(tx, drafts))):
+    loaded = without_skeleton_changes(tx, project_row, on_known_rigs(tx, project_row, load_drafts(tx, drafts)))
+    for together in _in_turns(loaded):
         publication.add(together)
     holdings.hold(tx, project_row.id, publication.added)
     faults.point("publish.before_commit")
     tx.after_commit(lambda: faults.point("publish.after_commit"))
-    return [publication.done[draft.name_in_batch] for draft in drafts]
+    return [publication.done[draft.name_in_batch] for draft in drafts if draft.name_in_batch in publication.done]
 
 
 def require_places(drafts: Iterable[Draft], rights: FolderRights | None) -> None:
@@ -124,9 +130,13 @@ class _Ready:
         """Digests of the parts that every item of the kind has."""
         return tuple(self.digests.get(part) for part in _required(self.draft.kind))
 
-    def published(self, item_id: str, number: int, *, created: bool) -> Published:
-        """Return the revision that was published from the draft."""
-        return Published(self.draft.name_in_batch, item_id, self.draft.kind, number, created)
+    def published(self, head: _Head, *, created: bool) -> Published:
+        """Return the revision that was published from the draft; `head.skeleton_id` is the skeleton before it."""
+        skeleton = skeleton_of(self.bodies)
+        changed = (
+            created and None not in (skeleton, head.skeleton_id) and (skeleton or {}).get("item") != head.skeleton_id
+        )
+        return Published(self.draft.name_in_batch, head.id, self.draft.kind, head.number, created, changed)
 
 
 def _required(kind: Kind) -> list[str]:
@@ -141,6 +151,7 @@ class _Head:
     number: int
     parts: Mapping[str, str]
     creator_id: str | None
+    skeleton_id: str | None = None
 
 
 @dataclass
@@ -232,7 +243,10 @@ class _Publication:
             return {}
         found = self._find_places(waiting, kind) if reuse == "by_name" else self._find_contents(waiting, kind)
         parts = read_part_digests(self.tx, {(row.id, row.head) for row in found.values()})
-        return {name: _Head(row.id, row.head, parts[row.id, row.head], row.creator_id) for name, row in found.items()}
+        return {
+            name: _Head(row.id, row.head, parts[row.id, row.head], row.creator_id, row.skeleton_id)
+            for name, row in found.items()
+        }
 
     def _find_places(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
         folders: defaultdict[str, dict[str, str]] = defaultdict(dict)
@@ -240,7 +254,7 @@ class _Publication:
             folders[self._collection_id(one.draft.collection)][one.draft.item_name] = one.draft.name_in_batch
         found = {}
         for collection_id, names in folders.items():
-            statement = select(item.c.id, item.c.head, item.c.creator_id, item.c.name).where(
+            statement = select(*_HEAD, item.c.name).where(
                 item.c.collection_id == collection_id, item.c.kind == kind.value, item.c.deleted_us.is_(None)
             )
             for row in self.tx.execute(statement.where(item.c.name.in_(list(names)))):
@@ -250,7 +264,7 @@ class _Publication:
     def _find_contents(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
         """Return, by name of the draft, the row of the first item of the project that has the same required parts."""
         self.tx.lock(f"content:{self.project.id}:{kind}")
-        statement = select(item.c.id, item.c.head, item.c.creator_id).where(
+        statement = select(*_HEAD).where(
             item.c.project_id == self.project.id, item.c.kind == kind.value, item.c.deleted_us.is_(None)
         )
         named = []
@@ -262,7 +276,7 @@ class _Publication:
             named.append(held.c.document_digest.label(f"digest_{place}"))
         rows: dict[tuple[str | None, ...], Row[Any]] = {}
         for row in self.tx.execute(statement.add_columns(*named).order_by(item.c.id)):
-            rows.setdefault(tuple(row[3:]), row)
+            rows.setdefault(tuple(row[len(_HEAD) :]), row)
         return {one.draft.name_in_batch: rows[one.required] for one in waiting if one.required in rows}
 
     @staticmethod
@@ -334,7 +348,7 @@ class _Publication:
         if one.draft.kind is Kind.CLIP and one.draft.reuse == "by_name":
             one = self._with_earlier_facts(one, head)
         if one.draft.reuse == "by_content" or one.digests.items() <= head.parts.items():
-            self.done[one.draft.name_in_batch] = one.published(head.id, head.number, created=False)
+            self.done[one.draft.name_in_batch] = one.published(head, created=False)
             return
         parts = {**head.parts, **one.digests}
         added = sum(size for part, size in one.stored_bytes.items() if one.digests[part] != head.parts.get(part))
@@ -384,7 +398,7 @@ class _Publication:
         shown = [(one, head) for one, head in made if not one.draft.hidden]
         self.tx.emit_each((event, self.project.id, head.id, self._event(one.draft, head)) for one, head in shown)
         for one, head in made:
-            self.done[one.draft.name_in_batch] = one.published(head.id, head.number, created=True)
+            self.done[one.draft.name_in_batch] = one.published(head, created=True)
 
     def _event(self, draft: Draft, head: _Head) -> dict[str, Any]:
         return {

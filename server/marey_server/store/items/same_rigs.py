@@ -76,7 +76,7 @@ def _known_rigs(tx: Transaction, project: ProjectRow, new: Mapping[str, RigDocum
     candidates = [RigDocument(digest, bodies[digest]) for digest in compared]
     found = {}
     for name, rig in unknown.items():
-        same = next((one for one in candidates if one.digest == rig.digest or _is_same(one, rig)), None)
+        same = next((one for one in candidates if one.digest == rig.digest or is_same_rig(one, rig)), None)
         if same is None:
             candidates.append(rig)
         elif same.digest != rig.digest:
@@ -98,7 +98,7 @@ def _stored_digests(tx: Transaction, project: ProjectRow) -> dict[str, str]:
     return {row.document_digest: row.id for row in tx.execute(statement)}
 
 
-def _is_same(known: RigDocument, new: RigDocument) -> bool:
+def is_same_rig(known: RigDocument, new: RigDocument) -> bool:
     """Return whether the clips of a new skeleton mean the same on a known one.
 
     Clips that move a joint of the known skeleton do not count: those of the new skeleton need the offset of this joint.
@@ -107,6 +107,19 @@ def _is_same(known: RigDocument, new: RigDocument) -> bool:
         abs(a - b) <= SAME_NUMBER
         for a, b in zip(_numbers(known.body, new.moved), _numbers(new.body, new.moved), strict=True)
     )
+
+
+def rig_difference(known: RigDocument, new: RigDocument) -> str:
+    """Return, as part of a sentence, what makes two skeletons different rigs."""
+    first, second = ([joint["name"] for joint in rig.body["joints"]] for rig in (known, new))
+    if odd := sorted(set(first) ^ set(second)):
+        return f"only one of them has {', '.join(odd[:5])}{', ...' if len(odd) > 5 else ''}"
+    if _structure(known.body) != _structure(new.body):
+        return "their joints have other parents, or another order"
+    farthest = max(
+        abs(a - b) for a, b in zip(_numbers(known.body, new.moved), _numbers(new.body, new.moved), strict=True)
+    )
+    return f"their offsets or rest rotations differ by up to {farthest:.2g}"
 
 
 def _structure(body: Tree) -> tuple[object, ...]:

@@ -12,14 +12,16 @@ from dataclasses import dataclass, field
 from itertools import count, islice
 from typing import Any
 
+from pydantic import ValidationError
 from sqlalchemy import and_, select
 
 from marey_schemas.access import Role
 from marey_schemas.datasets.naming import RefKind
+from marey_schemas.imports import published_result
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_schemas.queue.commits import MOST_COMMITTED, MOST_COMMITTED_AT_ONCE, JobCommit, OutputsCommit
-from marey_schemas.queue.jobs import FailureReason
+from marey_schemas.queue.jobs import FailureReason, JobOutput
 from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_server.access import roles, scopes
 from marey_server.access.folder_rights import FolderRoleProblem
@@ -184,6 +186,18 @@ class PublishedOutputs:
     def commit(self) -> str | None:
         """The digest of the commit that has the outputs."""
         return self.columns.get("committed")
+
+    def result(self, kind: str, result: dict[str, Any]) -> dict[str, Any]:
+        """Return the result of the job; the entries of an import say for each file what was published.
+
+        Raises `InvalidProblem` if an entry of an import is not valid.
+        """
+        if kind != "import" or "entries" not in result:
+            return result
+        try:
+            return published_result(result, {one["name"]: JobOutput.model_validate(one) for one in self.outputs})
+        except ValidationError as error:
+            raise InvalidProblem("An entry in the result of an import is not valid.") from error
 
 
 JOB_COLUMNS = (

@@ -130,7 +130,7 @@ def _complete(
         records.append(
             {
                 "of_job": row.id,
-                "its_result": {**request.result, "outputs": len(outputs)},
+                "its_result": {**published.result(row.kind, request.result), "outputs": len(outputs)},
                 "its_outputs": outputs,
                 "its_code": request.code_version,
                 "its_environment": request.environment,

@@ -12,7 +12,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, and_, delete, not_, select, update
 
 from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
-from marey_schemas.queue.jobs import NOTHING_DONE, FailureReason
+from marey_schemas.queue.jobs import NOTHING_DONE, FailureReason, nothing_done
 from marey_server.store.jobs import commits
 from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
 from marey_server.store.jobs.events import wake_workers
@@ -97,7 +97,7 @@ def _refused_all(kind_name: str, result: Mapping[str, Any]) -> bool:
         fails = find_kind(kind_name).refusing_all_fails
     except UnknownKindError:
         return False
-    return fails and bool(result.get("refused")) and not result.get("outputs")
+    return fails and nothing_done(result)
 
 
 def _is_large(tx: Transaction, head: Any, result: Mapping[str, Any]) -> bool:

@@ -16,7 +16,7 @@ from sqlalchemy import Row, and_, insert, select, update
 from marey_schemas.queue.job_kinds import UnknownKindError, kind_of_job
 from marey_schemas.queue.jobs import FailureReason, InputSpec
 from marey_schemas.queue.kind_declaration import KindDeclaration
-from marey_schemas.wording import without_prefix
+from marey_schemas.wording import plain_reason
 from marey_server import faults
 from marey_server.errors import QuotaExceededProblem
 from marey_server.store.jobs import commits, layout, result_cache
@@ -93,7 +93,7 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
     except ValidationError as error:
         detail = (
             f"In this version of the server, these parameters of {kind.name} are not valid: "
-            f"{without_prefix(error.errors()[0]['msg'])}"
+            f"{plain_reason(error.errors()[0]['msg'])}"
         )
         raise LateInputError("invalid-params", detail) from error
     pins = _pin_outputs(tx, row, kind)

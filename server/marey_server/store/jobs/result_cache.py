@@ -284,7 +284,7 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
         waits,
         "succeeded",
         dependencies_left=0,
-        result=row.result,
+        result=made.result(row.kind, row.result),
         outputs=made.outputs,
         code_version=row.code_version,
         environment=row.environment,

@@ -130,6 +130,7 @@ def _staged_draft(prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
         "collection": output.collection,
         "tags": list(output.tags),
         "reuse": output.reuse,
+        "same_skeleton": output.same_skeleton,
         "sources": _pinned_sources(output, pins),
         "parts": {part: content.digest for part, content in prepared.parts.items()},
     }
@@ -273,6 +274,7 @@ def publish_drafts(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft])
             "kind": one.kind.value,
             "revision": one.revision,
             "created": one.created,
+            **({"skeleton_changed": True} if one.skeleton_changed else {}),
         }
         for one in published
     ]
@@ -289,6 +291,7 @@ def _draft(name: str, draft: StagedDraft, row: Any) -> Draft:
         sources={role: [(item, revision) for item, revision in pairs] for role, pairs in draft["sources"].items()},
         reuse=draft["reuse"],
         message=row.message,
+        same_skeleton=draft.get("same_skeleton", False),  # earlier versions did not store it
     )
 
 

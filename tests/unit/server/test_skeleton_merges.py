@@ -1,0 +1,120 @@
+"""Merges of duplicate skeletons: clips move to one skeleton, with the same motion, history and freshness."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.support.store_fixtures import ALL_RIGHTS, Lab, motion_tree, skeleton_tree
+
+from marey_schemas.documents.skeleton_merges import SKELETON_MERGE, SkeletonMergeRequest
+from marey_schemas.items import ItemCreate
+from marey_schemas.kinds import Kind
+from marey_server.errors import ApiProblem, ConflictProblem, ForbiddenProblem, InvalidProblem, NotFoundProblem
+from marey_server.store import items, projects
+from marey_server.store.items import Draft
+
+
+def rig(
+    lab: Lab, name: str, *, root_m: float = 0.0, second_m: float = 0.5, mapping: dict[str, Any] | None = None
+) -> Any:
+    """Create a skeleton of three joints; its root and its second joint have these offsets."""
+    tree = skeleton_tree()
+    tree["joints"][0]["offset"] = [root_m, 0.0, 0.0]
+    tree["joints"][2]["offset"] = [0.0, second_m, 0.0]
+    parts = {"hierarchy": tree, **({"mapping": mapping} if mapping else {})}
+    return lab.write(
+        items.create_item, "lab", Kind.SKELETON, ItemCreate(name=name, collection="skeletons", parts=parts)
+    )
+
+
+def merge(lab: Lab, **fields: Any) -> Any:
+    request = SkeletonMergeRequest(**fields)
+    return (lab.read if request.dry_run else lab.write)(items.merge_skeletons, "lab", request, who=lab.maintainer)
+
+
+def derived(lab: Lab, clip: Any, skeleton: Any) -> str:
+    """Create a clip that was computed from `clip`; return its id."""
+
+    def publish(tx: Any) -> Any:
+        motion = motion_tree(skeleton, seed=9)
+        draft = Draft("made", Kind.CLIP, "made", {"motion": motion}, "made", sources={"clips": [(clip.id, 1)]})
+        row = projects.require(tx, "lab")
+        return items.publish(tx, row, [draft], author_id=tx.principal.user_id, rights=ALL_RIGHTS)[0].item
+
+    made: str = lab.write(publish)
+    return made
+
+
+def stale(lab: Lab, item: str) -> bool:
+    found: bool = lab.read(items.read_staleness, "lab", Kind.CLIP, item).stale
+    return found
+
+
+def test_clips_move_to_one_skeleton_with_the_same_poses_and_nothing_becomes_stale(lab: Lab) -> None:
+    first, second, other = rig(lab, "a"), rig(lab, "b", root_m=3.0), rig(lab, "c", second_m=0.7)
+    for number in range(2):
+        lab.add_clip(first, f"walk {number}", seed=number)
+    moved = lab.add_clip(second, "run", collection="raw", seed=7, info={"subject": "ada"})
+    body = {"clip": {"item": moved.id, "revision": 1}, "segments": [{"label": "a", "start": 0, "end": 2}]}
+    said = lab.write(items.create_item, "lab", Kind.ANNOTATION, ItemCreate(name="said", parts={"annotation": body}))
+    made = derived(lab, moved, other)
+
+    preview = merge(lab, dry_run=True)
+    assert [(one.kept.path, [gone.path for gone in one.merged]) for one in preview.rigs] == [
+        ("skeletons/a", ["skeletons/b"])
+    ]
+    assert lab.read(items.read_item, "lab", Kind.CLIP, moved.id).revision == 1
+
+    (done,) = merge(lab).rigs
+    assert (done.kept.id, done.merged[0].id, done.merged[0].moved) == (first.id, second.id, {"clip": 1})
+    now = lab.read(items.read_item, "lab", Kind.CLIP, moved.id)
+    assert (now.revision, now.path, now.summary["skeleton"], now.summary["subject"]) == (2, "raw/run", first.id, "ada")
+    before, after = (
+        lab.read(items.read_part, "lab", Kind.CLIP, moved.id, "motion", revision=number).tree for number in (1, 2)
+    )
+    assert np.array_equal(before["poses"], after["poses"])
+    assert {**before, "skeleton": None, "poses": None} == {**after, "skeleton": None, "poses": None}
+    with pytest.raises(NotFoundProblem):
+        lab.read(items.read_item, "lab", Kind.SKELETON, second.id)
+    layer = lab.read(items.read_part, "lab", Kind.ANNOTATION, said.id, "annotation").tree
+    assert layer["clip"] == {"item": moved.id, "revision": 2}
+    (edge,) = lab.read(items.read_lineage, "lab", Kind.CLIP, moved.id).inputs
+    assert (edge.role, edge.item, edge.revision) == (SKELETON_MERGE, moved.id, 1)
+
+    assert not stale(lab, made)
+    lab.write(items.put_part, "lab", Kind.CLIP, moved.id, "info", {"subject": "eve"}, expected_rev=None)
+    assert stale(lab, made)
+    assert merge(lab).rigs == ()
+
+
+def test_skeletons_whose_other_offsets_all_motions_replace_are_merged(lab: Lab) -> None:
+    kept, replaced = rig(lab, "a"), rig(lab, "b", second_m=0.7)
+    for skeleton in (kept, replaced):
+        tree = motion_tree(skeleton, seed=1)
+        tree |= {"translated_joints": ["j2"], "translations": np.ones((5, 1, 3), "<f4")}
+        lab.write(items.create_item, "lab", Kind.CLIP, ItemCreate(name=skeleton.name, parts={"motion": tree}))
+    assert len(merge(lab, kept=kept.id, dry_run=True).rigs) == 1
+    lab.add_clip(replaced, "still")
+    assert merge(lab, kept=kept.id, dry_run=True).rigs == ()
+    with pytest.raises(InvalidProblem, match=r"differ by up to 0\.2") as refused:
+        merge(lab, skeletons=(kept.id, replaced.id), kept=kept.id)
+    assert refused.value.error_code == "other-rig"
+
+
+def test_a_joint_map_made_by_hand_is_kept_and_two_of_them_are_a_question(lab: Lab) -> None:
+    mapping = {"joints": {"hips": "j0"}, "method": "manual", "confidence": 1.0}
+    plain, edited = rig(lab, "a"), rig(lab, "b", root_m=1.0, mapping=mapping)
+    lab.add_clip(plain)
+    assert merge(lab, dry_run=True).rigs[0].kept.id == edited.id
+    rig(lab, "c", root_m=2.0, mapping={**mapping, "joints": {"hips": "j1"}})
+    with pytest.raises(ConflictProblem, match="choose the skeleton that remains with --keep"):
+        merge(lab)
+    assert merge(lab, kept=edited.id).rigs[0].merged[1].path == "skeletons/a"
+
+
+def test_only_maintainers_merge_and_unknown_skeletons_are_named(lab: Lab) -> None:
+    rig(lab, "a")
+    with pytest.raises(ForbiddenProblem):
+        lab.write(items.merge_skeletons, "lab", SkeletonMergeRequest(), who=lab.contributor)
+    with pytest.raises(ApiProblem, match="skeleton_gone"):
+        merge(lab, skeletons=("skeleton_gone",))
