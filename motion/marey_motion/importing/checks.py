@@ -35,6 +35,7 @@ CODES = {
     "pelvis-from-hip-line": "The retargeted pelvis follows the line between the source's hips, which its pelvis joint "
     "contradicts.",
     "dropped-joints-followed": "Retargeted bones of spine or neck stand for joints that only one of the skeletons has.",
+    "below-floor": "Hands or feet of the retargeted clip are below the floor on which the source stands.",
     "feet-kept": "Feet of the retargeted clip were moved, so that they stay in place while those of the source do.",
     "hands-kept": "Hands of the retargeted clip were moved to the scaled positions of those of the source.",
     "soles-moved-to-floor": "The retargeted clip was moved up or down, because its soles were off the floor.",

@@ -61,7 +61,7 @@ RETARGET = KindDeclaration(
     description="Transfers the motion of clips to another skeleton.",
     params=job_params.RetargetParams,
     implementation="marey_worker.kinds.retarget:run",
-    version=3,
+    version=4,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to retarget."),
         "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton to retarget to."),
@@ -90,7 +90,7 @@ EDIT = KindDeclaration(
     description="Applies the commands of an edit to clips: trims, joins, smooths, places and repairs them.",
     params=job_params.EditParams,
     implementation="marey_worker.kinds.edit:run",
-    version=4,
+    version=5,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to edit."),
         "edit": InputSpec(

@@ -25,7 +25,8 @@ def run(context: Context, params: RetargetParams) -> dict[str, Any]:
     """Retarget every clip of the job.
 
     A clip that cannot be retargeted is listed as a refusal in the result, with code and reason. The result counts the
-    clips with a warning, by code; the part `info` of each such clip contains the warning.
+    clips with a warning, by code; the part `info` of each such clip contains the warning. Raises `JobRefused` if no
+    clip can be retargeted.
     """
     return _Retargeting(context, params).run()
 
@@ -62,6 +63,7 @@ class _Retargeting:
                 self._results.add(self._retargeted(pin, MotionDocument.model_validate(present(pin, motion)), info))
             except UNUSABLE as error:
                 self._refusals.add(pin, error)
+        self._refusals.require_some(self._results.count, len(pins), "retargeted")
         self._results.flush()
         return {
             "clips": self._results.count,
