@@ -268,20 +268,20 @@ class _Cluster:
         reach = max(blend_frames, FLIP_SHARE * len(frames), 1.0)
         limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
         joints = tuple(sorted({joint for one in constraints for joint in one.joints}))
-        self.budget.spend(self._work(len(frames), constraints, limb, joints))
         targets, neighbours = [_target_at(one, frames) for one in constraints], Neighbours(frames, reach)
-        solved = self._solver_of(limb, joints)
+        solved = self._solver_of(constraints, limb, joints)
         made = solved(given, targets, neighbours)
         if limb is None or self._method(constraints, limb, joints) != "two_bone" or not self.damping_zone_rad:
             return made
         return self._calmed(given, made, targets, limb, neighbours, solved)
 
     def _solver_of(
-        self, limb: TwoBoneLimb | None, joints: tuple[int, ...]
+        self, constraints: Sequence[Constraint], limb: TwoBoneLimb | None, joints: tuple[int, ...]
     ) -> Callable[[Motion, Sequence[Target], Neighbours], Motion]:
         freedom = replace(self.freedom, joints=joints)
 
         def solved(given: Motion, targets: Sequence[Target], neighbours: Neighbours) -> Motion:
+            self.budget.spend(self._work(given.frame_count, constraints, limb, joints))
             return solve(
                 self.skeleton, given, targets, freedom=freedom, limb=limb, solver=self.solver, options=self.options,
                 neighbours=neighbours, damping_zone_rad=self.damping_zone_rad,

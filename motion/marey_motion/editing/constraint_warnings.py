@@ -1,4 +1,4 @@
-"""Constraints that cannot act are refused; what else an animator would not expect of their result is told."""
+"""Constraints that cannot act are refused; what else an animator would not expect in their result gives a warning."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _apart(a: Target, b: Target, of_a: Floats, of_b: Floats) -> Flags:
 
 
 def joined(pairs: Sequence[JoinedWindows]) -> Iterator[str]:
-    """Tell in which frames a joint goes from the target of one constraint to that of the next.
+    """Say in which frames a joint goes from the target of one constraint to that of the next.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def joined(pairs: Sequence[JoinedWindows]) -> Iterator[str]:
 
 
 def missed(constraints: Sequence[Constraint], residuals: Sequence[Floats]) -> Iterator[str]:
-    """Tell which constraints are missed, how far, and in which frames.
+    """Say which constraints are missed, how far, and in which frames.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def missed(constraints: Sequence[Constraint], residuals: Sequence[Floats]) -> It
 def jumps(
     skeleton: Skeleton, before: Motion, after: Motion, constraints: Sequence[Constraint], blend_frames: int
 ) -> Iterator[str]:
-    """Tell which joints move faster than the motion before and the constraints require.
+    """Say which joints move faster than the motion before and the constraints require.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def jumps(
     moved = np.linalg.norm(places[1] - places[0], axis=-1).max(axis=0)
     usual = largest_steps(places[0])
     excess = np.linalg.norm(np.diff(places[1], axis=0), axis=-1) - allowed_steps(usual, moved, max(blend_frames, 2))
-    told = set()
+    reported = set()
     for one in constraints:
         chain = [*one.joints, one.target.joint]
         part = excess[max(one.start - blend_frames - 1, 0) : one.stop + blend_frames, chain]
@@ -170,9 +170,9 @@ def jumps(
             continue
         row, column = np.unravel_index(int(np.argmax(part)), part.shape)
         frame, joint = max(one.start - blend_frames - 1, 0) + int(row), chain[int(column)]
-        if (frame, joint) in told:
+        if (frame, joint) in reported:
             continue
-        told.add((frame, joint))
+        reported.add((frame, joint))
         step = float(np.linalg.norm(places[1][frame + 1, joint] - places[1][frame, joint]))
         yield (
             f"{skeleton.joint_names[joint]} moves {100.0 * step:.1f} cm between the frames {frame} and {frame + 1}; "

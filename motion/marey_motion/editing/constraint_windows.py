@@ -21,8 +21,8 @@ class JoinedWindows:
     Parameters
     ----------
     first, second : numbers of the constraints
-    start, stop : frames [start, stop) in which the joint goes from the first target to the second one; empty if there
-        is no room, so that it jumps from the frame `start - 1` to the frame `stop`
+    start, stop : frames [start, stop) in which the joint goes from the first target to the second one; empty if the
+        windows leave no frames, so that it jumps from the frame `start - 1` to the frame `stop`
     apart_m : distance of the two targets
     """
 

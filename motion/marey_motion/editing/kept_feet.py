@@ -31,10 +31,10 @@ from marey_schemas.editing.constraints import PlantOptions
 
 SUNK_M = 1e-4
 """Depth of a sole below its floor, in metres, that counts as rounding."""
-MOST_LIFTS = 3
+MOST_LIFTS = 5
 """Greatest number of times that feet are lifted and their legs solved again."""
-CALM_S = 0.3
-"""Seconds over which a leg is slowed down where its knee would jump."""
+CALM_S = 0.6
+"""Longest time, in seconds, over which a leg is slowed down where its knee would jump."""
 _ZONE_RAD = radians(PlantOptions().knee_damping_deg)
 ROUNDING = 1e-9
 """Difference, in metres and in components of quaternions, up to which a foot counts as in place."""
@@ -105,9 +105,10 @@ def with_feet(
     now = feet_as_motion(take.skeleton, part, feet)
     apart = np.maximum(np.abs(ankles - now.translations).max(axis=-1), np.abs(spins - now.rotations).max(axis=-1))
     moved = apart.max(axis=1) > ROUNDING
-    usual = largest_steps(np.asarray(motion.positions(take.skeleton), dtype=np.float64))
-    reach = max(1.0, CALM_S * take.frame_rate_hz)
-    legs = [_Leg(take.skeleton, foot, spins[:, number], usual, reach) for number, foot in enumerate(feet)]
+    places = [np.asarray(one.positions(take.skeleton), dtype=np.float64) for one in (take.motion, motion)]
+    usual = np.maximum(*(largest_steps(one) for one in places))
+    reach = max(1.0, min(CALM_S * take.frame_rate_hz, 0.5 * (stop - start)))
+    legs = [_Leg(take, foot, spins[:, number], usual, reach) for number, foot in enumerate(feet)]
     made = _solved(part, legs, ankles)
     for _ in range(MOST_LIFTS):
         sunk = np.maximum(
@@ -134,7 +135,7 @@ def _solved(motion: Motion, legs: Sequence[_Leg], ankles: Floats) -> Motion:
 class _Leg:
     """A leg whose ankle gets the rotations `spins` (F, 4) in the world; `usual` and `reach` as in `CalmLimb`."""
 
-    skeleton: Skeleton
+    take: Take
     foot: Foot
     spins: Floats
     usual: Floats
@@ -143,13 +144,15 @@ class _Leg:
     def solved(self, motion: Motion, ankle: Floats) -> Motion:
         """Bring the ankle to its places (F, 3); where the knee would jump, bring it near them."""
         leg = self.foot.leg
-        calm = CalmLimb(self.skeleton, leg, motion, self.usual[[leg.middle, leg.end]], self.reach, 0.5 * _ZONE_RAD)
+        calm = CalmLimb(self.take.skeleton, leg, motion, self.usual[[leg.middle, leg.end]], self.reach, 0.5 * _ZONE_RAD)
         coherent = Neighbours(np.arange(len(ankle)), self.reach)
         return calm.solved(ankle, partial(self._reached, neighbours=coherent), self._reached(motion, ankle))
 
     def _reached(self, motion: Motion, ankle: Floats, neighbours: Neighbours | None = None) -> Motion:
         end = self.foot.leg.end
+        if neighbours is not None:
+            self.take.budget.spend(PER_PLANTED_NUMBER * motion.rotations.size)
         return solve_two_bone(
-            self.skeleton, motion, self.foot.leg, PositionTarget(end, ankle),
+            self.take.skeleton, motion, self.foot.leg, PositionTarget(end, ankle),
             orientation=OrientationTarget(end, self.spins), damping_zone_rad=_ZONE_RAD, neighbours=neighbours,
         ).motion  # fmt: skip

@@ -48,7 +48,7 @@ def depths_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, 
 
 
 def warn_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, floor: Floor) -> CheckWarning | None:
-    """Tell how far hands and feet are below the floor.
+    """Say how far hands and feet are below the floor.
 
     Parameters
     ----------
