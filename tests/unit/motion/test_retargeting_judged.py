@@ -64,8 +64,10 @@ def test_kept_hands_are_where_those_of_the_source_are(rigs: dict[str, Actor], so
     judged = JudgedRetargeting(rigs[source], rigs[target], made.clip, plan.scale)
 
     (check,) = (check for check in made.checks if check.code == "hands-kept")
-    assert judged.hands_off_m(check.values["scale"]) < 0.02
-    assert judged.hands_off_m(check.values["scale"]) == pytest.approx(check.values["missed_m"], abs=1e-5)
+    off, lifted = judged.hands_off_m(check.values["scale"]), check.values["lifted_m"]
+    assert off < 0.02 + lifted, "only hands that are lifted to the floor are elsewhere"
+    assert lifted == 0.0 or (source, target) == ("boxing", "geno"), "no other actor touches the floor"
+    assert lifted > 0.0 or off == pytest.approx(check.values["missed_m"], abs=1e-5)
     arms = judged.upper_arm_speeds_deg_s
     assert arms[1] < 1.25 * arms[0], "elbows do not snap"
     assert judged.contact_speeds_m_s[1] < 1.2 * judged.contact_speeds_m_s[0]
