@@ -69,7 +69,7 @@ def test_kept_hands_are_where_those_of_the_source_are(rigs: dict[str, Actor], so
     assert lifted == 0.0 or (source, target) == ("boxing", "geno"), "no other actor touches the floor"
     assert lifted > 0.0 or off == pytest.approx(check.values["missed_m"], abs=1e-5)
     arms = judged.upper_arm_speeds_deg_s
-    assert arms[1] < 1.25 * arms[0], "elbows do not snap"
+    assert arms[1] < (1.6 if lifted else 1.25) * arms[0], "elbows do not snap"
     assert judged.contact_speeds_m_s[1] < 1.2 * judged.contact_speeds_m_s[0]
 
 
