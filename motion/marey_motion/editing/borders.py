@@ -73,4 +73,22 @@ def blended(a: Floats, b: Floats, shares: Floats) -> Floats:
     result = np.where((shares == 1.0)[:, None, None], b, a)
     between = (shares > 0.0) & (shares < 1.0)
     result[between] = quaternions.slerp(a[between], b[between], shares[between, None])
+    cosines = np.einsum("fjc,fjc->fj", a[between], b[between])
+    for joint in np.flatnonzero((cosines < 0.0).any(axis=0) & (cosines > 0.0).any(axis=0)):
+        result[between, joint] = _on_one_side(a[between, joint], b[between, joint], shares[between])
     return result
+
+
+def _on_one_side(a: Floats, b: Floats, shares: Floats) -> Floats:
+    """Interpolate between rotations (n, 4) of one joint that differ by about half a turn, always in one direction.
+
+    The shorter way would lead to one side in one frame and to the other side in the next frame. Signs of `a` and of `b`
+    are continuous over the frames.
+    """
+    cosines = np.sum(a * b, axis=1)
+    if cosines.sum() < 0.0:
+        b, cosines = -b, -cosines
+    angles = np.arccos(np.clip(cosines, -1.0, 1.0))
+    sines = np.maximum(np.sin(angles), 1e-9)
+    mixed = (np.sin((1.0 - shares) * angles) / sines)[:, None] * a + (np.sin(shares * angles) / sines)[:, None] * b
+    return np.asarray(quaternions.normalise(mixed), dtype=np.float64)

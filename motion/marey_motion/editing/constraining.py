@@ -6,14 +6,16 @@ same joint. All other constraints are solved separately.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats, Ints
+from marey_motion.editing.calm_limbs import CalmLimb, largest_steps
 from marey_motion.editing.compute_budget import PER_MEETING, PER_MET_NUMBER, ComputeBudget
 from marey_motion.editing.displacement import displace, windows_around
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_targets
@@ -41,6 +43,8 @@ _PER_FRAME = 40_000
 _LIMIT_PASSES = 4
 FLIP_SHARE = 0.25
 """Share of a range of frames over which a limb that would flip is turned over, if this is longer than the blend."""
+
+Method = Literal["ccd", "two_bone", "least_squares"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,14 +120,22 @@ def constrain_motion(
     freedom = freedom or Freedom()
     for number, constraint in enumerate(constraints):
         _check_range(constraint, number, motion.frame_count)
-    before = tuple(_residuals(skeleton, motion, constraint) for constraint in constraints)
+    before = tuple(residuals_of(skeleton, motion, constraint) for constraint in constraints)
     changed = motion
+    usual = largest_steps(np.asarray(motion.positions(skeleton), dtype=np.float64))
     for cluster in _clusters(skeleton, constraints, freedom.root_moves):
         solving = _Cluster(
-            skeleton, cluster, freedom, solver, options or SolverOptions(), budget or ComputeBudget(), damping_zone_rad
+            skeleton,
+            cluster,
+            freedom,
+            solver,
+            options or SolverOptions(),
+            budget or ComputeBudget(),
+            damping_zone_rad,
+            usual,
         )
         changed = solving.constrained(changed, blend_frames)
-    after = tuple(_residuals(skeleton, changed, constraint) for constraint in constraints)
+    after = tuple(residuals_of(skeleton, changed, constraint) for constraint in constraints)
     return ConstrainedMotion(changed, before, after)
 
 
@@ -163,7 +175,19 @@ def _check_range(constraint: Constraint, number: int, frames: int) -> None:
         )
 
 
-def _residuals(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> Floats:
+def residuals_of(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> Floats:
+    """Compute the error of a constraint in each of its frames.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    constraint : Constraint    a constraint on n frames
+
+    Returns
+    -------
+    (n,) float64    metres or radians
+    """
     part = motion.at_frames(np.arange(constraint.start, constraint.stop))
     return measure_residuals(skeleton, part, [constraint.target])[:, 0]
 
@@ -201,6 +225,7 @@ class _Cluster:
     options: SolverOptions
     budget: ComputeBudget
     damping_zone_rad: float
+    usual: Floats
 
     def constrained(self, motion: Motion, blend_frames: int) -> Motion:
         """Solve the constraints and blend the motion in and out of the solution.
@@ -215,7 +240,7 @@ class _Cluster:
         for _ in range(MOST_ROUNDS if len(spans) > 1 else 0):
             for together in spans.values():
                 motion = self._met(motion, together, blend_frames)
-            if max(_residuals(self.skeleton, motion, one).max() for one in self.constraints) < SETTLED:
+            if max(residuals_of(self.skeleton, motion, one).max() for one in self.constraints) < SETTLED:
                 break
         return self._met(motion, self.constraints, blend_frames)
 
@@ -243,36 +268,93 @@ class _Cluster:
         reach = max(blend_frames, FLIP_SHARE * len(frames), 1.0)
         limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
         joints = tuple(sorted({joint for one in constraints for joint in one.joints}))
-        self.budget.spend(self._work(len(frames), constraints, limb, joints))
-        return solve(
-            self.skeleton,
-            given,
-            [_target_at(one, frames) for one in constraints],
-            freedom=replace(self.freedom, joints=joints),
-            limb=limb,
-            solver=self.solver,
-            options=self.options,
-            neighbours=Neighbours(frames, reach),
-            damping_zone_rad=self.damping_zone_rad,
-        ).motion
+        targets, neighbours = [_target_at(one, frames) for one in constraints], Neighbours(frames, reach)
+        solved = self._solver_of(constraints, limb, joints)
+        made = solved(given, targets, neighbours)
+        if limb is None or self._method(constraints, limb, joints) != "two_bone" or not self.damping_zone_rad:
+            return made
+        return self._calmed(given, made, targets, limb, neighbours, solved)
+
+    def _solver_of(
+        self, constraints: Sequence[Constraint], limb: TwoBoneLimb | None, joints: tuple[int, ...]
+    ) -> Callable[[Motion, Sequence[Target], Neighbours], Motion]:
+        freedom = replace(self.freedom, joints=joints)
+
+        def solved(given: Motion, targets: Sequence[Target], neighbours: Neighbours) -> Motion:
+            self.budget.spend(self._work(given.frame_count, constraints, limb, joints))
+            return solve(
+                self.skeleton, given, targets, freedom=freedom, limb=limb, solver=self.solver, options=self.options,
+                neighbours=neighbours, damping_zone_rad=self.damping_zone_rad,
+            ).motion  # fmt: skip
+
+        return solved
+
+    def _calmed(
+        self,
+        given: Motion,
+        made: Motion,
+        targets: Sequence[Target],
+        limb: TwoBoneLimb,
+        neighbours: Neighbours,
+        solved: Callable[[Motion, Sequence[Target], Neighbours], Motion],
+    ) -> Motion:
+        """Solve runs of frames in which the limb jumps for calmer paths; `made` is the solution of `targets`."""
+        (place,) = (one for one in targets if isinstance(one, PositionTarget))
+        if place.pole is not None or np.any(place.offset):
+            return made
+        rotations = made.rotations.copy()
+        for start, stop in neighbours.runs:
+            rows = slice(start, stop)
+            run = Neighbours(neighbours.frames[rows], neighbours.reach)
+            others = [_rows_of(one, rows) for one in targets if one is not place]
+            usual = self.usual[[limb.middle, limb.end]]
+            calm = CalmLimb(
+                self.skeleton, limb, given.sliced(start, stop), usual, run.reach, 0.5 * self.damping_zone_rad
+            )
+            again = partial(_solved_for, solved, place, others, run)
+            path = np.broadcast_to(place.values, (len(neighbours.frames), 3))[rows]
+            rotations[rows] = calm.solved(path, again, made.sliced(start, stop)).rotations
+        return made._replace(rotations=rotations)
 
     def _work(
         self, frames: int, constraints: Sequence[Constraint], limb: TwoBoneLimb | None, joints: tuple[int, ...]
     ) -> float:
         """Estimate the work of solving a number of frames in the worst case, in which no target can be reached."""
-        limited, asked = bool(self.freedom.limits), limb_targets([one.target for one in constraints], limb)
-        alone = limb is not None and set(joints) <= set(limb.joints) and not self.freedom.root_moves
-        method: Literal["ccd", "two_bone", "least_squares"] = "ccd" if self.solver == "ccd" else "least_squares"
-        if self.solver == "two_bone" or (self.solver == "auto" and alone and asked is not None and not limited):
-            method = "two_bone"
+        method, limited = self._method(constraints, limb, joints), bool(self.freedom.limits)
         carriers = {carrier for one in constraints for carrier in self.skeleton.path_to_root(one.target.joint)}
         return solving_work(frames, len(carriers), len(constraints), method, limited=limited, options=self.options)
+
+    def _method(self, constraints: Sequence[Constraint], limb: TwoBoneLimb | None, joints: tuple[int, ...]) -> Method:
+        asked = limb_targets([one.target for one in constraints], limb)
+        alone = limb is not None and set(joints) <= set(limb.joints) and not self.freedom.root_moves
+        if self.solver == "two_bone" or (
+            self.solver == "auto" and alone and asked is not None and not self.freedom.limits
+        ):
+            return "two_bone"
+        return "ccd" if self.solver == "ccd" else "least_squares"
 
 
 def _target_at(constraint: Constraint, frames: Ints) -> Target:
     """Select the values of a constraint's target for some of its frames."""
     values = constraint.target.values
     return constraint.target if len(values) == 1 else _with_values(constraint.target, values[frames - constraint.start])
+
+
+def _rows_of(target: Target, rows: slice) -> Target:
+    """Select the values of a target for some of the frames that it is given for."""
+    return target if len(target.values) == 1 else _with_values(target, target.values[rows])
+
+
+def _solved_for(
+    solved: Callable[[Motion, Sequence[Target], Neighbours], Motion],
+    place: PositionTarget,
+    others: Sequence[Target],
+    neighbours: Neighbours,
+    given: Motion,
+    path: Floats,
+) -> Motion:
+    """Solve a run of frames for another path (n, 3) of the point that `place` puts in place."""
+    return solved(given, [replace(place, position=path), *others], neighbours)
 
 
 def _with_values(target: Target, values: Floats) -> Target:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
+from functools import partial
 from math import radians
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.arrays import Flags, Floats
+from marey_motion.editing.calm_limbs import largest_steps
 from marey_motion.editing.compute_budget import PER_NUMBER, PER_PLANTED_NUMBER, PER_RIG
-from marey_motion.editing.constraining import Constraint, constrain_motion, current_values
+from marey_motion.editing.constraining import Constraint, constrain_motion, current_values, residuals_of
+from marey_motion.editing.constraint_warnings import contradictions, joined, jumps, missed, require_acting
+from marey_motion.editing.constraint_windows import join_windows
 from marey_motion.editing.foot_plants import Foot, FootContacts, find_contacts, find_feet
 from marey_motion.editing.foot_plants import plant_feet as plant
 from marey_motion.editing.inverse_kinematics.limbs import limb_ending_at, straight_hinge
@@ -66,58 +68,32 @@ def constrain(take: Take, command: Constrain) -> Take:
     take.budget.spend(PER_RIG)
     rig = _Rig(take)
     wanted = [_named(number, _constraint, rig, one) for number, one in enumerate(command.constraints)]
+    for number, one in enumerate(wanted):
+        _named(number, partial(require_acting, root_moves=command.root_moves), take.skeleton, one)
     freedom = Freedom(
         root_moves=command.root_moves,
         limits={rig.joint(one.joint): _limit(rig, one) for one in command.limits},
         stiffness={rig.joint(name): value for name, value in command.stiffness.items()},
     )
+    blend = take.count_frames(command.blend_s)
+    usual = largest_steps(np.asarray(take.motion.positions(take.skeleton), dtype=np.float64))
+    windows, pairs = join_windows(wanted, usual, blend)
     made = constrain_motion(
-        take.skeleton, take.motion, wanted, blend_frames=take.count_frames(command.blend_s), freedom=freedom,
+        take.skeleton, take.motion, windows, blend_frames=blend, freedom=freedom,
         solver=command.solver, budget=take.budget, damping_zone_rad=radians(command.stretch_damping_deg),
     )  # fmt: skip
-    found = [
-        _finding(asked, constraint, before, after)
-        for asked, constraint, before, after in zip(
-            command.constraints, wanted, made.residuals_before, made.residuals_after, strict=True
-        )
-    ]
-    take = take.moved(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
-    for warning in _contradictions(wanted):
-        take = take.warned("constrain", warning)
-    if take.count_frames(command.blend_s) > take.frame_count:
-        take = take.warned("constrain", f"the blend of {command.blend_s:g} s is longer than the clip")
-    return take
-
-
-def _contradictions(constraints: Sequence[Constraint]) -> list[str]:
-    """Name pairs of constraints that want a joint in two places, or in two orientations, in the same frames."""
-    told = []
-    values = [one.target.values for one in constraints]
-    for (first, a), (second, b) in combinations(enumerate(constraints), 2):
-        start, stop = max(a.start, b.start), min(a.stop, b.stop)
-        if start >= stop or a.target.joint != b.target.joint:
-            continue
-        common = (
-            own if len(own) == 1 else own[start - one.start : stop - one.start]
-            for one, own in ((a, values[first]), (b, values[second]))
-        )
-        apart = start + np.flatnonzero(np.broadcast_to(_apart(a.target, b.target, *common), stop - start))
-        if apart.size:
-            told.append(
-                f"constraints[{first}] and constraints[{second}] contradict each other in the frames "
-                f"{apart[0]}:{apart[-1] + 1}; the result is between them, by their weights"
-            )
-    return told
-
-
-def _apart(a: Target, b: Target, of_a: Floats, of_b: Floats) -> Flags:
-    """Mark the frames (F or 1) in which the values (F or 1, 3 or 4) of two targets of one joint cannot both be met."""
-    if isinstance(a, PositionTarget) and isinstance(b, PositionTarget) and np.allclose(a.offset, b.offset):
-        axes = ["xyz".index(axis) for axis in a.axes if axis in b.axes]
-        return np.asarray(np.abs(of_a - of_b)[:, axes].max(axis=1, initial=0.0) > _OPTIONS.tolerance_m)
-    if isinstance(a, OrientationTarget) and isinstance(b, OrientationTarget):
-        return np.asarray(np.abs((of_a * of_b).sum(axis=1)) < np.cos(0.5 * _OPTIONS.tolerance_rad))
-    return np.zeros(1, dtype=np.bool_)
+    before, after = (
+        [residuals_of(take.skeleton, motion, one) for one in wanted] for motion in (take.motion, made.motion)
+    )
+    found = [_finding(*each) for each in zip(command.constraints, wanted, before, after, strict=True)]
+    edited = take.moved(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
+    told = [*contradictions(wanted), *joined(pairs), *missed(wanted, after)]
+    told += jumps(take.skeleton, take.motion, made.motion, wanted, blend)
+    if blend > take.frame_count:
+        told.append(f"the blend of {command.blend_s:g} s is longer than the clip")
+    for warning in told:
+        edited = edited.warned("constrain", warning)
+    return edited
 
 
 def plant_feet(take: Take, command: PlantFeet) -> Take:

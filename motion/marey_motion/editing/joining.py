@@ -10,6 +10,7 @@ from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.editing.annotations.contacts import contact_labels
 from marey_motion.editing.borders import blended, smooth_step
+from marey_motion.editing.calm_limbs import MOST_STEP, largest_steps
 from marey_motion.editing.foot_plants import Foot
 from marey_motion.editing.ground import heights_of_soles
 from marey_motion.editing.kept_feet import feet_as_motion, feet_of, with_feet
@@ -23,7 +24,7 @@ from marey_motion.looping import LoopSeam, loop_seam, rotated
 from marey_motion.motion import Motion
 from marey_motion.resampling import count_samples, resample_motion
 from marey_motion.root_carrier import body_first, root_first, root_stands
-from marey_motion.skeleton import SAME_SKELETON_M, same_hierarchy
+from marey_motion.skeleton import SAME_SKELETON_M, Skeleton, same_hierarchy
 from marey_schemas.editing.commands import Concatenate
 
 FARTHEST_HELD_M, LONGEST_HELD_S = 0.15, 1.5
@@ -74,7 +75,22 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     first, second, joined = (root_first(motion, body, carrier, root_stays=stays) for motion in (first, second, joined))
     if command.keep_feet and count:
         joined = _with_kept_feet(take, first, second, joined, overlap, count)
-    return take.moved(joined)
+    fast = _fastest(take.skeleton, first, second, joined) if count else None
+    return take.moved(joined) if fast is None else take.moved(joined).warned("concatenate", fast)
+
+
+def _fastest(skeleton: Skeleton, first: Motion, second: Motion, joined: Motion) -> str | None:
+    """Say which joint the blend moves more than `MOST_STEP` times as far as any joint moves before or after it."""
+    before, after, made = (np.asarray(one.positions(skeleton), np.float64) for one in (first, second, joined))
+    usual = max(float(largest_steps(one).max()) for one in (before, after))
+    steps = np.linalg.norm(np.diff(made, axis=0), axis=-1)
+    if not steps.size or steps.max() <= MOST_STEP * usual:
+        return None
+    frame, joint = (int(index) for index in np.unravel_index(int(np.argmax(steps)), steps.shape))
+    return (
+        f"{skeleton.joint_names[joint]} moves {100.0 * steps.max():.1f} cm between the frames {frame} and {frame + 1}; "
+        f"in both clips, no joint moves more than {100.0 * usual:.1f} cm; use a longer blend_s or another seam"
+    )
 
 
 def _without_rest_poses(take: Take, name: str) -> tuple[Take, Clip, dict[str, int]]:

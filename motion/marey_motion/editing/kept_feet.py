@@ -8,17 +8,20 @@ reach them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from math import radians
 
 import numpy as np
 
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
+from marey_motion.editing.calm_limbs import CalmLimb, largest_steps
 from marey_motion.editing.compute_budget import PER_PLANTED_NUMBER, PER_RIG
 from marey_motion.editing.foot_plants import Foot, find_feet
 from marey_motion.editing.ground import heights_of_soles
 from marey_motion.editing.inverse_kinematics.solving import solve_two_bone
-from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget
+from marey_motion.editing.inverse_kinematics.targets import Neighbours, OrientationTarget, PositionTarget
 from marey_motion.editing.take import Take
 from marey_motion.errors import MappingError
 from marey_motion.motion import Motion
@@ -28,8 +31,11 @@ from marey_schemas.editing.constraints import PlantOptions
 
 SUNK_M = 1e-4
 """Depth of a sole below its floor, in metres, that counts as rounding."""
-MOST_LIFTS = 3
+MOST_LIFTS = 5
 """Greatest number of times that feet are lifted and their legs solved again."""
+CALM_S = 0.6
+"""Longest time, in seconds, over which a leg is slowed down where its knee would jump."""
+_ZONE_RAD = radians(PlantOptions().knee_damping_deg)
 ROUNDING = 1e-9
 """Difference, in metres and in components of quaternions, up to which a foot counts as in place."""
 
@@ -99,7 +105,11 @@ def with_feet(
     now = feet_as_motion(take.skeleton, part, feet)
     apart = np.maximum(np.abs(ankles - now.translations).max(axis=-1), np.abs(spins - now.rotations).max(axis=-1))
     moved = apart.max(axis=1) > ROUNDING
-    made = _solved(take.skeleton, part, feet, ankles, spins)
+    places = [np.asarray(one.positions(take.skeleton), dtype=np.float64) for one in (take.motion, motion)]
+    usual = np.maximum(*(largest_steps(one) for one in places))
+    reach = max(1.0, min(CALM_S * take.frame_rate_hz, 0.5 * (stop - start)))
+    legs = [_Leg(take, foot, spins[:, number], usual, reach) for number, foot in enumerate(feet)]
+    made = _solved(part, legs, ankles)
     for _ in range(MOST_LIFTS):
         sunk = np.maximum(
             floors[start:stop] - heights_of_soles(take.skeleton, made, [foot.leg.end for foot in feet]), 0.0
@@ -108,19 +118,41 @@ def with_feet(
             break
         ankles[..., 1] += sunk
         moved |= (sunk >= SUNK_M).any(axis=1)
-        made = _solved(take.skeleton, part, feet, ankles, spins)
+        made = _solved(part, legs, ankles)
     rotations = motion.rotations.copy()
     rotations[start:stop][moved] = made.rotations[moved]
     return motion._replace(rotations=rotations)
 
 
-def _solved(skeleton: Skeleton, motion: Motion, feet: Sequence[Foot], ankles: Floats, spins: Floats) -> Motion:
-    """Solve the legs so that the ankles get the places (F, n, 3) and rotations (F, n, 4) in the world."""
-    zone = radians(PlantOptions().knee_damping_deg)
-    for number, foot in enumerate(feet):
-        place = PositionTarget(foot.leg.end, ankles[:, number])
-        turn = OrientationTarget(foot.leg.end, spins[:, number])
-        motion = solve_two_bone(
-            skeleton, motion, foot.leg, place, orientation=turn, damping_zone_rad=zone
-        ).motion  # fmt: skip
+def _solved(motion: Motion, legs: Sequence[_Leg], ankles: Floats) -> Motion:
+    """Solve the legs so that the ankles get the places (F, n, 3)."""
+    for number, leg in enumerate(legs):
+        motion = leg.solved(motion, ankles[:, number])
     return motion
+
+
+@dataclass(frozen=True, eq=False)
+class _Leg:
+    """A leg whose ankle gets the rotations `spins` (F, 4) in the world; `usual` and `reach` as in `CalmLimb`."""
+
+    take: Take
+    foot: Foot
+    spins: Floats
+    usual: Floats
+    reach: float
+
+    def solved(self, motion: Motion, ankle: Floats) -> Motion:
+        """Bring the ankle to its places (F, 3); where the knee would jump, bring it near them."""
+        leg = self.foot.leg
+        calm = CalmLimb(self.take.skeleton, leg, motion, self.usual[[leg.middle, leg.end]], self.reach, 0.5 * _ZONE_RAD)
+        coherent = Neighbours(np.arange(len(ankle)), self.reach)
+        return calm.solved(ankle, partial(self._reached, neighbours=coherent), self._reached(motion, ankle))
+
+    def _reached(self, motion: Motion, ankle: Floats, neighbours: Neighbours | None = None) -> Motion:
+        end = self.foot.leg.end
+        if neighbours is not None:
+            self.take.budget.spend(PER_PLANTED_NUMBER * motion.rotations.size)
+        return solve_two_bone(
+            self.take.skeleton, motion, self.foot.leg, PositionTarget(end, ankle),
+            orientation=OrientationTarget(end, self.spins), damping_zone_rad=_ZONE_RAD, neighbours=neighbours,
+        ).motion  # fmt: skip

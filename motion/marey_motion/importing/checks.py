@@ -36,7 +36,10 @@ CODES = {
     "pelvis-from-hip-line": "The retargeted pelvis follows the line between the source's hips, which its pelvis joint "
     "contradicts.",
     "dropped-joints-followed": "Retargeted bones of spine or neck stand for joints that only one of the skeletons has.",
+    "below-floor": "Hands or feet of the retargeted clip are below the floor on which the source stands.",
     "feet-kept": "Feet of the retargeted clip were moved, so that they stay in place while those of the source do.",
+    "knees-fast": "Knees of the retargeted clip bend faster than those of the source, because feet are kept in place.",
+    "edit-warning": "A command of an edit reported something that its result may not be expected to have.",
     "hands-kept": "Hands of the retargeted clip were moved to the scaled positions of those of the source.",
     "soles-moved-to-floor": "The retargeted clip was moved up or down, because its soles were off the floor.",
     "offsets-from-positions": "The file contains no bone lengths; they were computed from the position channels.",

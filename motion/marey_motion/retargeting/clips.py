@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from marey_motion import kinematics
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.moved_bones import FollowedBones, follow_moved_bones
 from marey_motion.retargeting.feet import keep_feet
+from marey_motion.retargeting.floor import warn_below_floor
 from marey_motion.retargeting.hands import keep_hands
 from marey_motion.retargeting.planning import RetargetPlan
 from marey_motion.retargeting.soles import level_soles
@@ -122,9 +124,14 @@ def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOption
     result, checks = made.clip, [bones.warning, *trunk.checks, made.warning]
     options = options or RetargetOptions()
     if options.keep_feet:
-        result, check = keep_feet(clip, result, plan)
-        checks.append(check)
+        result, kept = keep_feet(clip, result, plan, made.floor)
+        checks += kept
     if options.keep_hands:
-        result, check = keep_hands(clip, result, plan, options.hands_from)
+        result, check = keep_hands(clip, result, plan, options.hands_from, made.floor)
         checks.append(check)
+    if made.floor is not None and made.points is not None:
+        before, after = made.points
+        if result is not made.clip:
+            after = kinematics.global_positions(result, end_sites=True)
+        checks.append(warn_below_floor(before, after, plan, made.floor))
     return RetargetedClip(result, tuple(check for check in checks if check is not None))

@@ -16,6 +16,7 @@ from marey_motion.editing.ground import sole_heights
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.motion import Motion
+from marey_motion.retargeting.floor import BELOW_M, Floor, depths_below_floor
 from marey_motion.retargeting.planning import RetargetPlan
 from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import Skeleton
@@ -23,16 +24,18 @@ from marey_schemas.editing.constraints import PlantOptions
 from marey_schemas.wording import counted
 
 _OPTIONS = PlantOptions()
+FAST_KNEES = 1.25
+"""Speed of a knee, as a multiple of the greatest in the source, above which the result has a warning."""
 
 
 class KeptFeet(NamedTuple):
-    """A clip whose feet stay in place, and what was moved."""
+    """A clip whose feet stay in place, and checks of what was moved."""
 
     clip: Clip
-    check: CheckWarning
+    checks: tuple[CheckWarning, ...]
 
 
-def keep_feet(source: Clip, result: Clip, plan: RetargetPlan) -> KeptFeet:
+def keep_feet(source: Clip, result: Clip, plan: RetargetPlan, floor: Floor | None) -> KeptFeet:
     """Keep the feet of a retargeted clip in place while those of the source touch the floor.
 
     Touching soles get the height over the floor that they have in the source, times the scale. The feet are planted
@@ -43,10 +46,11 @@ def keep_feet(source: Clip, result: Clip, plan: RetargetPlan) -> KeptFeet:
     source : Clip    F frames of the plan's source skeleton
     result : Clip    F frames of its target skeleton
     plan : RetargetPlan    joints, scale and limbs
+    floor : Floor or None    floor below which no foot is left; None if it is not known
 
     Returns
     -------
-    KeptFeet    F frames, with the feet moved
+    KeptFeet    F frames, with the feet moved, and checks
 
     Raises
     ------
@@ -58,11 +62,23 @@ def keep_feet(source: Clip, result: Clip, plan: RetargetPlan) -> KeptFeet:
     points = kinematics.global_positions(source, end_sites=True).astype(np.float64)
     contacts = [_contacts(points, plan, side, rate) for side in SIDES]
     motion, blend = Motion.of(result), max(1, round(_OPTIONS.blend_s * rate))
+    after = kinematics.global_positions(result, end_sites=True)
     off = plan.scale * _soles(points, plan.source, plan.source_joints)
-    off -= _soles(kinematics.global_positions(result, end_sites=True), plan.target, plan.target_joints)
+    off -= _soles(after, plan.target, plan.target_joints)
     lifts = [faded(one.toe | one.heel, off[:, [side]], blend)[:, 0] for side, one in enumerate(contacts)]
+    if floor is not None:
+        depths = depths_below_floor(points, after, plan, floor, "ankle")
+        for side in np.flatnonzero(depths.max(axis=0) > BELOW_M).tolist():
+            lifted = faded(depths[:, side] > BELOW_M, depths[:, [side]], blend)[:, 0]
+            lifts[side] = np.maximum(lifts[side], np.maximum(lifted, depths[:, side]))
     planted = plant_feet(plan.target, motion, rate, feet, contacts=contacts, lifts=lifts, options=_OPTIONS)
-    return KeptFeet(planted.motion.as_clip(plan.target, rate), _check(planted, motion, plan, feet))
+    made = planted.motion.as_clip(plan.target, rate)
+    before = _knee_speed(points, plan.source_joints, rate)
+    now = _knee_speed(np.asarray(planted.motion.positions(plan.target)), plan.target_joints, rate)
+    checks = [_check(planted, motion, plan, feet)]
+    if now > FAST_KNEES * before:
+        checks.append(_fast_knees(before, now))
+    return KeptFeet(made, tuple(checks))
 
 
 def _toe(joints: Mapping[str, int], side: str) -> int:
@@ -79,6 +95,26 @@ def _contacts(points: Floats, plan: RetargetPlan, side: str, rate_hz: float) -> 
 
 def _soles(points: AnyFloats, skeleton: Skeleton, joints: Mapping[str, int]) -> Floats:
     return sole_heights(points, skeleton, [joints[f"{side}_ankle"] for side in SIDES])
+
+
+def _knee_speed(points: Floats, joints: Mapping[str, int], rate_hz: float) -> float:
+    """Compute the greatest speed, in degrees per second, at which a knee bends or stretches; `points` is (F, n, 3)."""
+    fastest = 0.0
+    for side in SIDES:
+        hip, knee, ankle = (points[:, joints[f"{side}_{part}"]] for part in ("hip", "knee", "ankle"))
+        thigh, shank = knee - hip, ankle - knee
+        bend = np.arctan2(np.linalg.norm(np.cross(thigh, shank), axis=1), np.sum(thigh * shank, axis=1))
+        fastest = max(fastest, float(np.abs(np.diff(bend)).max(initial=0.0)) * rate_hz)
+    return float(np.degrees(fastest))
+
+
+def _fast_knees(before: float, now: float) -> CheckWarning:
+    return CheckWarning(
+        "knees-fast",
+        f"knees bend at up to {now:.0f} degrees per second, {now / max(before, 1e-9):.2f} times as fast as in the "
+        "source, because the feet are kept in place; look at the clip before you use it",
+        values={"source_deg_s": before, "result_deg_s": now},
+    )
 
 
 def _check(planted: PlantedMotion, before: Motion, plan: RetargetPlan, feet: Sequence[Foot]) -> CheckWarning:

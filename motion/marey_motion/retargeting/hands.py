@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +14,10 @@ from marey_motion.clip import Clip
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb
 from marey_motion.editing.inverse_kinematics.solving import solve_two_bone
 from marey_motion.editing.inverse_kinematics.targets import PositionTarget
+from marey_motion.editing.kept_feet import MOST_LIFTS, SUNK_M
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.motion import Motion
+from marey_motion.retargeting.floor import Floor, depths_below_floor
 from marey_motion.retargeting.planning import RetargetPlan
 from marey_motion.rigs.standard import SIDES
 from marey_schemas.options.retargeting import HandsFrom
@@ -64,14 +67,14 @@ class _Arms(NamedTuple):
         return self.arm_m + 0.5 * float(np.linalg.norm(self.shoulders[:, 0] - self.shoulders[:, 1], axis=-1).mean())
 
 
-def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom) -> KeptHands:
+def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom, floor: Floor | None) -> KeptHands:
     """Move the hands of a retargeted clip to the positions of the source's hands, in proportion.
 
     About the shoulders, a hand gets the vector that it has in the source from the middle of the shoulders, times a
     constant scale. The scale is the ratio of the lengths of the arms, or that of the reaches to the side if this is
     smaller, so that hands are within reach in front of the body and beside it. In the world, positions are scaled like
     the path of the pelvis, and can be out of reach. Shoulders and elbows turn; hands keep their orientations in the
-    world. Stretching elbows are damped, so that they do not snap.
+    world. Stretching elbows are damped, so that they do not snap. Hands that would be below the floor are lifted to it.
 
     Parameters
     ----------
@@ -79,6 +82,7 @@ def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom)
     result : Clip    F frames of its target skeleton
     plan : RetargetPlan    joints, scale and limbs
     about : str    point from which positions are scaled: "shoulders" or "world"
+    floor : Floor or None    floor below which no hand is moved; None if it is not known
 
     Returns
     -------
@@ -97,28 +101,46 @@ def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom)
     else:
         scale = min(after.arm_m / before.arm_m, after.reach_m / before.reach_m)
         targets = after.middle[:, None] + scale * (before.wrists - before.middle[:, None])
-    kept = motion
+    kept = _reached(motion, targets, plan, limbs)
+    asked, lifted = targets, 0.0
+    if floor is not None:
+        points = kinematics.global_positions(source, end_sites=True)
+        for _ in range(MOST_LIFTS):
+            after_points = kinematics.global_positions(kept.as_clip(plan.target, 1.0), end_sites=True)
+            depths = depths_below_floor(points, after_points, plan, floor, "wrist")
+            if depths.max() <= SUNK_M:
+                break
+            targets = targets + depths[..., None] * (0.0, 1.0, 0.0)
+            kept = _reached(motion, targets, plan, limbs)
+        lifted = float((targets - asked)[..., 1].max())
+    made = _Arms.of(kept.positions(plan.target), plan.target_joints)
+    moved, missed = (float(np.linalg.norm(one - made.wrists, axis=-1).max()) for one in (after.wrists, targets))
+    check = _check(moved, missed, lifted, scale, plan, limbs)
+    return KeptHands(kept.as_clip(plan.target, source.frame_rate_hz), check)
+
+
+def _reached(motion: Motion, targets: Floats, plan: RetargetPlan, limbs: Sequence[TwoBoneLimb]) -> Motion:
+    """Bring both wrists to their targets (F, 2, 3), as far as the arms reach."""
     for side, limb in enumerate(limbs):
-        kept = solve_two_bone(
+        motion = solve_two_bone(
             plan.target,
-            kept,
+            motion,
             limb,
             PositionTarget(limb.end, targets[:, side]),
             ending="held",
             damping_zone_rad=ELBOW_DAMPING_RAD,
         ).motion
-    made = _Arms.of(kept.positions(plan.target), plan.target_joints)
-    moved, missed = (float(np.linalg.norm(one - made.wrists, axis=-1).max()) for one in (after.wrists, targets))
-    return KeptHands(kept.as_clip(plan.target, source.frame_rate_hz), _check(moved, missed, scale, plan, limbs))
+    return motion
 
 
 def _check(
-    moved: float, missed: float, scale: float, plan: RetargetPlan, limbs: tuple[TwoBoneLimb, ...]
+    moved: float, missed: float, lifted: float, scale: float, plan: RetargetPlan, limbs: tuple[TwoBoneLimb, ...]
 ) -> CheckWarning:
     return CheckWarning(
         "hands-kept",
         f"hands were moved by up to {100.0 * moved:.1f} cm to the positions of the source's hands, scaled by "
-        f"{scale:.2f}; they miss these positions by at most {100.0 * missed:.1f} cm",
+        f"{scale:.2f}; they miss these positions by at most {100.0 * missed:.1f} cm"
+        + (f"; they were lifted to the floor by up to {100.0 * lifted:.1f} cm" if lifted else ""),
         joints=tuple(plan.target.joint_names[limb.end] for limb in limbs),
-        values={"moved_m": moved, "missed_m": missed, "scale": scale},
+        values={"moved_m": moved, "missed_m": missed, "lifted_m": lifted, "scale": scale},
     )

@@ -13,6 +13,7 @@ from marey_motion.clip import Clip
 from marey_motion.editing.annotations.contacts import foot_speed, stances_of
 from marey_motion.editing.ground import LOWEST_SHARE, lower_soles_in_stance, sole_heights
 from marey_motion.importing.checks import CheckWarning
+from marey_motion.retargeting.floor import Floor
 from marey_motion.retargeting.planning import RetargetPlan
 from marey_motion.rigs.standard import SIDES
 from marey_schemas.options.annotations import ContactOptions
@@ -22,10 +23,15 @@ SOLES_OFF_M = 0.01
 
 
 class LevelledClip(NamedTuple):
-    """A clip whose soles are on the floor, and a warning if it was moved for this."""
+    """A clip whose soles are on the floor, a warning if it was moved for this, and the floor if it is known.
+
+    `points` are the positions (F, n, 3) of joints and end sites in the source and in the clip; None without a floor.
+    """
 
     clip: Clip
     warning: CheckWarning | None
+    floor: Floor | None
+    points: tuple[AnyFloats, AnyFloats] | None
 
 
 def level_soles(source: Clip, result: Clip, plan: RetargetPlan) -> LevelledClip:
@@ -47,17 +53,19 @@ def level_soles(source: Clip, result: Clip, plan: RetargetPlan) -> LevelledClip:
         [joints.get(f"{side}_ankle", -1) for side in SIDES] for joints in (plan.source_joints, plan.target_joints)
     ]
     if -1 in ankles[0]:
-        return LevelledClip(result, None)
+        return LevelledClip(result, None, None, None)
     before, after = (kinematics.global_positions(clip, end_sites=True) for clip in (source, result))
     heights = sole_heights(before, plan.source, ankles[0])
     standing = _feet_on_the_floor(before, heights, plan, source.frame_rate_hz)
-    floor = plan.scale * float(np.median(heights[standing]))
-    off = float(np.median(sole_heights(after, plan.target, ankles[1])[standing])) - floor
+    source_m = float(np.median(heights[standing]))
+    off = float(np.median(sole_heights(after, plan.target, ankles[1])[standing])) - plan.scale * source_m
+    floor = Floor(source_m, plan.scale * source_m)
     if abs(off) <= SOLES_OFF_M:
-        return LevelledClip(result, None)
+        return LevelledClip(result, None, floor._replace(result_m=floor.result_m + off), (before, after))
     poses = result.poses.copy()
     poses[:, 1] -= off
-    return LevelledClip(replace(result, poses=poses), _moved(off))
+    after[..., 1] -= off
+    return LevelledClip(replace(result, poses=poses), _moved(off), floor, (before, after))
 
 
 def _feet_on_the_floor(points: AnyFloats, heights: Floats, plan: RetargetPlan, frame_rate_hz: float) -> Flags:

@@ -91,7 +91,7 @@ EDIT = KindDeclaration(
     description="Applies the commands of an edit to clips: trims, joins, smooths, places and repairs them.",
     params=job_params.EditParams,
     implementation="marey_worker.kinds.edit:run",
-    version=4,
+    version=5,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to edit."),
         "edit": InputSpec(

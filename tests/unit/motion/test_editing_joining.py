@@ -16,6 +16,7 @@ from tests.support.edited_takes import (
 
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
+from marey_motion.editing.borders import blended
 from marey_motion.editing.registry import apply_edit
 from marey_motion.errors import EditError
 from marey_motion.gait import game_skeleton, generate_gait
@@ -189,3 +190,17 @@ def test_bodies_under_roots_that_turn_are_joined_as_bodies_that_are_the_root(ble
     joined = join(with_turning_root(first, 0.9), with_turning_root(second, 0.3), blend=blend)
     require_sound(joined)
     assert np.abs(global_positions(joined)[:, 1:] - global_positions(join(first, second, blend=blend))).max() < 1e-4
+
+
+def test_rotations_half_a_turn_apart_are_blended_on_one_side() -> None:
+    """Over the blend, the two rotations of a joint pass half a turn of difference, where the shorter way changes."""
+    count = 21
+    angles = np.linspace(0.9, 1.1, count) * np.pi
+    a = np.zeros((count, 2, 4))
+    a[..., 0] = 1.0
+    b = np.stack((np.cos(0.5 * angles), np.zeros(count), np.sin(0.5 * angles), np.zeros(count)), axis=1)[:, None]
+    b = np.concatenate((b, a[:, :1]), axis=1)
+    made = blended(a, b, np.linspace(0.0, 1.0, count + 2)[1:-1])
+    turns = np.degrees(quaternions.angle_between(made[1:], made[:-1]))
+    assert turns.max() < 15.0
+    assert np.array_equal(made[:, 1], a[:, 1])

@@ -13,6 +13,7 @@ import pytest
 from scipy.ndimage import minimum_filter1d
 
 from marey_motion.clip import Clip
+from marey_motion.editing.calm_limbs import allowed_steps, largest_steps
 from marey_motion.editing.ground import heights_of_soles
 from marey_motion.editing.registry import EditedClip, edit_clip
 from marey_motion.formats import read_motion
@@ -80,18 +81,39 @@ def _soles(clip: Clip) -> np.ndarray:
     return heights_of_soles(clip.skeleton, Motion.of(clip), ankles)
 
 
+def _constraints(clip: Clip, which: str, places: np.ndarray) -> list[dict[str, Any]]:
+    """Return constraints of the right wrist, or of the head for `look`, around the middle of a clip."""
+    middle, half = clip.frame_count // 2, int(clip.frame_rate_hz / 3)
+    name = "head" if which == "look" else "right_wrist"
+    joint, shoulder = (
+        clip.skeleton.index_of(map_joints(clip.skeleton).joints[one]) for one in (name, "right_shoulder")
+    )
+    held: dict[str, Any] = {"kind": "position", "joint": name, "frames": [middle - half, middle + half]}
+    near, far = ((places[middle, joint] + offset).tolist() for offset in ((0.05, 0.15, 0.05), (1.5, 0.3, 1.5)))
+    return {
+        "hold": [held],
+        "point": [{**held, "point_m": near}],
+        "look": [{**held, "kind": "look_at", "point_m": far}],
+        "shoulder": [{**held, "point_m": places[middle, shoulder].tolist()}],
+        "in a row": [
+            {**held, "frames": [middle - half, middle], "shift_m": [0.0, 0.0, 0.0]},
+            {**held, "frames": [middle, middle + half], "point_m": near},
+        ],
+    }[which]
+
+
 def _constrained_excess(clip: Clip, which: str) -> float:
     """Return the largest step of a joint, divided by what the take's own steps and the constraint's need allow."""
-    places, middle, half = _places(clip), clip.frame_count // 2, int(clip.frame_rate_hz / 3)
-    name = "head" if which == "look" else "right_wrist"
-    joint = clip.skeleton.index_of(map_joints(clip.skeleton).joints[name])
-    constraint: dict[str, Any] = {"kind": "position", "joint": name, "frames": [middle - half, middle + half]}
-    if which == "point":
-        constraint["point_m"] = (places[middle, joint] + (0.05, 0.15, 0.05)).tolist()
-    if which == "look":
-        constraint |= {"kind": "look_at", "point_m": (places[middle, joint] + (1.5, 0.3, 1.5)).tolist()}
-    edited = _places(_edited(clip, {"command": "constrain", "constraints": [constraint]}).clip)
+    places, constraints = _places(clip), _constraints(clip, which, _places(clip))
+    known = map_joints(clip.skeleton).joints
+    joint = clip.skeleton.index_of(known.get(constraints[0]["joint"], constraints[0]["joint"]))
+    edited = _places(_edited(clip, {"command": "constrain", "constraints": constraints}).clip)
     need = _steps(edited - places)[:, joint].max()
+    if which in ("shoulder", "in a row"):
+        elbow = clip.skeleton.index_of(known["right_elbow"])
+        moved = np.linalg.norm(edited - places, axis=-1).max(axis=0)
+        allowed = allowed_steps(largest_steps(places), moved, 0.3 * clip.frame_rate_hz)
+        return float(_steps(edited)[:, elbow].max() / (allowed[elbow] + need))
     # A joint that starts to move from rest, such as an elbow of a bowing person, may move as fast as the need.
     return float(_steps(edited).max() / (MOST_STEP * _steps(places).max() + 2.0 * need))
 
@@ -121,8 +143,8 @@ FILTERS: tuple[dict[str, Any], ...] = (
 
 def _faults(clip: Clip) -> list[str]:
     """Edit a take in every way, and list what an animator would not keep."""
-    faults = [f"{one} {_constrained_excess(clip, one):.3f} times too fast" for one in ("point", "hold", "look")]
-    faults = [fault for fault in faults if float(fault.split()[1]) > 1.0]
+    excesses = {one: _constrained_excess(clip, one) for one in ("point", "hold", "look", "shoulder", "in a row")}
+    faults = [f"{one} {excess:.3f} times too fast" for one, excess in excesses.items() if excess > 1.0]
     for blend in ("inertialise", "slerp"):
         sunk = _joined_sunk(clip, blend)
         faults += [f"{blend} sinks {sunk:.3f} m"] if sunk > MOST_SUNK_M else []

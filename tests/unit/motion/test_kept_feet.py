@@ -1,5 +1,6 @@
 """Edited motion: feet keep their contacts and stay above the floor, and unsuitable parameters give a warning."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,14 @@ from marey_motion.editing.ground import estimate_sole, heights_of_soles
 from marey_motion.editing.kept_feet import SUNK_M, feet_as_motion, feet_of, with_feet
 from marey_motion.editing.registry import EditedClip, edit_clip
 from marey_motion.editing.take import EditedBody, Take
+from marey_motion.formats import read_motion
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.rigs import map_joints
 from marey_schemas.editing.edits import EditDocument
 
+RUN = "bandai-namco-2/dataset-2_run_masculine_001.bvh"
 FLOOR_M = 0.02
 """Height of the lowest joint of the standing generated body."""
 
@@ -130,25 +133,25 @@ def test_parameters_that_do_not_suit_the_motion_give_a_warning() -> None:
     places = [
         {"kind": "position", "joint": "left_wrist", "frames": [10, 40], "point_m": [0.3, y, 0.2]} for y in (1, 1.4)
     ]
-    (told,) = warnings({"command": "constrain", "constraints": places})
-    assert told.startswith("constraints[0] and constraints[1] contradict each other in the frames 10:40")
-    assert not warnings({"command": "constrain", "constraints": [places[0], {**places[1], "frames": [40, 60]}]})
-    assert not warnings({"command": "constrain", "constraints": [places[0], places[0]]})
+    told = warnings({"command": "constrain", "constraints": places})
+    assert told[0].startswith("constraints[0] and constraints[1] contradict each other in the frames 10:40")
+    told = warnings({"command": "constrain", "constraints": [places[0], {**places[1], "frames": [70, 90]}]})
+    assert not any("constraints[0] and constraints[1]" in one for one in told)
+    told = warnings({"command": "constrain", "constraints": [places[0], places[0]]})
+    assert not any("contradict" in one for one in told)
     shifted = [
         {"kind": "position", "joint": "left_wrist", "frames": frames, "shift_m": [0.0, 0.05, 0.0]}
         for frames in ([0, 60], [30, 90])
     ]
     assert not warnings({"command": "constrain", "constraints": shifted})
-    (told,) = warnings(
-        {"command": "constrain", "constraints": [shifted[0], {**shifted[1], "shift_m": [0.0, 0.1, 0.0]}]}
-    )
-    assert "contradict each other in the frames 30:60" in told
-    (told,) = warnings({"command": "constrain", "constraints": places[:1], "blend_s": 60.0})
-    assert "the blend of 60 s is longer than the clip" in told
-    (told,) = warnings({"command": "smooth", "window_s": 30.0})
-    assert "the window of 30 s is longer than the clip" in told
-    (told,) = warnings({"command": "concatenate", "source": "other", "blend_s": 30.0}, other=walk)
-    assert "longer than one of the two clips" in told
+    told = warnings({"command": "constrain", "constraints": [shifted[0], {**shifted[1], "shift_m": [0.0, 0.1, 0.0]}]})
+    assert "contradict each other in the frames 30:60" in told[0]
+    told = warnings({"command": "constrain", "constraints": places[:1], "blend_s": 60.0})
+    assert "the blend of 60 s is longer than the clip" in told[-1]
+    (smoothed,) = warnings({"command": "smooth", "window_s": 30.0})
+    assert "the window of 30 s is longer than the clip" in smoothed
+    told = warnings({"command": "concatenate", "source": "other", "blend_s": 30.0}, other=walk)
+    assert "longer than one of the two clips" in told[0]
 
 
 def test_contacts_of_one_foot_that_overlap_are_refused() -> None:
@@ -161,3 +164,17 @@ def test_contacts_of_one_foot_that_overlap_are_refused() -> None:
         planted(("left", 29, 50), ("left", 10, 30))
     with pytest.raises(ValidationError, match="two contacts of the right foot overlap"):
         planted(("right", 0, None), ("right", 10, 30))
+
+
+def test_a_knee_does_not_jump_in_a_long_blend(mocap: Path) -> None:
+    """A run continues out of step, and its feet need three seconds to get to their own places."""
+    clip = read_motion((mocap / RUN).read_bytes(), "run.bvh").clip
+    assert clip is not None
+    seam, knee = clip.frame_count * 2 // 5, clip.skeleton.index_of(map_joints(clip.skeleton).joints["left_knee"])
+
+    def fastest(made: Clip) -> float:
+        places = Motion.of(made).positions(made.skeleton)[:, knee]
+        return float(np.linalg.norm(np.diff(places, axis=0), axis=1).max())
+
+    joined = _joined(clip.sliced(0, seam), clip, blend_s=3.0).clip
+    assert fastest(joined) < 1.8 * fastest(clip)

@@ -14,7 +14,7 @@ from marey_motion.editing.registry import EditedClip, edit_clip
 from marey_motion.editing.take import EditedBody
 from marey_motion.errors import EditError, MotionError
 from marey_motion.skeleton import Skeleton
-from marey_schemas.documents.clips import ClipInfo, ClipSource, MotionDocument
+from marey_schemas.documents.clips import Check, ClipInfo, ClipSource, MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.editing.edits import EditDocument
@@ -115,7 +115,12 @@ class _Editing:
             self._places.take(Kind.CLIP, pin.folder, *names)
         for name, one in zip(names, made, strict=True):
             self._note(pin, name, one)
-            yield self._output(pin, name, one.clip, motion, info)
+            told = tuple(
+                Check(code="edit-warning", message=f"{found.command}: {found.values['warning']}")
+                for found in one.findings
+                if "warning" in found.values
+            )
+            yield self._output(pin, name, one.clip, motion, info.model_copy(update={"checks": told}))
 
     def _output(self, pin: PinnedInput, name: str, clip: Clip, motion: MotionDocument, info: ClipInfo) -> StagedOutput:
         rig = self._rigs.get(_skeleton_of(motion).item)
@@ -156,7 +161,7 @@ class _Editing:
         return self._bodies[used]
 
     def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
-        """Return the part `info` of a result: the part `info` of the clip without its checks, and the applied edit.
+        """Return the part `info` of a result: the part `info` of the clip without checks, and the applied edit.
 
         The consent is at least as strict as the consents of the clip and of all clips to which the commands refer.
         """

@@ -1,0 +1,192 @@
+"""Limbs that cannot follow their targets smoothly follow calmer paths of targets, and miss what was asked for a little.
+
+A limb cannot reach a target at its shoulder or hip, because the fold of its middle joint has a limit. Where a target
+passes by the shoulder, the limb would turn over between two frames. And where a running body passes a target, the limb
+would turn as fast as the body passes. An animator leads the hand round the shoulder, and lets it lag behind. So does
+this module, but only in runs of frames in which the limb jumps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from marey_motion.arrays import Flags, Floats
+from marey_motion.editing.annotations.contacts import runs
+from marey_motion.editing.borders import smooth_step
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb
+from marey_motion.motion import Motion
+from marey_motion.skeleton import Skeleton
+
+MOST_STEP = 1.5
+"""Largest step of a joint between two frames, as a multiple of its largest step in the whole motion before."""
+BLEND_PEAK = 2.0
+"""Largest step of a change that is blended in over n frames, as a multiple of the mean step."""
+_WIDTHS = (0.0, 0.1, 0.2, 0.4, 0.8)
+"""Standard deviations over which targets are smoothed, as shares of the frames within which changes are blended."""
+_CLEAR = 0.5
+"""Length of the sum of two unit directions below which they count as opposite."""
+
+
+def largest_steps(places: Floats) -> Floats:
+    """Compute the largest step of each joint between two frames.
+
+    Parameters
+    ----------
+    places : (F, J, 3) float64    positions, metres
+
+    Returns
+    -------
+    (J,) float64    metres; 0 if there is only one frame
+    """
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=-1)
+    return np.asarray(steps.max(axis=0, initial=0.0), dtype=np.float64)
+
+
+def allowed_steps(usual: Floats, moved: Floats, blend_frames: float) -> Floats:
+    """Compute how far joints may move between two frames of an edited motion.
+
+    Parameters
+    ----------
+    usual : (n,) float64    largest step of each joint in the motion before
+    moved : (n,) float64    largest distance by which the edit moves each joint
+    blend_frames : float    number of frames within which the change is blended in
+
+    Returns
+    -------
+    (n,) float64    metres between two frames
+    """
+    need = BLEND_PEAK * moved / (max(blend_frames, 1.0) + 1.0)
+    return np.asarray(np.maximum(MOST_STEP * usual, usual + need), dtype=np.float64)
+
+
+class _Attempt(NamedTuple):
+    motion: Motion
+    excess: Floats
+    """Steps (n - 1,) of elbow or wrist, in metres, beyond what they may move."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalmLimb:
+    """A limb in a run of consecutive frames, and how fast it may move.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    limb : TwoBoneLimb    the limb
+    given : Motion    the n frames before they are solved
+    usual : (2,) float64    largest steps of middle joint and end in the whole motion, in metres
+    reach : float    number of frames within which changes are blended
+    fold_rad : float    angle between the bones up to which the limb folds
+    """
+
+    skeleton: Skeleton
+    limb: TwoBoneLimb
+    given: Motion
+    usual: Floats
+    reach: float
+    fold_rad: float
+
+    def solved(self, targets: Floats, solve: Callable[[Motion, Floats], Motion], first: Motion) -> Motion:
+        """Solve the limb for calmer paths of its end until it does not jump; return the calmest motion.
+
+        Parameters
+        ----------
+        targets : (n, 3) float64    where the end of the limb should be, in metres in the world
+        solve : callable    solves the frames of a motion for paths of the end
+        first : Motion    the solution for `targets`
+
+        Returns
+        -------
+        Motion    n frames; `first` itself if nothing jumps
+        """
+        best = self._judged(first)
+        if best.excess.max(initial=0.0) <= 0.0:
+            return first
+        jumps = np.zeros(len(targets), dtype=np.bool_)
+        jumps[:-1] |= best.excess > 0.0
+        jumps[1:] |= best.excess > 0.0
+        starts = self._places(self.given)[:, 0]
+        for width, calmer in product(_WIDTHS, (self._slowed, self._evened)):
+            path = starts + calmer(targets - starts, jumps, max(1, round(width * self.reach)))
+            made = self._judged(solve(self.given, path))
+            if made.excess.max() < best.excess.max():
+                best = made
+            if best.excess.max() <= 0.0:
+                break
+        return best.motion
+
+    def _places(self, motion: Motion) -> Floats:
+        joints = [self.limb.start, self.limb.middle, self.limb.end]
+        return np.asarray(motion.positions(self.skeleton)[:, joints], dtype=np.float64)
+
+    def _judged(self, motion: Motion) -> _Attempt:
+        before, after = (self._places(one)[:, 1:] for one in (self.given, motion))
+        moved = np.linalg.norm(after - before, axis=-1).max(axis=0)
+        steps = np.linalg.norm(np.diff(after, axis=0), axis=-1)
+        return _Attempt(motion, (steps - allowed_steps(self.usual, moved, self.reach)).max(axis=1))
+
+    def _slowed(self, ways: Floats, jumps: Flags, width: int) -> Floats:
+        """Slow down the turns of a path (n, 3), relative to the first joint, and lead it round this joint.
+
+        Around jumps, and where the limb would have to fold too far, the direction changes evenly, over `width` frames
+        before and after; the distance is at least that of the folded limb.
+        """
+        from scipy.ndimage import maximum_filter1d
+
+        start, middle, end = np.moveaxis(self._places(self.given), 1, 0)
+        first, second = np.linalg.norm(middle - start, axis=1), np.linalg.norm(end - middle, axis=1)
+        least = np.sqrt(first**2 + second**2 - 2.0 * first * second * np.cos(self.fold_rad))
+        sizes = np.linalg.norm(ways, axis=1)
+        turning = np.asarray(maximum_filter1d(jumps | (sizes < least), 2 * width + 1), dtype=np.bool_)
+        directions = _directions(ways, end - start)
+        slowed = directions.copy()
+        for begin, stop in runs(turning):
+            mean = _directions((end - start)[begin:stop].mean(axis=0), np.array((0.0, -1.0, 0.0)))
+            places = smooth_step(np.linspace(0.0, 1.0, stop - begin))
+            slowed[begin:stop] = _turned(directions[begin], directions[stop - 1], mean, places)
+        return np.asarray(np.where(turning[:, None], np.maximum(sizes, least)[:, None] * slowed, ways))
+
+    def _evened(self, ways: Floats, jumps: Flags, width: int) -> Floats:
+        """Average a path (n, 3), relative to the first joint, around jumps, over about `width` frames."""
+        from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+
+        share = maximum_filter1d(jumps.astype(np.float64), 4 * width + 1)
+        share = gaussian_filter1d(share, width, mode="nearest")[:, None]
+        even = gaussian_filter1d(self._slowed(ways, np.zeros_like(jumps), width), width, axis=0, mode="nearest")
+        return np.asarray(ways + share * (even - ways), dtype=np.float64)
+
+
+def _directions(ways: Floats, otherwise: Floats) -> Floats:
+    """Compute unit directions (..., 3) of vectors, and those of other vectors where a vector is zero."""
+    ways = np.where(np.linalg.norm(ways, axis=-1, keepdims=True) > 1e-6, ways, otherwise)
+    return np.asarray(ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-9))
+
+
+def _turned(first: Floats, last: Floats, guide: Floats, places: Floats) -> Floats:
+    """Turn one unit direction (3,) into another one, on a great circle; opposite ones by way of `guide`.
+
+    Returns the directions (n, 3) at `places` (n,), from 0 to 1.
+    """
+    middle, chord = first + last, last - first
+    size = float(np.linalg.norm(middle))
+    if size < _CLEAR:
+        across = np.stack((guide, *np.eye(3)))
+        across -= np.outer(across @ chord, chord) / max(float(chord @ chord), 1e-12)
+        chosen = (
+            across[0]
+            if np.linalg.norm(across[0]) > _CLEAR
+            else across[1 + np.argmax(np.linalg.norm(across[1:], axis=1))]
+        )
+        middle = middle + (_CLEAR - size) * chosen / np.linalg.norm(chosen)
+    middle = middle / np.linalg.norm(middle)
+    halves = np.where(places[:, None] < 0.5, first, last)
+    share = np.abs(2.0 * places - 1.0)[:, None]
+    angle = np.arccos(np.clip(float(first @ middle), -1.0, 1.0))
+    if angle < 1e-6:
+        return np.asarray(halves)
+    return np.asarray((np.sin(share * angle) * halves + np.sin((1.0 - share) * angle) * middle) / np.sin(angle))
