@@ -20,7 +20,7 @@ from tests.support.command_line import run_here
 from tests.support.identity_provider import FakeProvider, provider_running
 from tests.support.rest_server import Server
 
-from marey_client.cli import browser_login
+from marey_client.cli.access import browser_login
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_server.app import connect_database
 from marey_server.process.doctor import examine

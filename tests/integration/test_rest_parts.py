@@ -122,8 +122,8 @@ def test_documents_that_are_large_together_are_left_out_at_the_end(
 
 
 def test_quaternions_that_are_no_rotations_are_refused_by_frame_and_joint(owner: httpx.Client) -> None:
-    rows = [[0, 1, 0, 1, 0, 0, 0, 1, 0, 0, 0], [0, 1, 0, 0.6, 0.8, 0, 0, 1, 0, 0.5, 0]]
-    motion = {
+    rows: list[list[float]] = [[0, 1, 0, 1, 0, 0, 0, 1, 0, 0, 0], [0, 1, 0, 0.6, 0.8, 0, 0, 1, 0, 0.5, 0]]
+    motion: dict[str, Any] = {
         "schema": "marey/motion@1", "skeleton": {"item": "skeleton_none", "revision": 1}, "frame_rate_hz": 30,
         "joints": ["Hips", "LeftArm"], "poses": {"dtype": "<f4", "shape": [2, 11], "data": rows},
     }  # fmt: skip

@@ -12,7 +12,6 @@ from typer.main import get_command_name
 from typer.models import CommandInfo
 
 from marey_client.cli import (
-    accounts,
     audit,
     clip_jobs,
     comparisons,
@@ -20,7 +19,6 @@ from marey_client.cli import (
     evaluations,
     holdings,
     improvements,
-    invitations,
     lineage,
     models,
     organise,
@@ -29,11 +27,10 @@ from marey_client.cli import (
     purging,
     searches,
     skeletons,
-    tokens,
-    user_tables,
     viewing,
     webhooks,
 )
+from marey_client.cli.access import accounts, invitations, tokens, user_tables
 from marey_client.cli.datasets import archives, proposals, versions
 from marey_client.cli.difference import diff
 from marey_client.cli.editing import annotating, edits

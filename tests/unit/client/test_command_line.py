@@ -21,7 +21,8 @@ import typer
 from tests.support.command_line import run_here
 from tests.support.scripted_server import ScriptedServer, problem
 
-from marey_client.cli import projects, tokens, with_global_options_first
+from marey_client.cli import projects, with_global_options_first
+from marey_client.cli.access import tokens
 from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import OTHER_NAMES, app, with_one_command
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled

@@ -8,9 +8,9 @@ import httpx
 import pytest
 from tests.support.scripted_server import ScriptedServer
 
-from marey_client.cli import user_tables
+from marey_client.cli.access import user_tables
+from marey_client.cli.access.user_tables import _read, _store
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.user_tables import _read, _store
 
 NOW = "2026-01-01T00:00:00Z"
 TABLE = """name,display_name,administrator,project,role

@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
@@ -27,7 +29,7 @@ def test_a_noun_in_y_takes_the_plural_of_its_kind(noun: str, told: str) -> None:
         (Tag, "a,b", "no comma"),
     ],
 )
-def test_a_refused_text_is_explained_in_words_and_not_by_its_pattern(form: object, wrong: str, told: str) -> None:
+def test_a_refused_text_is_explained_in_words_and_not_by_its_pattern(form: Any, wrong: str, told: str) -> None:
     with pytest.raises(ValidationError) as refused:
         TypeAdapter(form).validate_python(wrong)
     reason = plain_reason(refused.value.errors()[0]["msg"])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.accounts import user
+from marey_client.cli.access.accounts import user
 from marey_client.cli.projects import member
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect

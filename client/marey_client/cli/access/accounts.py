@@ -81,7 +81,7 @@ def login(
         if with_token:
             secret = typer.get_text_stream("stdin").read().strip()
         elif browser:
-            from marey_client.cli.browser_login import sign_in_in_browser
+            from marey_client.cli.access.browser_login import sign_in_in_browser
 
             secret = sign_in_in_browser(marey, days * DAY_S, paste=paste)
         elif invitation:

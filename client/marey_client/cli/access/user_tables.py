@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.accounts import user
+from marey_client.cli.access.accounts import user
 from marey_client.cli.files.csv_files import rows_of
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, connect
