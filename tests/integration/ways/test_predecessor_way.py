@@ -115,19 +115,19 @@ def test_a_folder_with_one_of_each_goes_in_with_one_command_and_out_byte_for_byt
         "annotation run contact", "annotation run swing", "annotation turn imported", "annotation walk imported",
         "clip run", "clip turn", "clip walk", "graph steps",
         "model begin", "model left", "model old", "model right", "model stand",
-        "processed walk_aligned", "skeleton hik",
+        "processed walk_aligned", "skeleton hik (171 cm)",
     ]  # fmt: skip
     require_same_numbers(found)
     assert segments_of(found["annotation walk imported"]) == [("section 1", 0, 20), ("section 2", 20, 40)]
     assert segments_of(found["annotation turn imported"]) == [("left", 0, 10), ("right", 10, 20), ("left", 20, 40)]
     assert segments_of(found["annotation run contact"]) == [("contact", 3, 6), ("contact", 11, 12)]
-    mapping = found["skeleton hik"].mapping()
+    mapping = found["skeleton hik (171 cm)"].mapping()
     assert mapping.joints == {name: joint for name, joint in old.skeleton_model()["joints"].items() if joint}
     assert mapping.axes["LeftArm"].swing == (0.0, 0.0, 1.0)
 
     files = old.folder()
     items = {
-        "body.skeleton": "skeleton hik", "walk_sections.json": "annotation walk imported",
+        "body.skeleton": "skeleton hik (171 cm)", "walk_sections.json": "annotation walk imported",
         "turn_sections.json": "annotation turn imported", "run_sections.json": "annotation run contact",
         "walk_aligned.bson.bz2": "processed walk_aligned", "steps.json": "graph steps",
         "left_quaternion_mm.bson.bz2": "model left",
@@ -152,7 +152,7 @@ def test_a_job_imports_the_same_as_a_request(marey: Marey, lab: ProjectHandle, f
     assert len(found) == 15
     require_same_numbers(found)
     for name, key, part in (
-        ("body_skeleton_model.json", "skeleton hik", "skeleton_model"), ("walk.bson.bz2", "clip walk", None),
+        ("body_skeleton_model.json", "skeleton hik (171 cm)", "skeleton_model"), ("walk.bson.bz2", "clip walk", None),
         ("walk_aligned_alignment.json", "processed walk_aligned", "alignment"),
         ("turn_sections.json", "annotation turn imported", None),
     ):  # fmt: skip
@@ -177,7 +177,7 @@ def test_the_commands_of_the_page_run(lab: ProjectHandle, run: CommandLine, fold
     scores = np.random.default_rng(6).normal(size=models.TEMPORAL)
     expected = old.model_times(old.primitives()["begin_mm.json"], scores)
     np.testing.assert_allclose(old.model_times(layout_2, scores), expected, atol=1e-9)
-    model = old.decode((tmp_path / "hik.skeleton").read_bytes())["skeleton_model"]
+    model = old.decode((tmp_path / "hik (171 cm).skeleton").read_bytes())["skeleton_model"]
     assert model["joints"] == {**dict.fromkeys(model["joints"]), **old.skeleton_model()["joints"]}
     assert model["cos_map"]["LeftArm"] == {"x": [0.0, 0.0, 1.0], "y": [1.0, 0.0, 0.0]}
     assert model["joint_constraints"] == old.skeleton_model()["joint_constraints"]

@@ -51,11 +51,13 @@ def test_a_file_that_cannot_be_stored_harms_no_other(lab: Lab) -> None:
 
 def test_an_import_without_a_main_item_is_an_error_that_ends_the_request(lab: Lab) -> None:
     edit = Draft("clean-up", Kind.EDIT, "clean-up", {"edit": {"commands": [{"command": "trim", "start": 1}]}}, "takes")
-    with pytest.raises(RuntimeError, match=r"no clip, model, graph or skeleton was created from .walk\.bvh."):
+    with pytest.raises(RuntimeError, match=r"none of clip, .* was created from .walk\.bvh."):
         store(lab, PreparedImport("walk.bvh", drafts=(edit,)))
 
 
 def test_a_clip_gets_another_skeleton_only_on_request(lab: Lab) -> None:
+    notes = {"schema": "marey/annotation@1", "clip": {"output": "walk.bvh"}, "layer": "notes"}
+
     def long_legs(*, asked: bool) -> Any:
         file = read_file("walk.bvh", seed=1)
         rig, clip = file.drafts
@@ -64,6 +66,7 @@ def test_a_clip_gets_another_skeleton_only_on_request(lab: Lab) -> None:
             drafts=(
                 replace(rig, parts={"hierarchy": skeleton_tree(bone_m=9.0)}),
                 replace(clip, same_skeleton=not asked),
+                Draft("walk.bvh#notes", Kind.ANNOTATION, "notes", {"annotation": notes}, "takes"),
             ),
         )
 
@@ -75,6 +78,7 @@ def test_a_clip_gets_another_skeleton_only_on_request(lab: Lab) -> None:
     assert (refused.status, refused.error.code, refused.item) == ("failed", "skeleton-differs", None)
     assert "--replace" in refused.error.detail
     assert (other.status, skeletons()) == ("created", 1)
+    assert not lab.read(items.list_items, "lab", Kind.ANNOTATION).items
     (changed,) = store(lab, long_legs(asked=True))
     assert (changed.item, changed.revision, changed.skeleton_changed) == (first.item, 2, True)
     (back,) = store(lab, long_legs(asked=False))
