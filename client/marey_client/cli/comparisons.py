@@ -14,7 +14,6 @@ from marey_client.cli.terminal.following import FINDINGS_JOB, Wait
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
-from marey_schemas.documents.evaluations import MOST_COMPARED
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -42,8 +41,8 @@ def compare(
     others: Annotated[
         list[str],
         typer.Argument(
-            help=f"The evaluation after the change, or up to {MOST_COMPARED - 1} evaluations of other sets of clips, "
-            "with the same trials. Create them with `marey evaluate --normaliser BEFORE`."
+            help="The evaluation after the change, or several evaluations of other sets of clips, with the same "
+            "trials. Create them with `marey evaluate --normaliser BEFORE`."
         ),
     ],
     params: Chosen,
@@ -58,8 +57,6 @@ def compare(
             "--out writes the result of the job, but --no-wait does not wait for the result; leave out one of "
             "the two options"
         )
-    if len(others) >= MOST_COMPARED:
-        raise WrongUsage(f"{1 + len(others)} evaluations cannot be compared at once; choose up to {MOST_COMPARED}")
     with connect(context) as marey:
         first, *rest = (evaluation_at(marey, place) for place in (before, *others))
         if any(one.project != first.project for one in rest):
