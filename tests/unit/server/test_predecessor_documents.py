@@ -60,7 +60,7 @@ def written(
 ) -> tuple[str, dict[str, Any]]:
     """Write an item with some parts replaced; return the name of the file and its document."""
     item = imported[key]
-    hierarchy = imported["skeleton hik"].parts["hierarchy"]
+    hierarchy = imported["skeleton hik (171 cm)"].parts["hierarchy"]
     given = {**item.parts, **parts}
     if item.kind is Kind.MODEL:
         given["model"] = {**given["model"], "skeleton": {"item": "s", "revision": 1}}
@@ -74,7 +74,7 @@ def test_every_item_knows_its_file_until_its_content_changes(imported: Mapping[s
         "processed walk_aligned": ("motion", {"frame_rate_hz": 60.0}),
         "annotation walk imported": ("annotation", {"segments": []}),
         "model begin": ("model", {"keyframes": {}}),
-        "skeleton hik": ("hierarchy", {"end_sites": []}),
+        "skeleton hik (171 cm)": ("hierarchy", {"end_sites": []}),
     }
     for key, (part, change) in changes.items():
         item = imported[key]
@@ -84,7 +84,7 @@ def test_every_item_knows_its_file_until_its_content_changes(imported: Mapping[s
         changed = {**item.parts, part: {**item.parts[part], **change}}
         assert unchanged_original(item.kind, changed, PredecessorOptions()) is None
     for key, part, name in (
-        ("skeleton hik", "skeleton_model", "body_skeleton_model.json"),
+        ("skeleton hik (171 cm)", "skeleton_model", "body_skeleton_model.json"),
         ("processed walk_aligned", "alignment", "walk_aligned_alignment.json"),
     ):
         beside = unchanged_original(imported[key].kind, imported[key].parts, PredecessorOptions(part=part))  # type: ignore[arg-type]
@@ -127,8 +127,8 @@ def test_a_motion_without_components_is_written_with_a_mixture(
 def test_skeletons_are_written_with_the_joints_that_they_had(
     imported: Mapping[str, ImportedItem], layout: ExportLayout
 ) -> None:
-    name, document = written(imported, "skeleton hik", PredecessorOptions(layout=layout))
-    assert name == ("hik.skeleton" if layout == "file" else "hik_skeleton.json")
+    name, document = written(imported, "skeleton hik (171 cm)", PredecessorOptions(layout=layout))
+    assert name == ("hik (171 cm).skeleton" if layout == "file" else "hik (171 cm)_skeleton.json")
     found = {node.name: node for node in old.rig_of(document)}
     for joint in old.joints_of(old.RIG):
         expected = next(node for node in old.RIG if node.name == joint)
@@ -143,17 +143,18 @@ def test_skeletons_are_written_with_the_joints_that_they_had(
 def test_a_mapping_that_was_edited_is_written_with_the_rest_of_the_skeleton_model(
     imported: Mapping[str, ImportedItem],
 ) -> None:
-    mapping = imported["skeleton hik"].parts["mapping"]
+    mapping = imported["skeleton hik (171 cm)"].parts["mapping"]
     changed = {**mapping, "joints": {**mapping["joints"], "left_toe": "LeftFoot"}}
-    name, document = written(imported, "skeleton hik", PredecessorOptions(part="skeleton_model"), mapping=changed)
-    assert (name, document["name"]) == ("hik_skeleton_model.json", "hik")
+    only_model = PredecessorOptions(part="skeleton_model")
+    name, document = written(imported, "skeleton hik (171 cm)", only_model, mapping=changed)
+    assert (name, document["name"]) == ("hik (171 cm)_skeleton_model.json", "hik (171 cm)")
     model, before = document["model"], old.skeleton_model()
     assert model["joints"]["left_toe"] == "LeftFoot"
     for member in before.keys() - {"joints", "cos_map"}:
         assert model[member] == before[member]
-    alone = {"hierarchy": imported["skeleton hik"].parts["hierarchy"]}
+    alone = {"hierarchy": imported["skeleton hik (171 cm)"].parts["hierarchy"]}
     with pytest.raises(NotFoundProblem, match="no joint mapping"):
-        write_predecessor(Kind.SKELETON, "hik", alone, None, PredecessorOptions(part="skeleton_model"))
+        write_predecessor(Kind.SKELETON, "hik", alone, None, only_model)
 
 
 def test_annotations_and_clips_that_were_changed_are_read_again(imported: Mapping[str, ImportedItem]) -> None:
@@ -162,7 +163,9 @@ def test_annotations_and_clips_that_were_changed_are_read_again(imported: Mappin
     _, document = written(imported, "annotation walk imported", PredecessorOptions(), annotation=shorter)
     assert document == {"sections": {"section 1": [{"start_idx": 0, "end_idx": 19}]}}
 
-    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(imported["skeleton hik"].parts["hierarchy"]))
+    skeleton = skeleton_from_document(
+        SkeletonHierarchy.model_validate(imported["skeleton hik (171 cm)"].parts["hierarchy"])
+    )
     poses = imported["clip run"].parts["motion"]["poses"][5:35]
     names, expected = old.read_clip(old.clips()["run.json"])
     for form in ("poses", "frames"):
