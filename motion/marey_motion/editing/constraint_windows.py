@@ -39,7 +39,8 @@ def join_windows(
     """Shorten windows of one joint that follow each other, where the joint would jump from one target to the next.
 
     The ramps out of the first window and into the second one need `blend_frames` together; if there are fewer frames
-    between the windows, the rest is taken from both windows, at most half of each.
+    between the windows, the rest is taken from both windows, less than half of each, so that a window between two
+    others keeps a frame at least.
 
     Parameters
     ----------
@@ -58,12 +59,14 @@ def join_windows(
         gap = b.start - a.stop
         if not 0 <= gap < max(blend_frames, 1) or not _same_point(a, b):
             continue
+        if any(a.stop <= c.start and c.stop <= b.start and _same_point(a, c) for c in constraints):
+            continue  # the joint goes to another target in between
         apart = _distance(a, b)
         if apart <= MOST_STEP * float(usual[a.target.joint]) * (gap + 1):
             continue
         lacking = blend_frames - gap
-        before = min(lacking // 2, (a.stop - a.start) // 2)
-        after = min(lacking - before, (b.stop - b.start) // 2)
+        before = min(lacking // 2, (a.stop - a.start - 1) // 2)
+        after = min(lacking - before, (b.stop - b.start - 1) // 2)
         shortened[first] = _within(shortened[first], shortened[first].start, a.stop - before)
         shortened[second] = _within(shortened[second], b.start + after, shortened[second].stop)
         joined.append(JoinedWindows(first, second, a.stop - before, b.start + after, apart))

@@ -1,4 +1,4 @@
-"""Constraints that a limb cannot follow: it goes round its shoulder, takes time between two targets, and tells."""
+"""Constraints that a limb cannot follow: it goes round its shoulder and takes time between targets, with a warning."""
 
 from pathlib import Path
 from typing import Any
@@ -68,8 +68,8 @@ def test_an_elbow_does_not_jump_where_the_target_passes_the_shoulder(
     assert _excess(before, after, walk.frame_rate_hz) < 0.01
     missed = np.linalg.norm(after[slice(*window), 2] - target, axis=1)
     assert missed.max() < 0.3
-    (told,) = (one for one in _warnings(made) if "is missed" in one)
-    assert f"by up to {100 * missed.max():.1f} cm in frame {window[0] + int(np.argmax(missed))}" in told
+    (warning,) = (one for one in _warnings(made) if "is missed" in one)
+    assert f"by up to {100 * missed.max():.1f} cm in frame {window[0] + int(np.argmax(missed))}" in warning
     undamped = _arm(_constrained(walk, asked, stretch_damping_deg=0.0).clip)
     assert np.abs(undamped - after).max() > 0.05, "without damping, the limb meets the target and jumps"
 
@@ -88,8 +88,8 @@ def test_a_wrist_takes_time_between_two_targets_that_follow_each_other(walk: Cli
 
     after = _arm(made.clip)
     assert _excess(before, after, walk.frame_rate_hz) < 0.01
-    (told,) = (one for one in _warnings(made) if "follow each other" in one)
-    assert told.startswith(
+    (warning,) = (one for one in _warnings(made) if "follow each other" in one)
+    assert warning.startswith(
         f"constraints[0] and constraints[1] follow each other too closely: their targets are {100 * apart:.1f} cm"
     )
     sudden = _constrained(walk, *asked, blend_s=0.0)
@@ -97,6 +97,20 @@ def test_a_wrist_takes_time_between_two_targets_that_follow_each_other(walk: Cli
     assert np.linalg.norm(np.diff(_arm(sudden.clip)[:, 2], axis=0), axis=1).max() > 0.7 * apart
     near = [asked[0], {**asked[1], "point_m": (places[0] + (0.0, 0.001, 0.0)).tolist()}]
     assert not any("follow each other" in one for one in _warnings(_constrained(walk, *near)))
+
+
+def test_a_short_window_between_two_others_keeps_a_frame() -> None:
+    walk = generate_gait(1.2, 0.0, 2.0)
+    at_first = _arm(walk)[60, 2]
+    asked = [
+        {
+            "kind": "position", "joint": "left_wrist", "frames": [start, start + 10],
+            "point_m": [*at_first[:2].tolist(), float(at_first[2]) + 0.7 * number],
+        }
+        for number, start in enumerate((60, 70, 80))
+    ]  # fmt: skip
+    warnings = _warnings(_constrained(walk, *asked))
+    assert sum("follow each other too closely" in one for one in warnings) == 2
 
 
 @pytest.mark.parametrize(
