@@ -2,8 +2,8 @@
 
 A child that computes needs two seconds of processor time to import its modules and to load compiled kernels, and tests
 that kill servers and workers start hundreds of such children. So each program of the nursery (see `forked_programs`)
-has a *cradle*: a copy of the nursery with one thread, which forks the children of the program. A child has the
-arguments, the environment, the session and the descriptor that a new process would have, and its parent is the program.
+has a forker: a copy of the nursery with one thread, which forks the children of the program. A child has the arguments,
+the environment, the session and the descriptor that a new process would have, and its parent is the program.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from marey_schemas.processes.child_process import exit_status
 from marey_schemas.processes.limits import die_with_parent
 
 FORKS = sys.platform == "linux"
-"""Whether the system has what a cradle needs: a process that adopts the orphans among its descendants."""
+"""Whether the system has what a forker needs: a process that adopts the orphans among its descendants."""
 MODULES = ("marey_worker.child", "marey_server.motions.child", "marey_server.motions.reading")
 """Modules that children run or load first."""
 LONGEST_ORDER = 1 << 16
@@ -36,7 +36,7 @@ _PID = struct.Struct("<q")
 
 
 class ForkedChild:
-    """A child that a cradle has forked, with what `ChildProcess` needs of a `subprocess.Popen`."""
+    """A child that a forker has forked, with what `ChildProcess` needs of a `subprocess.Popen`."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
@@ -55,8 +55,8 @@ class ForkedChild:
         return self.returncode
 
 
-class Cradle:
-    """The process that forks the children of this process, which must have only one thread when it makes the cradle."""
+class ChildForker:
+    """The process that forks the children of this process, which must have only one thread when it makes the forker."""
 
     def __init__(self) -> None:
         self._orders, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -66,7 +66,7 @@ class Cradle:
             _keep_only(theirs.fileno())
             die_with_parent()
             signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a test may send it to all descendants of its program
-            _rock(theirs, parent)
+            _serve(theirs, parent)
         theirs.close()
 
     def start(
@@ -83,13 +83,13 @@ class Cradle:
             finally:
                 _adopt_orphans(False)
         if not answer:
-            raise RuntimeError("the cradle has ended; the log of the program says why")
+            raise RuntimeError("the forker has ended; the log of the program says why")
         return ForkedChild(_PID.unpack(answer)[0])
 
 
 def fork_children() -> None:
-    """Let this process fork its children from a cradle from now on."""
-    child_process.start_module = Cradle().start  # type: ignore[assignment]
+    """Let a forker fork the children of this process from now on."""
+    child_process.start_module = ChildForker().start  # type: ignore[assignment]
 
 
 def _adopt_orphans(adopts: bool) -> None:
@@ -106,7 +106,7 @@ def _keep_only(*descriptors: int) -> None:
         os.closerange(after + 1, before)
 
 
-def _rock(orders: socket.socket, parent: int) -> NoReturn:
+def _serve(orders: socket.socket, parent: int) -> NoReturn:
     """Fork the children that the parent orders, until the kernel ends this process with its parent.
 
     A child is forked twice: when the process between has ended, the parent adopts the child.
@@ -115,11 +115,15 @@ def _rock(orders: socket.socket, parent: int) -> NoReturn:
         order, descriptors, _, _ = socket.recv_fds(orders, LONGEST_ORDER, 1)
         if not order:
             os._exit(0)
-        if (between := os.fork()) == 0:
+        between = os.fork()
+        if between == 0:
+            between = os.getpid()
             if os.fork() != 0:
                 os._exit(0)
-            while os.getppid() != parent:
+            while os.getppid() == between:
                 time.sleep(0.0002)
+            if os.getppid() != parent:  # the parent was killed, and another process has adopted this one
+                os._exit(1)
             os.setsid()
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             orders.send(_PID.pack(os.getpid()))

@@ -210,7 +210,7 @@ def tell_statuses(running: dict[int, int]) -> None:
 
 
 def adopt(arguments: list[str], environment: dict[str, str], folder: str, own_children: bool) -> list[str]:
-    """Take on the environment and the folder of a program; unless it starts its own children, give it a cradle."""
+    """Take on the environment and the folder of a program; unless it starts its own children, give it a forker."""
     os.chdir(folder)
     take_on(environment)
     if FORKS and not own_children:
