@@ -57,7 +57,8 @@ def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
     ------
     FormatError    if a model is missing or ambiguous, or if the graph is inconsistent
     """
-    models = {name: _find_model(find, name, graph.collection) for _, name in graph.graph.nodes}
+    names = dict.fromkeys(name for _, name in graph.graph.nodes)
+    models = {name: _find_model(find, name, graph.collection) for name in names}
     actions: dict[str, Any] = {}
     for (action, name), node in graph.graph.nodes.items():
         primitives = actions.setdefault(action, {"primitives": {}})["primitives"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 from marey_schemas.access import Role
@@ -19,7 +20,7 @@ from marey_server.prepared_documents import PreparedDocument, prepare_document
 from marey_server.store import blobs, items, projects
 from marey_server.store.blob_backings import Spool
 from marey_server.store.folder_roles.rights import rights_of_caller, rights_shown
-from marey_server.store.items import Draft, ItemFilters, Published
+from marey_server.store.items import Draft, Namesakes, Published
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import daily
@@ -364,10 +365,17 @@ def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
         from marey_motion.errors import MotionError
         from marey_motion.importing.graphs import FEW, NamedModel, graph_item
 
-    def find(name: str, collection: str | None) -> tuple[int, list[NamedModel]]:
-        named = ItemFilters(exact_name=name, directly_in=collection)
-        page = items.list_items(tx, project, Kind.MODEL, named, limit=FEW, count=True)
-        return page.count or 0, [NamedModel(one.path, {"item": one.id, "revision": one.revision}) for one in page.items]
+    names = {name for _, name in graph.graph.nodes}
+
+    @cache
+    def namesakes(folder: str | None) -> dict[str, Namesakes]:
+        return items.find_namesakes(tx, project, Kind.MODEL, names, directly_in=folder, most=FEW)
+
+    def find(name: str, folder: str | None) -> tuple[int, list[NamedModel]]:
+        found = namesakes(folder).get(name)
+        if found is None:
+            return 0, []
+        return found.count, [NamedModel(path, {"item": one, "revision": number}) for path, one, number in found.first]
 
     try:
         item = graph_item(graph, find)

@@ -88,3 +88,10 @@ def test_damaged_graphs_are_refused_by_the_node(path: list[str], value: object, 
     with pytest.raises(FormatError, match=told) as refused:
         graph_of_document(document, "g.json")
     assert refused.value.file == "g.json"
+
+
+def test_a_graph_with_too_many_nodes_is_refused_before_it_is_linked() -> None:
+    node = {"name": "stand", "type": "idle", "transitions": {}}
+    document = {"nodes": {f"a{number}": {"1": node} for number in range(10_001)}, "start_node": ["a0", "stand"]}
+    with pytest.raises(FormatError, match="more than 10000 nodes"):
+        graph_of_document(document, "g.json")

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from tests.support.predecessor_models import imported
@@ -41,7 +42,7 @@ def add_models(lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]], *paths
 
 def models_of(lab: Lab, *names: Any) -> list[str]:
     """Return the ids of the models that the nodes of a graph in the folder `g` refer to."""
-    nodes = {("idle", name): GraphNode("?", "idle", (("idle", name),)) for name in names}
+    nodes = {("idle", name): GraphNode("?", "idle", tuple(("idle", other) for other in names)) for name in names}
     graph = PredecessorGraph(nodes, ("idle", names[0]))
     draft = lab.read(graph_draft, "lab", ImportedGraph("graph", "g", (), graph, "graph.json", f"sha256:{'3' * 64}"))
     group = draft.parts["graph"].body["actions"]["idle"]["primitives"]
@@ -73,3 +74,14 @@ def test_the_only_model_elsewhere_is_taken_and_one_of_several_is_not_guessed(
     add_models(lab, parts, "farther/stand")
     with pytest.raises(InvalidProblem, match="2 models are called 'stand'"):
         models_of(lab, "stand")
+
+
+def test_the_models_of_many_nodes_are_looked_up_together(
+    lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [f"stand {number}" for number in range(40)]
+    ids = add_models(lab, parts, *(f"far/{name}" for name in names))
+    counted = Mock(side_effect=items.find_namesakes)
+    monkeypatch.setattr(items, "find_namesakes", counted)
+    assert models_of(lab, *names) == [ids[f"far/{name}"] for name in names]
+    assert counted.call_count == 2, "once in the folder of the graph, and once in the project"

@@ -15,6 +15,7 @@ from typing import Any
 from marey_motion.errors import FormatError
 from marey_motion.formats.document_fields import field_of
 from marey_motion.formats.predecessor.encoding import Encoding, encode_document
+from marey_schemas.documents.graphs import MOST_PRIMITIVES
 
 TYPES = ("start", "standard", "end", "idle", "single", "cycle_end")
 START_FIELDS = ("start_node", "startNode")
@@ -79,12 +80,16 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
     """
     listed: dict[tuple[str, str], Mapping[str, Any]] = {}
     names: dict[tuple[str, str], Place] = {}
+    places: set[Place] = set()
     nodes = field_of(document, "nodes", dict, file)
     for action in nodes:
         for model_id, node in field_of(nodes, action, dict, file).items():
             place = (action, field_of(node, "name", str, file))
-            if place in names.values():
+            if place in places:
                 raise FormatError(f"action {action}: two nodes are called {place[1]!r}", file=file)
+            if len(places) == MOST_PRIMITIVES:
+                raise FormatError(f"the graph has more than {MOST_PRIMITIVES} nodes", file=file)
+            places.add(place)
             listed[action, model_id] = node
             names[action, model_id] = place
     known = {**{place: place for place in names.values()}, **names}

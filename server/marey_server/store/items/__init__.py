@@ -20,7 +20,7 @@ from marey_server.store.items.consents import find_ended_consents, permit_export
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
 from marey_server.store.items.lineage_graphs import read_lineage_graph
-from marey_server.store.items.listing import ItemFilters, explain_query, list_items
+from marey_server.store.items.listing import ItemFilters, Namesakes, explain_query, find_namesakes, list_items
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import (
     FoundPart,
@@ -39,6 +39,7 @@ __all__ = [
     "Draft",
     "FoundPart",
     "ItemFilters",
+    "Namesakes",
     "Part",
     "Published",
     "StoredDocument",
@@ -51,6 +52,7 @@ __all__ = [
     "find_annotation",
     "find_contents",
     "find_ended_consents",
+    "find_namesakes",
     "find_part",
     "list_items",
     "list_revisions",

@@ -19,7 +19,7 @@ from marey_server.store.items import narrowing
 from marey_server.store.items.querying import sql_of
 from marey_server.store.items.reading import item_rows, shown_items
 from marey_server.store.tables import collection, item, item_tag
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 SORT_KEYS: dict[str, ColumnElement[Any]] = {
     "id": item.c.id,
@@ -42,8 +42,6 @@ class ItemFilters:
     """Path of an item: folder and name."""
     name: str | None = None
     """Exact name, or its beginning followed by `*`."""
-    exact_name: str | None = None
-    """Exact name; a final `*` is an ordinary character."""
     tags: tuple[str, ...] = ()
     """Tags; items with at least one of these match."""
     skeleton: str | None = None
@@ -100,6 +98,41 @@ def list_items(
     return Page(items=tuple(_shown(tx, rows, fields)), next_cursor=next_cursor, count=total)
 
 
+@dataclass(frozen=True, slots=True)
+class Namesakes:
+    """Items that have one name: how many there are, and the first of them as path, id and newest revision."""
+
+    count: int
+    first: tuple[tuple[str, str, int], ...]
+
+
+def find_namesakes(
+    tx: Transaction, project: str, kind: Kind, names: Collection[str], *, directly_in: str | None, most: int
+) -> dict[str, Namesakes]:
+    """Return the items with each of the names that any item has, at most `most` for each name.
+
+    With `directly_in`, only the items of this folder count.
+    """
+    project_row = projects.require(tx, project)
+    conditions = conditions_of(project_row.id, ItemFilters(directly_in=directly_in), kind)
+    found: dict[str, Namesakes] = {}
+    for some in in_lists(sorted(names)):
+        ranked = (
+            select(
+                item.c.name, item.c.id, item.c.head, collection.c.path, func.count().over(partition_by=item.c.name).label("namesakes"),
+                func.row_number().over(partition_by=item.c.name, order_by=item.c.id).label("place"),
+            )
+            .join(collection, collection.c.id == item.c.collection_id)
+            .where(*conditions, item.c.name.in_(some))
+            .subquery()
+        )  # fmt: skip
+        for row in tx.execute(select(ranked).where(ranked.c.place <= most).order_by(ranked.c.name, ranked.c.place)):
+            before = found.get(row.name, Namesakes(row.namesakes, ()))
+            path = f"{row.path}/{row.name}".lstrip("/")
+            found[row.name] = replace(before, first=(*before.first, (path, row.id, row.head)))
+    return found
+
+
 def _shown(tx: Transaction, rows: Any, fields: Collection[str] | None) -> list[Any]:
     if fields is None:
         return shown_items(tx, rows)
@@ -153,8 +186,6 @@ def _filter_conditions(project_id: str, filters: ItemFilters) -> list[ColumnElem
         conditions += [_directly_in(project_id, folder, deleted=filters.deleted), item.c.name == name]
     if filters.name is not None:
         conditions += _named(filters.name)
-    if filters.exact_name is not None:
-        conditions.append(item.c.name == filters.exact_name)
     if filters.tags:
         tagged = select(item_tag.c.item_id).where(item_tag.c.tag.in_(filters.tags))
         conditions.append(item.c.id.in_(tagged))
