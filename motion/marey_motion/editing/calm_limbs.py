@@ -130,7 +130,7 @@ class CalmLimb:
         steps = np.linalg.norm(np.diff(after, axis=0), axis=-1)
         return _Attempt(motion, (steps - allowed_steps(self.usual, moved, self.reach)).max(axis=1))
 
-    def _slowed(self, ways: Floats, jumps: Flags, width: int) -> Floats:
+    def _slowed(self, vectors: Floats, jumps: Flags, width: int) -> Floats:
         """Slow down the turns of a path (n, 3), relative to the first joint, and lead it round this joint.
 
         Around jumps, and where the limb would have to fold too far, the direction changes evenly, over `width` frames
@@ -141,30 +141,30 @@ class CalmLimb:
         start, middle, end = np.moveaxis(self._places(self.given), 1, 0)
         first, second = np.linalg.norm(middle - start, axis=1), np.linalg.norm(end - middle, axis=1)
         least = np.sqrt(first**2 + second**2 - 2.0 * first * second * np.cos(self.fold_rad))
-        sizes = np.linalg.norm(ways, axis=1)
+        sizes = np.linalg.norm(vectors, axis=1)
         turning = np.asarray(maximum_filter1d(jumps | (sizes < least), 2 * width + 1), dtype=np.bool_)
-        directions = _directions(ways, end - start)
+        directions = _directions(vectors, end - start)
         slowed = directions.copy()
         for begin, stop in runs(turning):
             mean = _directions((end - start)[begin:stop].mean(axis=0), np.array((0.0, -1.0, 0.0)))
             places = smooth_step(np.linspace(0.0, 1.0, stop - begin))
             slowed[begin:stop] = _turned(directions[begin], directions[stop - 1], mean, places)
-        return np.asarray(np.where(turning[:, None], np.maximum(sizes, least)[:, None] * slowed, ways))
+        return np.asarray(np.where(turning[:, None], np.maximum(sizes, least)[:, None] * slowed, vectors))
 
-    def _evened(self, ways: Floats, jumps: Flags, width: int) -> Floats:
+    def _evened(self, vectors: Floats, jumps: Flags, width: int) -> Floats:
         """Average a path (n, 3), relative to the first joint, around jumps, over about `width` frames."""
         from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
         share = maximum_filter1d(jumps.astype(np.float64), 4 * width + 1)
         share = gaussian_filter1d(share, width, mode="nearest")[:, None]
-        even = gaussian_filter1d(self._slowed(ways, np.zeros_like(jumps), width), width, axis=0, mode="nearest")
-        return np.asarray(ways + share * (even - ways), dtype=np.float64)
+        even = gaussian_filter1d(self._slowed(vectors, np.zeros_like(jumps), width), width, axis=0, mode="nearest")
+        return np.asarray(vectors + share * (even - vectors), dtype=np.float64)
 
 
-def _directions(ways: Floats, otherwise: Floats) -> Floats:
+def _directions(vectors: Floats, otherwise: Floats) -> Floats:
     """Compute unit directions (..., 3) of vectors, and those of other vectors where a vector is zero."""
-    ways = np.where(np.linalg.norm(ways, axis=-1, keepdims=True) > 1e-6, ways, otherwise)
-    return np.asarray(ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-9))
+    vectors = np.where(np.linalg.norm(vectors, axis=-1, keepdims=True) > 1e-6, vectors, otherwise)
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))
 
 
 def _turned(first: Floats, last: Floats, guide: Floats, places: Floats) -> Floats:

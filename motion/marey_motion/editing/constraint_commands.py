@@ -87,11 +87,11 @@ def constrain(take: Take, command: Constrain) -> Take:
     )
     found = [_finding(*each) for each in zip(command.constraints, wanted, before, after, strict=True)]
     edited = take.moved(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
-    told = [*contradictions(wanted), *joined(pairs), *missed(wanted, after)]
-    told += jumps(take.skeleton, take.motion, made.motion, wanted, blend)
+    warnings = [*contradictions(wanted), *joined(pairs), *missed(wanted, after)]
+    warnings += jumps(take.skeleton, take.motion, made.motion, wanted, blend)
     if blend > take.frame_count:
-        told.append(f"the blend of {command.blend_s:g} s is longer than the clip")
-    for warning in told:
+        warnings.append(f"the blend of {command.blend_s:g} s is longer than the clip")
+    for warning in warnings:
         edited = edited.warned("constrain", warning)
     return edited
 

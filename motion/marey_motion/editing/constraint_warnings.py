@@ -105,15 +105,15 @@ def joined(pairs: Sequence[JoinedWindows]) -> Iterator[str]:
     """
     for pair in pairs:
         both = f"constraints[{pair.first}] and constraints[{pair.second}]"
-        way = f"their targets are {100.0 * pair.apart_m:.1f} cm apart"
+        apart = f"their targets are {100.0 * pair.apart_m:.1f} cm apart"
         if pair.start < pair.stop:
             yield (
-                f"{both} follow each other too closely: {way}, so the joint goes from the first to the second one in "
+                f"{both} follow each other too closely: {apart}, so the joint goes from the first to the second one in "
                 f"the frames {pair.start}:{pair.stop}; leave more frames between them"
             )
         else:
             yield (
-                f"{both} follow each other without a gap: {way}, so the joint jumps between the frames "
+                f"{both} follow each other without a gap: {apart}, so the joint jumps between the frames "
                 f"{pair.start - 1} and {pair.stop}; leave frames between them, or set blend_s"
             )
 

@@ -60,7 +60,7 @@ def warn_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, fl
     -------
     CheckWarning or None    None if no hand or foot is more than `BELOW_M` below the floor
     """
-    told, joints, values, deep = [], [], {}, np.zeros(len(after), dtype=np.bool_)
+    places, joints, values, deep = [], [], {}, np.zeros(len(after), dtype=np.bool_)
     for end, (part, option) in _KINDS.items():
         if not all(f"{side}_{end}" in plan.target_joints for side in SIDES):
             continue
@@ -68,19 +68,19 @@ def warn_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, fl
         if depths.max() <= BELOW_M:
             continue
         frame, side = np.unravel_index(int(np.argmax(depths)), depths.shape)
-        told.append(
+        places.append(
             f"the {SIDES[int(side)]} {part} is up to {100.0 * depths.max():.1f} cm below it, in frame {frame} "
             f"({option} keeps it on the floor as far as the limb can)"
         )
         joints.append(plan.target.joint_names[plan.target_joints[f"{SIDES[int(side)]}_{end}"]])
         values[f"{part}_m"] = float(depths.max())
         deep |= (depths > BELOW_M).any(axis=1)
-    if not told:
+    if not places:
         return None
     frames = np.flatnonzero(deep)
     return CheckWarning(
         "below-floor",
-        f"a part of the body is below the floor on which the source stands: {'; '.join(told)}",
+        f"a part of the body is below the floor on which the source stands: {'; '.join(places)}",
         joints=tuple(joints),
         frames=(int(frames[0]), int(frames[-1]) + 1),
         values=values,

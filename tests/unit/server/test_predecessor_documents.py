@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -21,7 +21,10 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.predecessor_exports import (
+    LAYOUTS_OF,
+    PARTS_OF,
     ExportLayout,
+    ExportPart,
     PredecessorOptions,
     unchanged_original,
     write_predecessor,
@@ -121,6 +124,11 @@ def test_a_motion_without_components_is_written_with_a_mixture(
     expected = BSpline(np.array(still["knots"]), np.array(still["spatial_coeffs"]), 3)(FRAMES)
     np.testing.assert_allclose(old.model_poses(again, np.ones(1)), expected, atol=1e-9)
     np.testing.assert_allclose(old.model_times(again, np.zeros(0)), FRAMES, atol=1e-6)
+
+
+def test_requests_can_name_each_part_and_each_layout_that_can_be_written() -> None:
+    assert set(get_args(ExportPart)) == {part for parts in PARTS_OF.values() for part in parts}
+    assert set(get_args(ExportLayout)) == {layout for layouts in LAYOUTS_OF.values() for layout in layouts}
 
 
 @pytest.mark.parametrize("layout", ["database", "file"])

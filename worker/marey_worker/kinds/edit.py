@@ -115,12 +115,12 @@ class _Editing:
             self._places.take(Kind.CLIP, pin.folder, *names)
         for name, one in zip(names, made, strict=True):
             self._note(pin, name, one)
-            told = tuple(
+            checks = tuple(
                 Check(code="edit-warning", message=f"{found.command}: {found.values['warning']}")
                 for found in one.findings
                 if "warning" in found.values
             )
-            yield self._output(pin, name, one.clip, motion, info.model_copy(update={"checks": told}))
+            yield self._output(pin, name, one.clip, motion, info.model_copy(update={"checks": checks}))
 
     def _output(self, pin: PinnedInput, name: str, clip: Clip, motion: MotionDocument, info: ClipInfo) -> StagedOutput:
         rig = self._rigs.get(_skeleton_of(motion).item)

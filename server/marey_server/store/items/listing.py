@@ -119,7 +119,8 @@ def find_namesakes(
     for some in in_lists(sorted(names)):
         ranked = (
             select(
-                item.c.name, item.c.id, item.c.head, collection.c.path, func.count().over(partition_by=item.c.name).label("namesakes"),
+                item.c.name, item.c.id, item.c.head, collection.c.path,
+                func.count().over(partition_by=item.c.name).label("namesakes"),
                 func.row_number().over(partition_by=item.c.name, order_by=item.c.id).label("place"),
             )
             .join(collection, collection.c.id == item.c.collection_id)
