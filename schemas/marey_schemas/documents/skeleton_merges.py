@@ -10,14 +10,18 @@ from marey_schemas.names import ItemId
 SKELETON_MERGE = "skeleton_merge"
 """Name of the input by which a revision that a merge made refers to the revision before it."""
 MOST_MOVED = 5_000
-"""Greatest number of items that one merge moves to another skeleton, and of skeletons that it compares."""
+"""Greatest number of items that one merge moves to another skeleton."""
+MOST_RIGS_COMPARED = 500
+"""Greatest number of skeletons that a merge compares with each other, and an import with each new skeleton."""
 
 
 class SkeletonMergeRequest(Request):
     """Request to merge skeletons of one rig, or to show what would be merged."""
 
     skeletons: tuple[ItemId, ...] = Field(
-        (), max_length=500, description="Ids of the skeletons to merge; none: all skeletons of the project."
+        (),
+        max_length=MOST_RIGS_COMPARED,
+        description="Ids of the skeletons to merge; none: all skeletons of the project.",
     )
     kept: ItemId | None = Field(
         None,

@@ -54,6 +54,7 @@ IMPORT = KindDeclaration(
     outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON, "models": Kind.MODEL, "graphs": Kind.GRAPH},
     newest_of=("skeleton",),
     never_cached_for=_may_hold_graphs,
+    reports_entries=True,
 )
 
 RETARGET = KindDeclaration(

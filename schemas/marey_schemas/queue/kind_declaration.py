@@ -40,6 +40,9 @@ class KindDeclaration:
 
     A job that refuses some of its inputs succeeds. With `refusing_all_fails`, it fails if it refused all of them.
 
+    With `reports_entries`, the result has an entry for each file (`ImportAnswer`), which the server completes with what
+    it has published for the file.
+
     Some jobs never reuse results. A kind declares them with these fields:
 
     * `never_cached_for`: function of the parameters, which returns whether the job looks up names while it runs.
@@ -79,6 +82,7 @@ class KindDeclaration:
     never_cached_for: Callable[[Mapping[str, Any]], bool] | None = None
     named_after: str | None = None
     refusing_all_fails: bool = False
+    reports_entries: bool = False
     unclear_place: Callable[[Any, str], str | None] | None = None
     exports: str | None = None
 

@@ -177,7 +177,9 @@ class StagedOutput(Request):
         "project, is used unchanged. If there is no such item, a new one is created.",
     )
     same_skeleton: bool = Field(
-        False, description="Publish nothing if the existing item has another skeleton; its own skeleton neither."
+        False,
+        description="Publish nothing if the existing item has another skeleton; the skeleton of this output is not "
+        "published either. A skeleton of the same rig is no other one: the item keeps its own.",
     )
 
 

@@ -7,6 +7,7 @@ import pytest
 from tests.support.store_fixtures import Lab, motion_tree, skeleton_tree
 
 from marey_schemas.imports import Refusal, refused_entry
+from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.errors import UnavailableProblem
 from marey_server.motions import importing
@@ -83,6 +84,32 @@ def test_a_clip_gets_another_skeleton_only_on_request(lab: Lab) -> None:
     assert (changed.item, changed.revision, changed.skeleton_changed) == (first.item, 2, True)
     (back,) = store(lab, long_legs(asked=False))
     assert (back.status, back.revision, back.skeleton_changed, skeletons()) == ("unchanged", 2, False, 2)
+
+
+def test_a_new_take_of_a_rig_keeps_the_skeleton_of_its_clip(lab: Lab) -> None:
+    def rig(root_m: float) -> dict[str, Any]:
+        tree = skeleton_tree()
+        tree["joints"][0]["offset"] = [root_m, 0.0, 0.0]
+        return tree
+
+    for name, root_m in (("a", 0.0), ("b", 1.0)):
+        request = ItemCreate(name=name, collection="skeletons", parts={"hierarchy": rig(root_m)})
+        own = lab.write(items.create_item, "lab", Kind.SKELETON, request)
+    lab.add_clip(own, "walk", collection="takes")
+
+    def take(root_m: float, seed: int) -> Any:
+        file = read_file("walk.bvh", seed=seed)
+        skeleton, clip = file.drafts
+        parts = {"hierarchy": rig(root_m)}
+        return replace(file, drafts=(replace(skeleton, parts=parts), replace(clip, same_skeleton=True)))
+
+    for revision, root_m in ((2, 7.0), (3, 0.0)):
+        (entry,) = store(lab, take(root_m, revision))
+        assert (entry.status, entry.revision, entry.error) == ("created", revision, None)
+        assert (entry.skeleton, entry.skeleton_changed) == (own.id, False)
+    clip = lab.read(items.read_item, "lab", Kind.CLIP, entry.item)
+    assert clip.summary["skeleton"] == own.id
+    assert len(lab.read(items.list_items, "lab", Kind.SKELETON).items) == 2
 
 
 def test_the_same_take_twice_in_one_request_is_one_revision(lab: Lab) -> None:

@@ -9,9 +9,17 @@ from tests.support.store_fixtures import ALL_RIGHTS, Lab, motion_tree, skeleton_
 from marey_schemas.documents.skeleton_merges import SKELETON_MERGE, SkeletonMergeRequest
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
-from marey_server.errors import ApiProblem, ConflictProblem, ForbiddenProblem, InvalidProblem, NotFoundProblem
+from marey_server.errors import (
+    ApiProblem,
+    ConflictProblem,
+    ForbiddenProblem,
+    InvalidProblem,
+    NotFoundProblem,
+    TooLargeProblem,
+)
 from marey_server.store import items, projects
-from marey_server.store.items import Draft
+from marey_server.store.items import Draft, skeleton_merges
+from marey_server.store.items.same_rigs import RigDocument, is_same_rig
 
 
 def rig(
@@ -85,6 +93,63 @@ def test_clips_move_to_one_skeleton_with_the_same_poses_and_nothing_becomes_stal
     lab.write(items.put_part, "lab", Kind.CLIP, moved.id, "info", {"subject": "eve"}, expected_rev=None)
     assert stale(lab, made)
     assert merge(lab).rigs == ()
+
+
+def test_annotations_of_a_thousand_clips_are_found_at_once(lab: Lab) -> None:
+    clip = lab.add_clip(rig(lab, "a"))
+    body = {"clip": {"item": clip.id, "revision": 1}, "segments": [{"label": "a", "start": 0, "end": 2}]}
+    lab.write(items.create_item, "lab", Kind.ANNOTATION, ItemCreate(name="said", parts={"annotation": body}))
+    clips = {f"clip_{number:026d}": 1 for number in range(999)} | {clip.id: 1}
+
+    def find(tx: Any) -> list[Draft]:
+        return list(skeleton_merges._moved_annotations(tx, projects.require(tx, "lab"), clips, "merged"))
+
+    assert [one.item_name for one in lab.write(find)] == ["said"]
+
+
+def test_only_documents_of_what_moves_are_read_and_not_before_the_limits_are_checked(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept, duplicate = rig(lab, "a"), rig(lab, "b", root_m=1.0)
+    for number in range(3):
+        lab.add_clip(kept, f"stays {number}", seed=number)
+    for number in range(2):
+        lab.add_clip(duplicate, f"moves {number}", seed=number + 3)
+    read: list[str] = []
+
+    def note(load: Any) -> Any:
+        def loading(tx: Any, project: Any, skeleton: str, **kwargs: Any) -> Any:
+            read.append(skeleton)
+            return load(tx, project, skeleton, **kwargs)
+
+        return loading
+
+    monkeypatch.setattr(skeleton_merges, "_users", note(skeleton_merges._users))
+    monkeypatch.setattr(skeleton_merges, "MOST_MOVED", 1)
+    with pytest.raises(TooLargeProblem, match="moves at most 1 clips"):
+        merge(lab)
+    assert read == []
+    monkeypatch.setattr(skeleton_merges, "MOST_MOVED", 2)
+    assert merge(lab).rigs[0].merged[0].moved == {"clip": 2}
+    assert read == [duplicate.id]
+    monkeypatch.setattr(skeleton_merges, "MOST_RIGS_COMPARED", 1)
+    rig(lab, "c", root_m=2.0)
+    with pytest.raises(TooLargeProblem, match="compares at most 1 skeletons"):
+        merge(lab)
+
+
+def test_comparing_many_rigs_reads_each_skeleton_a_fixed_number_of_times() -> None:
+    class Body(dict[str, Any]):
+        reads = 0
+
+        def __getitem__(self, name: str) -> Any:
+            self.reads += 1
+            return super().__getitem__(name)
+
+    rigs = [RigDocument(f"digest {n}", Body(skeleton_tree(60, bone_m=1 + n / 1000))) for n in range(20)]
+    assert not any(is_same_rig(one, other, ()) for one in rigs for other in rigs if one is not other)
+    assert is_same_rig(rigs[0], rigs[1], [f"j{n}" for n in range(60)])
+    assert max(body.reads for one in rigs if isinstance(body := one.body, Body)) <= 4
 
 
 def test_skeletons_whose_other_offsets_all_motions_replace_are_merged(lab: Lab) -> None:

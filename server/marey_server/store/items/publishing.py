@@ -26,8 +26,8 @@ from marey_server.store.items.drafts import Draft, Published
 from marey_server.store.items.loaded_drafts import LoadedDraft, load_drafts
 from marey_server.store.items.revisions import NewRevision, read_part_digests, write_head, write_revisions
 from marey_server.store.items.same_rigs import on_known_rigs
-from marey_server.store.items.skeleton_changes import skeleton_of, without_skeleton_changes
-from marey_server.store.items.summaries import summarise
+from marey_server.store.items.skeleton_changes import without_skeleton_changes
+from marey_server.store.items.summaries import skeleton_of, summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import holdings
@@ -76,7 +76,7 @@ def publish(
     hold_off_purges(tx, project_row.id)
     require_places((draft for draft in drafts if draft.reuse != "by_content"), rights)
     publication = _Publication(tx, project_row, author_id, rights, job_id, refer_to_deleted)
-    loaded = without_skeleton_changes(tx, project_row, on_known_rigs(tx, project_row, load_drafts(tx, drafts)))
+    loaded = on_known_rigs(tx, project_row, without_skeleton_changes(tx, project_row, load_drafts(tx, drafts)))
     for together in _in_turns(loaded):
         publication.add(together)
     holdings.hold(tx, project_row.id, publication.added)
@@ -132,7 +132,7 @@ class _Ready:
 
     def published(self, head: _Head, *, created: bool) -> Published:
         """Return the revision that was published from the draft; `head.skeleton_id` is the skeleton before it."""
-        skeleton = skeleton_of(self.bodies)
+        skeleton = skeleton_of(self.draft.kind, self.bodies)
         changed = (
             created and None not in (skeleton, head.skeleton_id) and (skeleton or {}).get("item") != head.skeleton_id
         )

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Hashable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import and_, select
 
+from marey_schemas.documents.skeleton_merges import MOST_RIGS_COMPARED
 from marey_schemas.kinds import Kind
+from marey_server.prepared_documents import PreparedDocument
 from marey_server.store import documents
 from marey_server.store.items.drafts import StoredDocument
 from marey_server.store.items.loaded_drafts import LoadedDraft
@@ -18,21 +24,43 @@ from marey_server.store.transaction import Transaction
 
 Tree = dict[str, Any]
 
-MOST_COMPARED = 500
-"""Greatest number of skeletons of a project with which a new skeleton is compared: the newest ones."""
 SAME_NUMBER = 1e-5
 """Greatest difference of equal bones, in metres, and of equal rotations: writers round numbers."""
 
 _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RigDocument:
-    """Document `hierarchy` of a skeleton. `moved` are the joints whose offsets the motions of all its clips replace."""
+    """Document `hierarchy` of a skeleton, with what comparisons need of it."""
 
     digest: str
     body: Tree
-    moved: frozenset[str] = frozenset()
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of the joints."""
+        return [joint["name"] for joint in self.body["joints"]]
+
+    @cached_property
+    def structure(self) -> Hashable:
+        """Names and parents of the joints, and the joints with end sites: equal for all skeletons of one rig."""
+        joints = tuple((joint["name"], joint["parent"], joint.get("display_name")) for joint in self.body["joints"])
+        return joints, tuple(site["joint"] for site in self.body.get("end_sites", ()))
+
+    @cached_property
+    def offsets(self) -> NDArray[np.float64]:
+        """Offsets of the joints in metres, (joints, 3). Those of roots are 0: each clip has the place of its root."""
+        return np.array(
+            [joint["offset"] if joint["parent"] >= 0 else (0, 0, 0) for joint in self.body["joints"]], float
+        ).reshape(-1, 3)
+
+    @cached_property
+    def others(self) -> NDArray[np.float64]:
+        """The numbers that no motion replaces: rest rotations of the joints, and offsets of end sites."""
+        rotations = (joint.get("rest_rotation", _UNTURNED) for joint in self.body["joints"])
+        sites = (site["offset"] for site in self.body.get("end_sites", ()))
+        return np.array([*chain.from_iterable(rotations), *chain.from_iterable(sites)], float)
 
 
 def on_known_rigs(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
@@ -43,24 +71,29 @@ def on_known_rigs(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft
         for name in one.refers:
             moved[name] = moved.get(name, joints) & joints
     new = {
-        one.draft.name_in_batch: RigDocument(
-            one.contents["hierarchy"].digest, one.bodies["hierarchy"], frozenset(moved.get(name, ()))
-        )
+        one.draft.name_in_batch: RigDocument(one.contents["hierarchy"].digest, one.bodies["hierarchy"])
         for one in loaded
-        for name in (one.draft.name_in_batch,)
         if one.draft.kind is Kind.SKELETON and one.draft.reuse == "by_content" and "hierarchy" in one.contents
     }
-    known = _known_rigs(tx, project, new) if new else {}
+    known = _known_rigs(tx, project, new, moved) if new else {}
     brought = {rig.digest: one.contents["hierarchy"] for one in loaded if (rig := new.get(one.draft.name_in_batch))}
 
-    def on_rig(one: LoadedDraft, rig: RigDocument) -> LoadedDraft:
-        kept = brought.get(rig.digest) or StoredDocument(rig.digest)
-        return replace(one, contents={**one.contents, "hierarchy": kept}, bodies={**one.bodies, "hierarchy": rig.body})
+    def on_known(one: LoadedDraft) -> LoadedDraft:
+        rig = known.get(one.draft.name_in_batch)
+        return one if rig is None else on_rig(one, rig, brought.get(rig.digest))
 
-    return [on_rig(one, known[one.draft.name_in_batch]) if one.draft.name_in_batch in known else one for one in loaded]
+    return [on_known(one) for one in loaded]
 
 
-def _known_rigs(tx: Transaction, project: ProjectRow, new: Mapping[str, RigDocument]) -> dict[str, RigDocument]:
+def on_rig(one: LoadedDraft, rig: RigDocument, brought: PreparedDocument | StoredDocument | None = None) -> LoadedDraft:
+    """Return the draft of a skeleton with the hierarchy `rig`; `brought` is its document if it is not stored yet."""
+    kept = brought or StoredDocument(rig.digest)
+    return replace(one, contents={**one.contents, "hierarchy": kept}, bodies={**one.bodies, "hierarchy": rig.body})
+
+
+def _known_rigs(
+    tx: Transaction, project: ProjectRow, new: Mapping[str, RigDocument], moved: Mapping[str, Collection[str]]
+) -> dict[str, RigDocument]:
     """Return for some of the new skeletons, by name, the skeleton of the project or of an earlier one that is its rig.
 
     A skeleton whose digest the project has is left alone. The root's offset does not count, because every clip states
@@ -71,12 +104,12 @@ def _known_rigs(tx: Transaction, project: ProjectRow, new: Mapping[str, RigDocum
     tx.lock(f"content:{project.id}:{Kind.SKELETON}")  # as publication does, so that two imports see each other
     stored = _stored_digests(tx, project)
     unknown = {name: rig for name, rig in new.items() if rig.digest not in stored}
-    compared = list(stored)[-MOST_COMPARED:]
+    compared = list(stored)[-MOST_RIGS_COMPARED:]
     bodies = documents.load_bodies(tx, compared)
     candidates = [RigDocument(digest, bodies[digest]) for digest in compared]
     found = {}
     for name, rig in unknown.items():
-        same = next((one for one in candidates if one.digest == rig.digest or is_same_rig(one, rig)), None)
+        same = next((one for one in candidates if is_same_rig(one, rig, moved.get(name, ()))), None)
         if same is None:
             candidates.append(rig)
         elif same.digest != rig.digest:
@@ -98,40 +131,34 @@ def _stored_digests(tx: Transaction, project: ProjectRow) -> dict[str, str]:
     return {row.document_digest: row.id for row in tx.execute(statement)}
 
 
-def is_same_rig(known: RigDocument, new: RigDocument) -> bool:
+def is_same_rig(known: RigDocument, new: RigDocument, moved: Collection[str]) -> bool:
     """Return whether the clips of a new skeleton mean the same on a known one.
 
-    Clips that move a joint of the known skeleton do not count: those of the new skeleton need the offset of this joint.
+    `moved` are the joints whose offsets the motions of all clips of the new skeleton replace. What the clips of the
+    known skeleton move does not count: those of the new skeleton need the offset of such a joint.
     """
-    return _structure(known.body) == _structure(new.body) and all(
-        abs(a - b) <= SAME_NUMBER
-        for a, b in zip(_numbers(known.body, new.moved), _numbers(new.body, new.moved), strict=True)
-    )
+    if known.digest == new.digest:
+        return True
+    odd = odd_offsets(known, new)
+    return odd is not None and odd.issubset(moved)
 
 
-def rig_difference(known: RigDocument, new: RigDocument) -> str:
-    """Return, as part of a sentence, what makes two skeletons different rigs."""
-    first, second = ([joint["name"] for joint in rig.body["joints"]] for rig in (known, new))
-    if odd := sorted(set(first) ^ set(second)):
+def odd_offsets(known: RigDocument, new: RigDocument) -> frozenset[str] | None:
+    """Return the joints whose offsets differ; None if the skeletons differ in something that no motion replaces."""
+    if known.structure != new.structure or np.any(np.abs(known.others - new.others) > SAME_NUMBER):
+        return None
+    odd = np.any(np.abs(known.offsets - new.offsets) > SAME_NUMBER, axis=1)
+    return frozenset(new.names[index] for index in np.flatnonzero(odd))
+
+
+def rig_difference(known: RigDocument, new: RigDocument, moved: Collection[str]) -> str:
+    """Return, as part of a sentence, what makes two skeletons different rigs; `moved` as in `is_same_rig`."""
+    if odd := sorted(set(known.names) ^ set(new.names)):
         return f"only one of them has {', '.join(odd[:5])}{', ...' if len(odd) > 5 else ''}"
-    if _structure(known.body) != _structure(new.body):
+    if known.structure != new.structure:
         return "their joints have other parents, or another order"
+    counted = [name not in moved for name in new.names]
     farthest = max(
-        abs(a - b) for a, b in zip(_numbers(known.body, new.moved), _numbers(new.body, new.moved), strict=True)
+        np.abs(known.offsets - new.offsets)[counted].max(initial=0), np.abs(known.others - new.others).max(initial=0)
     )
     return f"their offsets or rest rotations differ by up to {farthest:.2g}"
-
-
-def _structure(body: Tree) -> tuple[object, ...]:
-    joints = tuple((joint["name"], joint["parent"], joint.get("display_name")) for joint in body["joints"])
-    return joints, tuple(site["joint"] for site in body.get("end_sites", ()))
-
-
-def _numbers(body: Tree, moved: Collection[str]) -> Iterator[float]:
-    """Yield the numbers of a hierarchy that the motion of a clip does not replace."""
-    for joint in body["joints"]:
-        if joint["parent"] >= 0 and joint["name"] not in moved:
-            yield from joint["offset"]
-        yield from joint.get("rest_rotation", _UNTURNED)
-    for site in body.get("end_sites", ()):
-        yield from site["offset"]

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import and_, select
 
+from marey_server.prepared_documents import PreparedDocument, digest_of_body, with_body
+from marey_server.store import documents
+from marey_server.store.items.drafts import StoredDocument
 from marey_server.store.items.loaded_drafts import LoadedDraft
+from marey_server.store.items.references import outputs_in
+from marey_server.store.items.same_rigs import RigDocument, is_same_rig, on_rig
+from marey_server.store.items.summaries import SKELETON_PARTS, skeleton_of
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, item, revision_part
 from marey_server.store.transaction import Transaction, in_lists
@@ -15,35 +22,95 @@ from marey_server.store.transaction import Transaction, in_lists
 Tree = dict[str, Any]
 
 
-def skeleton_of(bodies: Mapping[str, Tree]) -> Tree | None:
-    """Return the reference to the skeleton of an item, given the documents of its parts; None if it has none."""
-    moved = bodies.get("motion") or bodies.get("model")
-    reference: Tree | None = None if moved is None else moved.get("skeleton")
-    return reference
-
-
 def without_skeleton_changes(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
-    """Leave out drafts with `same_skeleton` that would change the skeleton of an item, and what belongs to them alone.
+    """Keep the skeletons of items that drafts with `same_skeleton` revise.
 
-    To a clip belong its annotations, and a skeleton that no other draft uses. Skeletons are equal if their hierarchies
-    are.
+    If the skeleton of the draft is the same rig (`is_same_rig`), the draft gets the reference to the item's own one.
+    Otherwise the draft is left out, and what belongs to it alone: the annotations of a clip, and a skeleton that no
+    other draft uses.
     """
     before = _skeletons_before(tx, project, [one for one in loaded if one.draft.same_skeleton])
     if not before:
         return loaded
     by_name = {one.draft.name_in_batch: one for one in loaded}
-    after = {name: skeleton_of(by_name[name].bodies) or {} for name in before}
-    stored = _hierarchies(tx, {*before.values(), *(ref["item"] for ref in after.values() if "item" in ref)})
+    after = {name: _reference(by_name[name]) for name in before}
+    stored = _stored_rigs(tx, {*before.values(), *(ref["item"] for ref in after.values() if "item" in ref)})
 
-    def hierarchy(reference: Tree) -> str | None:
-        given = by_name.get(reference.get("output", ""))
-        return stored.get(reference.get("item", "")) if given is None else given.contents["hierarchy"].digest
+    def is_kept(name: str) -> bool:
+        known, reference = stored.get(before[name]), after[name]
+        rig = _rig(by_name.get(reference.get("output", "")), stored.get(reference.get("item", "")))
+        return known is not None and rig is not None and is_same_rig(known.rig, rig, _moved_by(by_name[name]))
 
-    refused = {name for name, skeleton_id in before.items() if hierarchy(after[name]) != stored.get(skeleton_id)}
+    kept = {name: stored[skeleton_id] for name, skeleton_id in before.items() if is_kept(name)}
+    refused = before.keys() - kept.keys()
     refused |= {one.draft.name_in_batch for one in loaded if refused.intersection(one.refers)}
     used = {name for one in loaded if one.draft.name_in_batch not in refused for name in one.refers}
     refused |= {name for one in loaded if one.draft.name_in_batch in refused for name in one.refers} - used
-    return [one for one in loaded if one.draft.name_in_batch not in refused]
+    own = {name: skeleton for name, skeleton in kept.items() if not skeleton.deleted}
+    return _on_own_skeletons(tx, [one for one in loaded if one.draft.name_in_batch not in refused], own)
+
+
+@dataclass(frozen=True)
+class _StoredSkeleton:
+    """Newest revision of a skeleton of the project."""
+
+    reference: Tree
+    rig: RigDocument
+    deleted: bool
+
+
+def _reference(one: LoadedDraft) -> Tree:
+    return skeleton_of(one.draft.kind, one.bodies) or {}
+
+
+def _moved_by(one: LoadedDraft) -> Collection[str]:
+    joints: Collection[str] = one.bodies[SKELETON_PARTS[one.draft.kind]].get("translated_joints", ())
+    return joints
+
+
+def _rig(given: LoadedDraft | None, stored: _StoredSkeleton | None) -> RigDocument | None:
+    """Return the rig of a skeleton that is either another draft or stored; None if it is neither."""
+    if given is not None and "hierarchy" in given.contents:
+        return RigDocument(given.contents["hierarchy"].digest, given.bodies["hierarchy"])
+    return None if stored is None else stored.rig
+
+
+def _on_own_skeletons(
+    tx: Transaction, loaded: Sequence[LoadedDraft], own: Mapping[str, _StoredSkeleton]
+) -> list[LoadedDraft]:
+    """Return drafts with references to the skeletons of the items that they revise, given by name of the draft.
+
+    A skeleton that only such drafts used stands for the one that the first of them keeps, so that it is not stored.
+    """
+    others = {name for one in loaded if one.draft.name_in_batch not in own for name in one.refers}
+    replaced: dict[str, RigDocument] = {}
+    changed = []
+    for one in loaded:
+        skeleton = own.get(one.draft.name_in_batch)
+        if skeleton is not None:
+            given = _reference(one).get("output")
+            if given is not None and given not in others:
+                replaced.setdefault(given, skeleton.rig)
+            one = _on_skeleton(tx, one, skeleton.reference)
+        changed.append(one)
+    return [
+        on_rig(one, replaced[one.draft.name_in_batch]) if one.draft.name_in_batch in replaced else one
+        for one in changed
+    ]
+
+
+def _on_skeleton(tx: Transaction, one: LoadedDraft, reference: Tree) -> LoadedDraft:
+    """Return a draft that refers to another skeleton, and is otherwise the same."""
+    part = SKELETON_PARTS[one.draft.kind]
+    content, body = one.contents[part], {**one.bodies[part], "skeleton": reference}
+    bodies = {**one.bodies, part: body}
+    if isinstance(content, StoredDocument):
+        documents.store_variants(tx, [(content.digest, body)])
+        changed: PreparedDocument | StoredDocument = StoredDocument(digest_of_body(body))
+    else:
+        changed = with_body(content, body)
+    refers = [name for tree in bodies.values() for name in outputs_in(tree)]
+    return replace(one, bodies=bodies, contents={**one.contents, part: changed}, refers=refers)
 
 
 def _skeletons_before(tx: Transaction, project: ProjectRow, drafts: Sequence[LoadedDraft]) -> dict[str, str]:
@@ -65,12 +132,22 @@ def _skeletons_before(tx: Transaction, project: ProjectRow, drafts: Sequence[Loa
     return found
 
 
-def _hierarchies(tx: Transaction, ids: set[str]) -> dict[str, str]:
-    """Return the digests of the newest hierarchies of skeletons, by id."""
+def _stored_rigs(tx: Transaction, ids: set[str]) -> dict[str, _StoredSkeleton]:
+    """Return the newest revisions of skeletons, by id."""
     at_head = and_(revision_part.c.item_id == item.c.id, revision_part.c.number == item.c.head)
-    statement = select(item.c.id, revision_part.c.document_digest).join(revision_part, at_head)
-    return {
-        row.id: row.document_digest
+    statement = select(item.c.id, item.c.head, item.c.deleted_us, revision_part.c.document_digest).join(
+        revision_part, at_head
+    )
+    rows = [
+        row
         for some in in_lists(sorted(ids))
         for row in tx.execute(statement.where(item.c.id.in_(some), revision_part.c.part == "hierarchy"))
+    ]
+    bodies = documents.load_bodies(tx, {row.document_digest for row in rows})
+    rigs = {digest: RigDocument(digest, body) for digest, body in bodies.items()}
+    return {
+        row.id: _StoredSkeleton(
+            {"item": row.id, "revision": row.head}, rigs[row.document_digest], row.deleted_us is not None
+        )
+        for row in rows
     }

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-from sqlalchemy import or_
+from sqlalchemy import ColumnElement, and_, func, select
 
 from marey_schemas.access import Role
 from marey_schemas.documents.skeleton_merges import (
     MOST_MOVED,
+    MOST_RIGS_COMPARED,
     SKELETON_MERGE,
     MergedRig,
     MergedSkeleton,
@@ -20,6 +22,7 @@ from marey_schemas.documents.skeleton_merges import (
     SkeletonMergeRequest,
 )
 from marey_schemas.kinds import Kind
+from marey_schemas.sizes import batched
 from marey_server.errors import ConflictProblem, InvalidProblem, TooLargeProblem
 from marey_server.prepared_documents import digest_of_body
 from marey_server.store import documents, projects
@@ -30,7 +33,8 @@ from marey_server.store.items.facets import repeat_facets
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import item_rows, no_item
 from marey_server.store.items.revisions import read_part_digests
-from marey_server.store.items.same_rigs import RigDocument, is_same_rig, rig_difference
+from marey_server.store.items.same_rigs import RigDocument, odd_offsets, rig_difference
+from marey_server.store.items.summaries import SKELETON_PARTS
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import item
@@ -38,19 +42,20 @@ from marey_server.store.transaction import Transaction, in_lists
 
 Tree = dict[str, Any]
 
-_MOVING = {Kind.CLIP: "motion", Kind.PROCESSED: "motion", Kind.MODEL: "model"}
-"""Kinds of items that use a skeleton, with the part that refers to it."""
+_LOADED_TOGETHER = 200
+"""Number of items whose documents are loaded at once."""
 
 
 @dataclass
-class _Used:
-    """Skeleton of the project, with the items whose newest revision uses it."""
+class _Skeleton:
+    """Skeleton of the project, with the numbers of items whose newest revision uses it, by kind."""
 
     row: Any
-    hierarchy: Tree
-    digest: str
+    rig: RigDocument
     mapping: Tree | None
-    users: list[_User] = field(default_factory=list)
+    users: Mapping[str, int]
+    odd: frozenset[str] = frozenset()
+    """Joints whose offsets differ from those of the skeleton that is kept; all motions must replace them."""
 
     @property
     def named(self) -> dict[str, str]:
@@ -62,10 +67,8 @@ class _Used:
         return self.mapping is not None and self.mapping.get("method") == "manual"
 
     @property
-    def rig(self) -> RigDocument:
-        """The hierarchy, with the joints whose offsets the motions of all users replace."""
-        replaced = [set(one.bodies[one.part].get("translated_joints", ())) for one in self.users]
-        return RigDocument(self.digest, self.hierarchy, frozenset(set.intersection(*replaced) if replaced else ()))
+    def user_count(self) -> int:
+        return sum(self.users.values())
 
 
 @dataclass(frozen=True)
@@ -81,8 +84,9 @@ class _User:
         return Kind(self.row.kind)
 
     @property
-    def part(self) -> str:
-        return _MOVING[self.kind]
+    def moved(self) -> frozenset[str]:
+        """The joints whose offsets the motion replaces."""
+        return frozenset(self.bodies[SKELETON_PARTS[self.kind]].get("translated_joints", ()))
 
 
 def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest) -> SkeletonMergeAnswer:
@@ -102,7 +106,7 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
         hold_off_purges(tx, row.id)
         rights_of_caller(tx, row).require_below("", Role.MAINTAINER)
         tx.lock(f"content:{row.id}:{Kind.SKELETON}")  # as publication does, so that no import uses a merged skeleton
-    rigs = _rigs(_find_used(tx, row, request), request)
+    rigs = _rigs(tx, row, _find_skeletons(tx, row, request), request)
     if not request.dry_run:
         for kept, merged in rigs:
             for one in merged:
@@ -111,9 +115,7 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
     shown = [
         MergedRig(
             kept=NamedSkeleton(**kept.named),
-            merged=tuple(
-                MergedSkeleton(**one.named, moved=dict(Counter(user.row.kind for user in one.users))) for one in merged
-            ),
+            merged=tuple(MergedSkeleton(**one.named, moved=dict(one.users)) for one in merged),
         )
         for kept, merged in rigs
     ]
@@ -123,80 +125,136 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
 # -- what is merged ----------------------------------------------------------------------------------------------------
 
 
-def _find_used(tx: Transaction, project: ProjectRow, request: SkeletonMergeRequest) -> list[_Used]:
+def _find_skeletons(tx: Transaction, project: ProjectRow, request: SkeletonMergeRequest) -> list[_Skeleton]:
+    """Return the skeletons to compare; lock their rows, so that nobody revises them before they are merged."""
     named = {*request.skeletons, *([request.kept] if request.kept else ())}
-    whole = not request.skeletons
     statement = item_rows().where(
         item.c.project_id == project.id, item.c.kind == Kind.SKELETON.value, item.c.deleted_us.is_(None)
     )
-    if not whole:
+    if request.skeletons:
         statement = statement.where(item.c.id.in_(sorted(named)))
-    rows = tx.execute(_locked(statement, request).order_by(item.c.id).limit(MOST_MOVED + 1)).all()
+    rows = tx.execute(_locked(statement, request).order_by(item.c.id).limit(MOST_RIGS_COMPARED + 1)).all()
+    if len(rows) > MOST_RIGS_COMPARED:
+        raise TooLargeProblem(
+            f"One merge compares at most {MOST_RIGS_COMPARED} skeletons, and there are more; name skeletons of one rig."
+        )
     if absent := sorted(named - {row.id for row in rows}):
         raise no_item(Kind.SKELETON, absent[0])
-    _require_few(len(rows), "skeletons")
     digests = read_part_digests(tx, [(row.id, row.head) for row in rows])
     bodies = documents.load_bodies(tx, {digest for parts in digests.values() for digest in parts.values()})
-    skeletons = {}
+    counts = _count_users(tx, project, [row.id for row in rows])
+    found = []
     for row in rows:
         parts = digests[row.id, row.head]
         mapping = bodies[parts["mapping"]] if "mapping" in parts else None
-        skeletons[row.id] = _Used(row, bodies[parts["hierarchy"]], parts["hierarchy"], mapping)
-    for user in _users(tx, project, sorted(skeletons), request):
-        skeletons[user.row.skeleton_id].users.append(user)
-    return list(skeletons.values())
+        rig = RigDocument(parts["hierarchy"], bodies[parts["hierarchy"]])
+        found.append(_Skeleton(row, rig, mapping, counts.get(row.id, {})))
+    return found
 
 
-def _users(
-    tx: Transaction, project: ProjectRow, skeletons: Sequence[str], request: SkeletonMergeRequest
-) -> Iterator[_User]:
-    """Yield the items whose newest revision uses one of the skeletons, each with its documents."""
+def _uses(project: ProjectRow, skeletons: Sequence[str]) -> ColumnElement[bool]:
+    """Return the condition that an item uses one of some skeletons, and moves when the skeleton is merged."""
+    return and_(
+        item.c.project_id == project.id, item.c.skeleton_id.in_(skeletons), item.c.deleted_us.is_(None),
+        item.c.kind.in_([kind.value for kind in SKELETON_PARTS]),
+    )  # fmt: skip
+
+
+def _count_users(tx: Transaction, project: ProjectRow, skeletons: Sequence[str]) -> dict[str, dict[str, int]]:
+    counts: defaultdict[str, dict[str, int]] = defaultdict(dict)
     for some in in_lists(skeletons):
-        statement = item_rows().where(
-            item.c.project_id == project.id, item.c.skeleton_id.in_(some), item.c.deleted_us.is_(None),
-            item.c.kind.in_([kind.value for kind in _MOVING]),
-        )  # fmt: skip
-        for rows in in_lists(tx.execute(_locked(statement, request).order_by(item.c.id)).all()):
-            digests = read_part_digests(tx, [(row.id, row.head) for row in rows])
-            bodies = documents.load_bodies(
-                tx, {parts[part] for parts in digests.values() for part in ("motion", "model", "tree") if part in parts}
-            )
-            for row in rows:
-                parts = digests[row.id, row.head]
-                yield _User(row, parts, {part: bodies[digest] for part, digest in parts.items() if digest in bodies})
+        columns = (item.c.skeleton_id, item.c.kind, func.count().label("users"))
+        statement = select(*columns).where(_uses(project, some)).group_by(item.c.skeleton_id, item.c.kind)
+        for row in tx.execute(statement):
+            counts[row.skeleton_id][row.kind] = row.users
+    return counts
+
+
+def _users(tx: Transaction, project: ProjectRow, skeleton: str, *, lock: bool) -> Iterator[_User]:
+    """Yield the items whose newest revision uses a skeleton, each with its documents; `lock` their rows."""
+    statement = item_rows().where(_uses(project, [skeleton])).order_by(item.c.id).limit(MOST_MOVED)
+    rows = tx.execute(statement.with_for_update(of=item) if lock else statement).all()
+    for some in batched(rows, _LOADED_TOGETHER):
+        digests = read_part_digests(tx, [(row.id, row.head) for row in some])
+        wanted = {*SKELETON_PARTS.values(), "tree"}
+        bodies = documents.load_bodies(
+            tx, {digest for parts in digests.values() for part, digest in parts.items() if part in wanted}
+        )
+        for row in some:
+            parts = digests[row.id, row.head]
+            yield _User(row, parts, {part: bodies[digest] for part, digest in parts.items() if digest in bodies})
 
 
 def _locked(statement: Any, request: SkeletonMergeRequest) -> Any:
-    """Lock the rows of items that are merged or moved, so that nobody revises them meanwhile."""
     return statement if request.dry_run else statement.with_for_update(of=item)
 
 
-def _rigs(skeletons: Sequence[_Used], request: SkeletonMergeRequest) -> list[tuple[_Used, list[_Used]]]:
-    """Return each skeleton that is kept, with those that are merged into it."""
+def _rigs(
+    tx: Transaction, project: ProjectRow, skeletons: Sequence[_Skeleton], request: SkeletonMergeRequest
+) -> list[tuple[_Skeleton, list[_Skeleton]]]:
+    """Return each skeleton that is kept, with those that are merged into it.
+
+    The documents of items are read only where it depends on them whether skeletons are one rig.
+    """
     best_first = sorted(
-        skeletons, key=lambda one: (one.row.id != request.kept, not one.is_edited, -len(one.users), one.row.id)
+        skeletons, key=lambda one: (one.row.id != request.kept, not one.is_edited, -one.user_count, one.row.id)
     )
-    rigs: list[tuple[_Used, list[_Used]]] = []
+    rigs: list[tuple[_Skeleton, list[_Skeleton]]] = []
+    alike: defaultdict[Hashable, list[tuple[_Skeleton, list[_Skeleton]]]] = defaultdict(list)
     for one in best_first:
-        same = next((found for found in rigs if is_same_rig(found[0].rig, one.rig)), None)
+        moved = _Moved(tx, project, one)
+        same = next((found for found in alike[one.rig.structure] if moved.covers(found[0])), None)
         if same is None:
             rigs.append((one, []))
+            alike[one.rig.structure].append(rigs[-1])
         else:
             _require_same_mapping(same[0], one, request)
+            one.odd = odd_offsets(same[0].rig, one.rig) or frozenset()
             same[1].append(one)
     if request.skeletons and len(rigs) > 1:
         first, other = rigs[0][0], rigs[1][0]
         raise InvalidProblem(
             f"The skeletons {first.named['path']} and {other.named['path']} are not one rig: "
-            f"{rig_difference(first.rig, other.rig)}. Name skeletons of one rig, or none to merge all duplicates.",
+            f"{rig_difference(first.rig, other.rig, _Moved(tx, project, other).joints)}. Name skeletons of one rig, or "
+            "none to merge all duplicates.",
             code="other-rig",
         )
     found = [rig for rig in rigs if rig[1] and (request.kept in (None, rig[0].row.id))]
-    _require_few(sum(len(one.users) for _, merged in found for one in merged), "clips and models")
+    if sum(one.user_count for _, merged in found for one in merged) > MOST_MOVED:
+        raise TooLargeProblem(
+            f"One merge moves at most {MOST_MOVED} clips and models, and there are more; name some of the skeletons to "
+            "merge."
+        )
     return found
 
 
-def _require_same_mapping(kept: _Used, merged: _Used, request: SkeletonMergeRequest) -> None:
+@dataclass
+class _Moved:
+    """Joints whose offsets the motions of all users of a skeleton replace, read when they are needed."""
+
+    tx: Transaction
+    project: ProjectRow
+    skeleton: _Skeleton
+
+    def covers(self, kept: _Skeleton) -> bool:
+        """Return whether the skeleton is the same rig as `kept`."""
+        odd = odd_offsets(kept.rig, self.skeleton.rig)
+        return odd is not None and (not odd or odd <= self.joints)
+
+    @cached_property
+    def joints(self) -> frozenset[str]:
+        """Those joints: none if there are no users, or so many that the skeleton cannot be merged."""
+        if self.skeleton.user_count > MOST_MOVED:
+            return frozenset()
+        common: frozenset[str] | None = None
+        for user in _users(self.tx, self.project, self.skeleton.row.id, lock=False):
+            common = user.moved if common is None else common & user.moved
+            if not common:
+                break  # most motions replace no offset, so the first one decides
+        return common or frozenset()
+
+
+def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonMergeRequest) -> None:
     if merged.is_edited and merged.mapping != kept.mapping and request.kept is None:
         raise ConflictProblem(
             f"Somebody made or confirmed the joint maps of {kept.named['path']} and {merged.named['path']}, and they "
@@ -205,23 +263,21 @@ def _require_same_mapping(kept: _Used, merged: _Used, request: SkeletonMergeRequ
         )
 
 
-def _require_few(count: int, what: str) -> None:
-    if count > MOST_MOVED:
-        raise TooLargeProblem(
-            f"One merge handles at most {MOST_MOVED} {what}, and there are more; name some of the skeletons to merge."
-        )
-
-
 # -- moving ------------------------------------------------------------------------------------------------------------
 
 
-def _move(tx: Transaction, project: ProjectRow, merged: _Used, kept: _Used) -> None:
+def _move(tx: Transaction, project: ProjectRow, merged: _Skeleton, kept: _Skeleton) -> None:
     """Give the users of a skeleton revisions that use the kept one, and move the annotations of clips to them."""
     reference = {"item": kept.row.id, "revision": kept.row.head}
     message = f"The skeleton {merged.named['path']} was merged into {kept.named['path']}"
-    drafts = [_draft(tx, user, reference, message) for user in merged.users]
-    _publish(tx, project, drafts)
-    clips = {user.row.id: user.row.head for user in merged.users if user.kind is Kind.CLIP}
+    users = list(_users(tx, project, merged.row.id, lock=True))
+    if Counter(user.row.kind for user in users) != merged.users or any(not merged.odd <= user.moved for user in users):
+        raise ConflictProblem(
+            f"Other requests changed what uses the skeleton {merged.named['path']} at the same time; try again.",
+            code="contended",
+        )
+    _publish(tx, project, [_draft(tx, user, reference, message) for user in users])
+    clips = {user.row.id: user.row.head for user in users if user.kind is Kind.CLIP}
     _publish(tx, project, list(_moved_annotations(tx, project, clips, message)))
 
 
@@ -234,7 +290,8 @@ def _publish(tx: Transaction, project: ProjectRow, drafts: Sequence[Draft]) -> l
 
 def _draft(tx: Transaction, user: _User, reference: Tree, message: str) -> Draft:
     """Return the draft of an item's revision with another skeleton; the arrays of its documents are the same."""
-    changed = {user.part: {**user.bodies[user.part], "skeleton": reference}}
+    part = SKELETON_PARTS[user.kind]
+    changed = {part: {**user.bodies[part], "skeleton": reference}}
     if "tree" in user.bodies:
         changed["tree"] = {**user.bodies["tree"], "model_digest": digest_of_body(changed["model"])}
     return _revised(tx, user.row, user.digests, changed, message)
@@ -255,7 +312,7 @@ def _moved_annotations(tx: Transaction, project: ProjectRow, clips: Mapping[str,
     Annotations of earlier revisions stay as they are.
     """
     for some in in_lists(sorted(clips)):
-        of_clips = or_(*(item.c.summary["clip"].as_string() == clip for clip in some))
+        of_clips = item.c.summary["clip"].as_string().in_(some)
         statement = item_rows().where(
             item.c.project_id == project.id, item.c.kind == Kind.ANNOTATION.value, item.c.deleted_us.is_(None), of_clips
         )

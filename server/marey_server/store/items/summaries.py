@@ -10,6 +10,8 @@ from typing import Any
 from marey_schemas.documents.clips import TakeRecord
 from marey_schemas.kinds import Kind
 
+SKELETON_PARTS = {Kind.CLIP: "motion", Kind.PROCESSED: "motion", Kind.MODEL: "model"}
+"""Kinds of items that use a skeleton, with the part that refers to it."""
 LABELS_SHOWN = 32
 """Greatest number of labels in the summary of an annotation; the labels with the most segments are kept."""
 
@@ -23,14 +25,23 @@ class Summary:
     skeleton_id: str | None = None
 
 
+def skeleton_of(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> dict[str, Any] | None:
+    """Return the reference to the skeleton of an item, given the documents of its parts; None if it has none."""
+    reference: dict[str, Any] | None = bodies.get(SKELETON_PARTS.get(kind, ""), {}).get("skeleton")
+    return reference
+
+
 def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
     """Return the summary of a revision from the documents of its parts, which have references in place of arrays."""
+    skeleton = (skeleton_of(kind, bodies) or {}).get("item")
     if kind is Kind.SKELETON:
         return Summary({"joints": len(bodies["hierarchy"]["joints"])})
     if kind is Kind.EVALUATION:
         return Summary({"verdict": bodies["evaluation"]["verdict"], **bodies["evaluation"]["headline"]})
     if kind is Kind.MODEL:
-        return _learned(bodies["model"])
+        model = bodies["model"]
+        shown = {"verdict": model.get("verdict", ""), "skeleton": skeleton, **model.get("headline", {})}
+        return Summary(shown, skeleton_id=skeleton)
     if kind is Kind.INDEX:
         return Summary({name: bodies["index"].get(name, 0) for name in ("clips", "rows", "left_out")})
     if kind is Kind.ANNOTATION:
@@ -38,9 +49,9 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
     if kind is Kind.CLIP:
         info = bodies.get("info", {})
         warnings = sorted({check["code"] for check in info.get("checks", ())})
-        return _moved(bodies["motion"], {"warnings": warnings, **take_record(info)})
+        return _moved(bodies["motion"], skeleton, {"warnings": warnings, **take_record(info)})
     if kind is Kind.PROCESSED:
-        return _moved(bodies["motion"], _aligned(bodies["info"]))
+        return _moved(bodies["motion"], skeleton, _aligned(bodies["info"]))
     if kind is Kind.STUDY:
         study = bodies["study"]
         return Summary({"title": study["title"], "motions": len(study["motions"])})
@@ -52,7 +63,7 @@ def take_record(info: Mapping[str, Any]) -> dict[str, Any]:
     return {name: info[name] for name in TakeRecord.model_fields if info.get(name)}
 
 
-def _moved(motion: Mapping[str, Any], known: Mapping[str, Any]) -> Summary:
+def _moved(motion: Mapping[str, Any], skeleton: str | None, known: Mapping[str, Any]) -> Summary:
     """Return the summary of a motion, with the facts in `known` added."""
     frames = motion["poses"]["shape"][0]
     shown = {
@@ -60,10 +71,10 @@ def _moved(motion: Mapping[str, Any], known: Mapping[str, Any]) -> Summary:
         "frame_rate_hz": motion["frame_rate_hz"],
         "duration_s": frames / motion["frame_rate_hz"],
         "joints": len(motion["joints"]),
-        "skeleton": motion["skeleton"]["item"],
+        "skeleton": skeleton,
         **known,
     }
-    return Summary(shown, frames, motion["skeleton"]["item"])
+    return Summary(shown, frames, skeleton)
 
 
 def _aligned(info: Mapping[str, Any]) -> dict[str, Any]:
@@ -78,12 +89,6 @@ def _aligned(info: Mapping[str, Any]) -> dict[str, Any]:
         "cost": info.get("cost", 0.0),
         "keyframes": len(info.get("keyframes", {})),
     }
-
-
-def _learned(model: Mapping[str, Any]) -> Summary:
-    skeleton = model["skeleton"]["item"]
-    shown = {"verdict": model.get("verdict", ""), "skeleton": skeleton, **model.get("headline", {})}
-    return Summary(shown, skeleton_id=skeleton)
 
 
 def _said(annotation: Mapping[str, Any]) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from marey_schemas.imports import published_result
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_schemas.queue.commits import MOST_COMMITTED, MOST_COMMITTED_AT_ONCE, JobCommit, OutputsCommit
+from marey_schemas.queue.job_kinds import job_kinds
 from marey_schemas.queue.jobs import FailureReason, JobOutput
 from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_server.access import roles, scopes
@@ -188,16 +189,17 @@ class PublishedOutputs:
         return self.columns.get("committed")
 
     def result(self, kind: str, result: dict[str, Any]) -> dict[str, Any]:
-        """Return the result of the job; the entries of an import say for each file what was published.
+        """Return the result of the job; entries for files (`reports_entries`) say what was published for each file.
 
-        Raises `InvalidProblem` if an entry of an import is not valid.
+        Raises `InvalidProblem` if an entry is not valid.
         """
-        if kind != "import" or "entries" not in result:
+        declaration = job_kinds().get(kind)
+        if declaration is None or not declaration.reports_entries or "entries" not in result:
             return result
         try:
             return published_result(result, {one["name"]: JobOutput.model_validate(one) for one in self.outputs})
         except ValidationError as error:
-            raise InvalidProblem("An entry in the result of an import is not valid.") from error
+            raise InvalidProblem("An entry for a file in the result of the job is not valid.") from error
 
 
 JOB_COLUMNS = (
