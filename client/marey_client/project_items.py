@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Unpack
 
 from marey_client.arguments import checked
 from marey_client.blobs import Blobs
+from marey_client.errors import NotFound
 from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.edits import EditHandle, Edits
@@ -168,10 +170,16 @@ class ProjectItems:
         return self.transport.post(DatasetPurgeAnswer, f"/projects/{self.name}/dataset-purges", request)
 
     def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
-        """Return the skeletons of `clips` whose joint mapping may have been edited: those with several revisions."""
-        used = {str(clip.summary["skeleton"]) for clip in clips}
-        skeletons = map(self.skeletons.get, sorted(used))
-        return tuple(ItemInput(item=one.id) for one in skeletons if one.item.revision > 1)
+        """Return the skeletons of `clips` whose joint mapping may have been edited: those with several revisions.
+
+        Deleted skeletons are left out: their clips use the mapping of the revision that they name.
+        """
+        edited = []
+        for used in sorted({str(clip.summary["skeleton"]) for clip in clips}):
+            with suppress(NotFound):
+                if self.skeletons.get(used).item.revision > 1:
+                    edited.append(ItemInput(item=used))
+        return tuple(edited)
 
 
 @dataclass(frozen=True)

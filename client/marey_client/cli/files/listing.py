@@ -301,13 +301,17 @@ def _rounded(value: object) -> object:
 
 def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
     """Yield names and values that describe an item; for a clip also its skeleton, source and warnings."""
+    from marey_client.errors import NotFound
     from marey_client.handles.clips import ClipHandle
 
     yield from item.item.model_dump(mode="json", exclude={"parts", "summary", "facets", "rev", "tags"}).items()
     yield "tags", " ".join(item.item.tags)
     for name, value in item.item.summary.items():
         if isinstance(item, ClipHandle) and name == "skeleton":
-            yield name, f"{marey.project(item.project).skeletons.get(value).path} ({value})"
+            try:
+                yield name, f"{marey.project(item.project).skeletons.get(value).path} ({value})"
+            except NotFound:
+                yield name, f"deleted; `marey restore {item.project}/{value}` restores it"
         elif name != "warnings":
             yield name, _rounded(value)
     yield from ((f"{FACET_PREFIX}{name}", _rounded(value)) for name, value in item.item.facets.items())

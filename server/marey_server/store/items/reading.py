@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, Select, and_, bindparam, select, type_coerce
+from sqlalchemy import Row, Select, and_, bindparam, not_, or_, select, type_coerce
 from sqlalchemy.types import NullType
 
 from marey_schemas.items import Item, PartPlace, PartSummary
@@ -89,11 +89,14 @@ _PART = (
     select(item.c.rev, revision_part.c.number, revision_part.c.document_digest, document.c.size_bytes)
     .join(revision_part, revision_part.c.item_id == item.c.id)
     .join(document, document.c.digest == revision_part.c.document_digest)
-    .where(*_THIS_ITEM, item.c.deleted_us.is_(None), revision_part.c.part == bindparam("part"))
+    .where(*_THIS_ITEM, revision_part.c.part == bindparam("part"))
 )
+_NEEDED_DELETED = and_(item.c.kind == Kind.SKELETON.value, item.c.purged_us.is_(None))
+"""Condition under which revisions of a deleted item can be read: revisions of clips may use a deleted skeleton."""
 _PARTS_OF_PROJECT = Prepared(
     select(
-        item.c.kind, item.c.deleted_us, revision_part.c.item_id, revision_part.c.number, revision_part.c.part,
+        item.c.kind, and_(item.c.deleted_us.is_not(None), not_(_NEEDED_DELETED)).label("is_deleted"),
+        revision_part.c.item_id, revision_part.c.number, revision_part.c.part,
         document.c.digest, document.c.size_bytes,
     )
     .join(item, item.c.id == revision_part.c.item_id)
@@ -104,8 +107,10 @@ _PARTS_OF_PROJECT = Prepared(
         revision_part.c.number.in_(bindparam("numbers", expanding=True)),
     )
 )  # fmt: skip
-_PART_OF_HEAD = Prepared(_PART.where(revision_part.c.number == item.c.head))
-_PART_OF_REVISION = Prepared(_PART.where(revision_part.c.number == bindparam("number")))
+_PART_OF_HEAD = Prepared(_PART.where(item.c.deleted_us.is_(None), revision_part.c.number == item.c.head))
+_PART_OF_REVISION = Prepared(
+    _PART.where(or_(item.c.deleted_us.is_(None), _NEEDED_DELETED), revision_part.c.number == bindparam("number"))
+)
 
 
 def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Any:
@@ -214,7 +219,10 @@ class FoundPart:
 def find_part(
     tx: Transaction, project: str, kind: Kind, item_id: str, part: str, *, revision: int | None = None
 ) -> FoundPart:
-    """Return a part of the newest revision, or of `revision`. Raises `NotFoundProblem` if there is no such part."""
+    """Return a part of the newest revision, or of `revision`, which for a skeleton is found after its deletion, too.
+
+    Raises `NotFoundProblem` if there is no such part.
+    """
     project_row = projects.require(tx, project)
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
     if revision is None:
@@ -291,8 +299,9 @@ class LoadedParts:
 def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> LoadedParts:
     """Load the documents of parts with encoded arrays, in the order of the request; None for a missing part.
 
-    The parts of deleted items count as missing, with one exception: an attempt of a job can load parts of its inputs,
-    because a version of a dataset may contain items that were deleted later. If the documents together are too large,
+    The parts of deleted items count as missing, with two exceptions: revisions of clips may use a deleted skeleton, and
+    an attempt of a job can load parts of its inputs, because a version of a dataset may contain items that were deleted
+    later. If the documents together are too large,
     the list ends before the first one that does not fit; the first document is always loaded.
     """
     project_row = projects.require(tx, project)
@@ -302,7 +311,7 @@ def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> Lo
     }
     rows = tx.run(_PARTS_OF_PROJECT, {"project_id": project_row.id, **keys})
     refused = reach.unreachable_places(tx, {(row.item_id, row.number) for row in rows})
-    refused |= {(row.item_id, row.number) for row in rows if row.deleted_us is not None} - reach.pinned_places(tx)
+    refused |= {(row.item_id, row.number) for row in rows if row.is_deleted} - reach.pinned_places(tx)
     found = {
         (row.kind, row.item_id, row.number, row.part): row for row in rows if (row.item_id, row.number) not in refused
     }
