@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.evaluations import evaluation_at, perceived_text
-from marey_client.cli.improvements import SHOWN, Evaluation, found_by, print_found
+from marey_client.cli.improvements import SHOWN, Evaluation, print_findings, submit_and_follow
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import FINDINGS_JOB, Wait
 from marey_client.cli.terminal.invocation import AsJson, connect
@@ -61,13 +61,13 @@ def compare(
         first, *rest = (evaluation_at(marey, place) for place in (before, *others))
         if any(one.project != first.project for one in rest):
             raise WrongUsage("all evaluations must be in one project")
-        found = found_by(marey, first, first.compare_request(*rest, **params), job, wait, as_json)
+        found = submit_and_follow(marey, first, first.compare_request(*rest, **params), job, wait, as_json)
         if found is None:
             return
         document = found.document()
         if out is not None:
             found.save_report(out)
-    print_found(found, document, as_json, _print_several if len(others) > 1 else _print_comparison)
+    print_findings(found, document, as_json, _print_several if len(others) > 1 else _print_comparison)
     if out is not None and not as_json:
         print_message(f"report: {out}")
 

@@ -76,7 +76,7 @@ def suggest(
         handle = evaluation_at(marey, evaluation)
         places = _places(marey, handle, candidates)
         request = handle.suggest_request(places, metric=metric_at(marey, metric), **params)
-        found = found_by(marey, handle, request, job, wait, as_json)
+        found = submit_and_follow(marey, handle, request, job, wait, as_json)
         if found is None:
             return
         document = found.document()
@@ -84,7 +84,7 @@ def suggest(
         names = [f"{clip['name']}\n" for clip in document["unused"]["clips"]]
         remove_out.write_text("".join(names), encoding="utf-8")
         print_message(f"{counted(len(names), 'clip')} that can be removed: {remove_out}")
-    print_found(found, document, as_json, _print_suggestions)
+    print_findings(found, document, as_json, _print_suggestions)
 
 
 def optimise(
@@ -100,8 +100,8 @@ def optimise(
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         request = handle.optimise_request(_places(marey, handle, candidates), **params)
-        if (found := found_by(marey, handle, request, job, wait, as_json)) is not None:
-            print_found(found, found.document(), as_json, _print_steps)
+        if (found := submit_and_follow(marey, handle, request, job, wait, as_json)) is not None:
+            print_findings(found, found.document(), as_json, _print_steps)
 
 
 def sweep(
@@ -115,16 +115,20 @@ def sweep(
     """Repeat an evaluation with other weights of the features, and rank the features by their effect on the result."""
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
-        if (found := found_by(marey, handle, handle.sweep_request(**params), job, wait, as_json)) is not None:
-            print_found(found, found.document(), as_json, _print_sweep)
+        if (found := submit_and_follow(marey, handle, handle.sweep_request(**params), job, wait, as_json)) is not None:
+            print_findings(found, found.document(), as_json, _print_sweep)
 
 
 # -- requests ---------------------------------------------------------------------------------------------------------
 
 
-def found_by(
+def submit_and_follow(
     marey: Marey, handle: EvaluationHandle, request: JobCreate, job: Chosen, wait: bool, as_json: bool
 ) -> Findings | None:
+    """Submit a job and follow it.
+
+    Returns its findings, or None if the command does not wait, since the job itself was then printed.
+    """
     from marey_client.handles.findings import Findings
 
     submitted = marey.project(handle.project).submit(request.model_copy(update=job))
@@ -140,9 +144,10 @@ def _places(marey: Marey, handle: EvaluationHandle, candidates: Sequence[str] | 
     return [clips_at(marey, address) for address in addresses]
 
 
-def print_found(
+def print_findings(
     found: Findings, document: Mapping[str, Any], as_json: bool, show: Callable[[Mapping[str, Any]], None]
 ) -> None:
+    """Print the findings of a job: summary and document as JSON, or the document as text, by `show`."""
     if as_json:
         print_json({"summary": found.summary, **_plain(document)})
     else:
@@ -230,8 +235,8 @@ def _print_steps(document: Mapping[str, Any]) -> None:
     for one in document["unconfirmed"]:
         clips = ", ".join(names.get(source, source) for source in one["sources"])
         typer.echo(
-            f"No effect found: {one['action']} {clips} seemed to change the objective by {-one['estimated_gain']:+.4f} "
-            f"m; in other replicates, it changes by {_change(one['effect']['objective'])} m."
+            f"Not confirmed: {one['action']} {clips} seemed to change the objective by {-one['estimated_gain']:+.4f} "
+            f"m; in other replicates, it changes by {_change(one['effect']['objective'])} m.{_chance_in_words(one)}"
         )
     reasons = {
         "no gain": "Ended because no further step gains enough.",
@@ -247,6 +252,12 @@ def _print_steps(document: Mapping[str, Any]) -> None:
 
 def _confirmed(effect: Mapping[str, Any] | None) -> str:
     return "" if effect is None else _change(effect["objective"])
+
+
+def _chance_in_words(refused: Mapping[str, Any]) -> str:
+    """Say why an effect was refused: its probability is corrected for the candidates of its step."""
+    p = refused["effect"]["objective"]["p"]
+    return "" if p is None else f" Among several candidates, chance alone changes it so much with probability {p:.2f}."
 
 
 def _change(change: Mapping[str, Any]) -> str:

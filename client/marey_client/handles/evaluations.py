@@ -21,7 +21,7 @@ from marey_client.items import Items
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.keywords.evaluation import CompareKeywords, OptimiseKeywords, SuggestKeywords, SweepKeywords
 from marey_client.places import Places, as_inputs, resolved
-from marey_schemas.documents.evaluations import COSTS, MOST_COMPARED
+from marey_schemas.documents.evaluations import COSTS, MOST_EVALUATIONS_COMPARED
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.queue.jobs import JobCreate
@@ -124,8 +124,10 @@ class EvaluationHandle(ReportedHandle):
 
     def compare_request(self, *others: EvaluationHandle, **options: Unpack[CompareKeywords]) -> JobCreate:
         """Return the job request of `compare`; `options` are those of `CompareParams`."""
-        if not 0 < len(others) < MOST_COMPARED:
-            raise BadArgument(f"between 2 and {MOST_COMPARED} evaluations can be compared, not {1 + len(others)}")
+        if not 0 < len(others) < MOST_EVALUATIONS_COMPARED:
+            raise BadArgument(
+                f"between 2 and {MOST_EVALUATIONS_COMPARED} evaluations can be compared, not {1 + len(others)}"
+            )
         after, *further = (other.as_input() for other in others)
         inputs: dict[str, Any] = {"before": self.as_input(), "after": after}
         if further:

@@ -215,10 +215,11 @@ class SuggestKeywords(TypedDict, total=False):
     """Weights of the objective: the cost of a set of clips."""
     estimation_replicates: int
     """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
-    the evaluation."""
+    the evaluation. Confirmations begin after the last replicate of both."""
     confirmation_replicates: int
     """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
-    intervals. At least 3, or 0: effects are not confirmed."""
+    intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose effect
+    is equal in all replicates, unless it changes no trial."""
     confirmation_seed: int
     """Seed of these other replicates: with another seed, the same choices are confirmed again."""
     removals: int
@@ -249,10 +250,11 @@ class OptimiseKeywords(TypedDict, total=False):
     """Weights of the objective: the cost of a set of clips."""
     estimation_replicates: int
     """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
-    the evaluation."""
+    the evaluation. Confirmations begin after the last replicate of both."""
     confirmation_replicates: int
     """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
-    intervals. At least 3, or 0: effects are not confirmed."""
+    intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose effect
+    is equal in all replicates, unless it changes no trial."""
     confirmation_seed: int
     """Seed of these other replicates: with another seed, the same choices are confirmed again."""
     least_gain: float
@@ -275,10 +277,11 @@ class SweepKeywords(TypedDict, total=False):
     """Weights of the objective: the cost of a set of clips."""
     estimation_replicates: int
     """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
-    the evaluation."""
+    the evaluation. Confirmations begin after the last replicate of both."""
     confirmation_replicates: int
     """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
-    intervals. At least 3, or 0: effects are not confirmed."""
+    intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose effect
+    is equal in all replicates, unless it changes no trial."""
     confirmation_seed: int
     """Seed of these other replicates: with another seed, the same choices are confirmed again."""
     factors: Sequence[float]

@@ -106,7 +106,10 @@ _CONDITION_OF = {
     **dict.fromkeys(("switch_speed_m_s", "switch_every_s", "replicates", "seed"), "scenarios"),
     "limits": "limits",
 }
-"""Condition of a comparison to which a member of the options belongs; other members do not change any number."""
+"""Condition of a comparison to which a member of the options belongs.
+
+Other members decide only what is counted or computed in addition: `coverage_least_s` and `literal_formulas`.
+"""
 _NAMED = 5
 """Greatest number of differing options that an error names."""
 

@@ -52,7 +52,7 @@ def _replicates_to_tree(replicates: ReplicateValues | None) -> Tree:
     if replicates is None:
         return {}
     intervals = {name: replicates.interval(name) for name in replicates.suite}
-    told = {name: one._asdict() for name, one in intervals.items() if one is not None}
+    known = {name: one._asdict() for name, one in intervals.items() if one is not None}
     return {
         "replicates": {
             "names": list(replicates.names),
@@ -60,7 +60,7 @@ def _replicates_to_tree(replicates: ReplicateValues | None) -> Tree:
             "defined": np.isfinite(replicates.values),
             "followed": replicates.followed,
             "suite": {name: [_defined(value) for value in own.tolist()] for name, own in replicates.suite.items()},
-            "intervals": told,
+            "intervals": known,
         }
     }
 

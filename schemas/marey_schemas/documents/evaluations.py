@@ -17,7 +17,7 @@ CONFIDENCE = 0.95
 """Confidence level of intervals: of changes between two evaluations, and of means of replicates."""
 
 
-MOST_COMPARED = 8
+MOST_EVALUATIONS_COMPARED = 8
 """Greatest number of evaluations in one comparison: more do not fit beside each other in a table."""
 
 

@@ -45,14 +45,16 @@ class ConfirmedEffects(ObjectiveChoice):
         ge=1,
         le=64,
         description="Number of replicates of each trial in which effects are estimated, to choose among them; the "
-        "first are those of the evaluation.",
+        "first are those of the evaluation. Confirmations begin after the last replicate of both.",
     )
     confirmation_replicates: int = Field(
         8,
         ge=0,
         le=64,
         description="Number of other replicates in which the chosen effects are measured again: the effects that are "
-        f"reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed.",
+        f"reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed. With "
+        f"{LEAST_REPLICATES} to 6, an optimisation confirms no step whose effect is equal in all replicates, unless it "
+        "changes no trial.",
     )
     confirmation_seed: int = Field(
         0,

@@ -1,6 +1,6 @@
 """Kinds of jobs that measure clips and sets of clips; `job_kinds` lists them with all others."""
 
-from marey_schemas.documents.evaluations import MOST_COMPARED, REMOVAL_FACETS, USAGE_FACETS
+from marey_schemas.documents.evaluations import MOST_EVALUATIONS_COMPARED, REMOVAL_FACETS, USAGE_FACETS
 from marey_schemas.documents.quality import QUALITY_FACETS
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_params
@@ -71,8 +71,8 @@ COMPARE = KindDeclaration(
             kind=Kind.EVALUATION,
             many=True,
             required=False,
-            description=f"Further evaluations to compare with `before`, at most {MOST_COMPARED - 2}, with the same "
-            "trials and the same normaliser.",
+            description=f"Further evaluations to compare with `before`, at most {MOST_EVALUATIONS_COMPARED - 2}, with "
+            "the same trials and the same normaliser.",
         ),
     },
     outputs={"document": "file", "report": "file"},
@@ -137,7 +137,7 @@ SUGGEST = KindDeclaration(
     "coverage.",
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
-    version=5,
+    version=6,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": METRIC},
     outputs={"document": "file"},
     facets=REMOVAL_FACETS,
@@ -148,7 +148,7 @@ OPTIMISE = KindDeclaration(
     description="Removes clips from an evaluated set and adds others, step by step, as long as the set improves.",
     params=job_params.OptimiseParams,
     implementation="marey_worker.kinds.optimise:run",
-    version=3,
+    version=4,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
     outputs={"document": "file"},
 )
@@ -160,7 +160,7 @@ SWEEP = KindDeclaration(
     implementation="marey_worker.kinds.sweep:run",
     gathering="marey_worker.kinds.sweep:gather",
     task_count=job_params.count_sweep_tasks,
-    version=3,
+    version=4,
     inputs={"evaluation": _EVALUATED},
     outputs={"document": "file"},
 )

@@ -1,22 +1,34 @@
 """Effects of changed sets are confirmed in replicates that had no part in choosing the change."""
 
+from collections.abc import Collection
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tests.support.suggestion_cases import OPTIONS, wandering_tracks
+from tests.support.suggestion_cases import OPTIONS, UNWANTED, wandering_tracks
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
-from marey_motion.evaluation.improvement.effects import confirmation_replicates, effect_of, estimation_replicates
+from marey_motion.evaluation.compare import paired_change, probability
+from marey_motion.evaluation.improvement import optimise as searching
+from marey_motion.evaluation.improvement.effects import (
+    Effect,
+    confirmation_replicates,
+    effect_of,
+    estimation_replicates,
+)
 from marey_motion.evaluation.improvement.objective import headline_means
-from marey_motion.evaluation.improvement.optimise import Optimisation, optimise, with_total
+from marey_motion.evaluation.improvement.optimise import CONFIRMED_AT_ONCE, Optimisation, optimise, with_total
 from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation
 from marey_motion.evaluation.improvement.selection import without_sources
 from marey_motion.evaluation.improvement.sweep import SweepRow, group_influences
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.replicates import measure_run, run_of, simulate
+from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.search import build_index
+from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.improvement import ObjectiveOptions, OptimisationOptions, SuggestionOptions
 from marey_schemas.options.matching import FeatureWeights
 
@@ -50,20 +62,24 @@ def test_an_effect_is_the_paired_difference_of_evaluations_in_the_same_replicate
     effect = effect_of(simulation, ObjectiveOptions(), NONE, frozenset(["clip_001"]))
     without = offsets(without_sources(pool, ["clip_001"]), replicates)
     change = np.array(without) - offsets(pool, replicates)
-    told = effect.headlines["offset_mean"]
-    assert told.change == pytest.approx(change.mean(), abs=1e-12)
-    assert told.replicates == 3
-    assert told.low is not None
-    assert told.high is not None
-    assert told.low < told.change < told.high
+    offset = effect.headlines["offset_mean"]
+    assert offset.change == pytest.approx(change.mean(), abs=1e-12)
+    assert offset.replicates == 3
+    assert offset.low is not None
+    assert offset.high is not None
+    assert offset.low < offset.change < offset.high
     again = effect_of(simulation, ObjectiveOptions(), NONE, frozenset(["fast_000"]))
-    assert again.nothing, "no trial needs this clip"
+    assert {one.verdict for one in again.headlines.values()} == {"same"}, "no trial needs this clip"
 
 
 def test_choices_and_confirmations_have_no_replicate_in_common() -> None:
-    how = SuggestionOptions(estimation_replicates=4, confirmation_replicates=8)
-    ranges = [estimation_replicates(how), confirmation_replicates(how), confirmation_replicates(how, 1)]
-    assert [list(one)[:: len(one) - 1] for one in ranges] == [[0, 3], [4, 11], [12, 19]]
+    for estimation, evaluation in ((4, EvaluationOptions()), (10, EvaluationOptions(replicates=2))):
+        how = SuggestionOptions(estimation_replicates=estimation)
+        confirmations = [confirmation_replicates(how, evaluation, turn) for turn in (0, 1)]
+        assert [len(one) for one in confirmations] == [8, 8]
+        used = [number for one in confirmations for number in one]
+        chosen_from = {*estimation_replicates(how), *range(evaluation.replicates)}
+        assert len({*used, *chosen_from}) == len(used) + len(chosen_from)
     for count in (1, 2):
         with pytest.raises(ValidationError, match="have no interval; choose at least 3, or 0"):
             SuggestionOptions(confirmation_replicates=count)
@@ -82,14 +98,59 @@ def test_only_steps_whose_gain_is_confirmed_in_other_replicates_are_made(confirm
     assert {source for step in confirmed.steps for source in step.sources} & set(TURNS), "turns help where turns lack"
     for step in confirmed.steps[1:]:
         assert step.confirmed is not None
-        assert step.confirmed.improves(1)
+        assert step.confirmed.improves
     assert confirmed.ended == "not confirmed"
     for one in confirmed.unconfirmed:
         assert one.estimated_gain > 0.0
-        assert not one.effect.improves(len(confirmed.unconfirmed))
+        assert not one.effect.improves
     assert confirmed.unconfirmed
     assert confirmed.total is not None
     assert confirmed.total.objective.change < 0.0
+
+
+def test_the_effect_of_a_refused_step_has_the_probability_by_which_it_was_refused(
+    pool: MatchingDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raw = paired_change("objective", np.zeros((1, 4)), np.array([[-1.0, -2.0, -3.0, -1.0]]))
+    assert raw.p is not None
+    assert raw.p <= 0.05 < CONFIRMED_AT_ONCE * raw.p
+    monkeypatch.setattr(searching, "effect_of", lambda *_sides, **_options: Effect(raw, {"offset_mean": raw}))
+    once = Resimulation(pool, OPTIONS)
+    aim = OptimisationOptions(objective=ObjectiveOptions(seconds=1.0), max_steps=1)
+    found = searching.optimise(once, aim, confirming=once, absent=once.sources.keys() - once.needed())
+    assert len(found.unconfirmed) == CONFIRMED_AT_ONCE
+    for one in found.unconfirmed:
+        for change in (one.effect.objective, one.effect.headlines["offset_mean"]):
+            assert change.p == pytest.approx(CONFIRMED_AT_ONCE * raw.p)
+            assert change.verdict == "unclear"
+
+
+def test_a_step_that_changes_a_trial_in_anything_is_not_certain(
+    pool: MatchingDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved = paired_change("objective", np.ones((1, 3)), np.full((1, 3), 0.9))
+    monkeypatch.setattr(searching, "effect_of", lambda *_sides, **_options: Effect(saved, {}))
+    once = Resimulation(pool, OPTIONS)
+    aim = OptimisationOptions(objective=ObjectiveOptions(seconds=0.01), max_steps=1, consider=2)
+    step = searching.optimise(once, aim, confirming=once).steps[-1]
+    assert (step.sources, step.changed_trials) == (UNWANTED, 0), "the effect alone would not confirm it"
+    results = Resimulation.results
+
+    def slightly_changed(self: Resimulation, removed: Collection[str] = NONE) -> tuple[TrialResult, ...]:
+        first, *others = results(self, removed)
+        metrics = {**first.metrics, "heading_rms_deg": float(len(removed))}
+        return replace(first, metrics=metrics), *others
+
+    monkeypatch.setattr(Resimulation, "results", slightly_changed)
+    found = searching.optimise(once, aim, confirming=once)
+    assert (found.ended, len(found.steps)) == ("not confirmed", 1)
+
+
+def test_an_optimisation_needs_seven_replicates_to_confirm_equal_changes() -> None:
+    needed = next(count for count in range(3, 65) if CONFIRMED_AT_ONCE * probability(np.full(count, -1.0)) <= 0.05)
+    described = OptimisationOptions.model_fields["confirmation_replicates"].description
+    assert described is not None
+    assert f"With 3 to {needed - 1}, an optimisation confirms no step whose effect is equal" in described
 
 
 def test_the_best_weight_of_a_group_is_confirmed_and_corrected_for_the_number_of_groups() -> None:

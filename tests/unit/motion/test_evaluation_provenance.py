@@ -6,7 +6,7 @@ import pytest
 from tests.support.evaluation_cases import arc, root_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.provenance import provenance_of, require_comparable
+from marey_motion.evaluation.provenance import _CONDITION_OF, provenance_of, require_comparable
 from marey_motion.evaluation.result import Provenance
 from marey_motion.evaluation.scenario import suite_trials
 from marey_schemas.options.evaluation import EvaluationOptions
@@ -88,3 +88,11 @@ def test_all_that_differs_is_named_at_once() -> None:
 @pytest.mark.parametrize("options", [OPTIONS.replace(coverage_least_s=5.0), OPTIONS.replace(literal_formulas=True)])
 def test_other_data_and_what_no_trial_depends_on_may_differ(options: EvaluationOptions) -> None:
     require_comparable(traced(LEFT), traced(RIGHT, options=options))
+
+
+def test_every_option_belongs_to_a_condition_of_comparisons_or_is_known_to_change_no_compared_number() -> None:
+    without_condition = {"coverage_least_s", "literal_formulas"}
+    assert _CONDITION_OF.keys() | without_condition == EvaluationOptions.model_fields.keys()
+    assert not _CONDITION_OF.keys() & without_condition
+    for other in (OPTIONS.replace(coverage_least_s=2.0), OPTIONS.replace(literal_formulas=True)):
+        require_comparable(traced(LEFT), traced(LEFT, options=other))

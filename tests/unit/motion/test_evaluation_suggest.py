@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import stdtr, stdtrit
 from tests.support.compared_evaluations import compare_results
 from tests.support.suggestion_cases import (
     OPTIONS,
@@ -19,7 +20,7 @@ from tests.support.suggestion_cases import (
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.compare import OBJECTIVE, paired_change
+from marey_motion.evaluation.compare import OBJECTIVE, MetricChange, corrected_family, paired_change
 from marey_motion.evaluation.improvement.effects import Effect
 from marey_motion.evaluation.improvement.filling import FilledCell, Filling
 from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means
@@ -88,6 +89,27 @@ def test_effects_are_confirmed_in_other_replicates_or_said_not_to_be(found: Sugg
     assert tree["unused"]["confirmed_clips"]["reason"].startswith("Without all of them, in other replicates, ")
     assert tree["unused"]["confirmed_ranges"]["objective"]["replicates"] == 3
     assert tree["chance"]["offset_mean"] > 0.0
+
+
+def test_all_confirmed_effects_are_one_family_in_each_metric(found: Suggestions) -> None:
+    assert found.confirmed is not None
+    steps = [*(step.confirmed for step in found.plan), *(step.confirmed for step in found.additions)]
+    effects = [one for one in (found.confirmed.unused, found.confirmed.ranges, *steps) if one is not None]
+    assert len(effects) == 6
+    for name in HEADLINES:
+        changes = [effect.headlines[name] for effect in effects]
+        single = [replace(one, p=_single_probability(one)) for one in changes]
+        assert [one.p for one in changes] == pytest.approx([one.p for one in corrected_family(single)])
+
+
+def _single_probability(one: MetricChange) -> float | None:
+    """Compute the uncorrected probability of a change from its interval, which is not corrected."""
+    if one.p is None or one.low is None or one.high is None:
+        return None
+    if one.high == one.low:
+        return float(2.0 ** (1 - one.replicates))
+    spread = (one.high - one.low) / 2 / stdtrit(one.replicates - 1, 0.975)
+    return float(2 * stdtr(one.replicates - 1, -abs(one.change) / spread))
 
 
 def test_what_another_replicate_shows_is_not_called_unused(database: MatchingDatabase) -> None:
@@ -237,8 +259,14 @@ def bandai(mocap: Path) -> tuple[MatchingDatabase, MatchingDatabase]:
 
     Both databases use the body of the first collection.
     """
+
+    def source(path: Path) -> SourceClip:
+        motion = read_motion(path.read_bytes(), path.name)
+        assert motion.clip is not None
+        return SourceClip(path.stem, path.stem, motion.clip)
+
     straight, turns = (
-        [SourceClip(path.stem, path.stem, read_motion(path.read_bytes(), path.name).clip) for path in paths]
+        [source(path) for path in paths]
         for paths in (
             sorted((mocap / "bandai-namco-1").glob("*.bvh")),
             sorted((mocap / "bandai-namco-2").glob("*turn*.bvh")),

@@ -11,7 +11,9 @@ import pytest
 from tests.support.suggestion_cases import OPTIONS, evaluated
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement import sweep
 from marey_motion.evaluation.improvement.objective import objective_value
+from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.sweep import (
     GROUPS,
     SweepRow,
@@ -73,6 +75,20 @@ def test_each_row_of_a_sweep_is_an_evaluation_with_these_weights(database: Match
         assert row.metrics == pooled_metrics(result.trials)
         assert row.objective == objective_value(ObjectiveOptions(), result.trials, 0.0)
     assert rows[0].objective != rows[1].objective
+
+
+def test_a_sweep_without_confirmations_builds_no_simulation_for_them(
+    database: MatchingDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built = []
+
+    def build(*given: Any, replicates: range, **options: Any) -> Resimulation:
+        built.append(replicates)
+        return Resimulation(*given, replicates=replicates, **options)
+
+    monkeypatch.setattr(sweep, "Resimulation", build)
+    (row,) = sweep_weights(database, OPTIONS, [OTHER], how=ONCE)
+    assert (row.confirming, built) == ((), [range(1)])
 
 
 def test_each_group_is_varied_alone() -> None:

@@ -11,7 +11,7 @@ from marey_motion.evaluation.improvement.suggestion_documents import comparison_
 from marey_motion.evaluation.result import EvaluationResult
 from marey_reports.evaluation.page import render_comparison
 from marey_reports.evaluation.several import render_several
-from marey_schemas.documents.evaluations import MOST_COMPARED
+from marey_schemas.documents.evaluations import MOST_EVALUATIONS_COMPARED
 from marey_schemas.queue.job_params import CompareParams
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
@@ -26,9 +26,10 @@ def run(context: Context, params: CompareParams) -> dict[str, Any]:
     evaluation. Raises `JobRefused` if normalisers, options or scenarios differ, or if there are too many evaluations.
     """
     pins = (*context.inputs["before"], *context.inputs["after"], *context.inputs.get("others", ()))
-    if len(pins) > MOST_COMPARED:
+    if len(pins) > MOST_EVALUATIONS_COMPARED:
         raise JobRefused(
-            "too-many-evaluations", f"{len(pins)} evaluations cannot be compared at once; choose up to {MOST_COMPARED}"
+            "too-many-evaluations",
+            f"{len(pins)} evaluations cannot be compared at once; choose up to {MOST_EVALUATIONS_COMPARED}",
         )
     results = []
     for done, pin in enumerate(pins):

@@ -101,10 +101,9 @@ def _confirming(
     context: Context, params: OptimiseParams, evaluated: EvaluatedSet, database: MatchingDatabase
 ) -> list[Resimulation]:
     """Return simulations to confirm single steps and all steps together; none if the parameters ask for none."""
-    return [
-        _simulation(context, evaluated, database, confirmation_replicates(params, turn), params.confirmation_seed)
-        for turn in range(2 if params.confirmation_replicates else 0)
-    ]
+    turns = range(2 if params.confirmation_replicates else 0)
+    replicates = [confirmation_replicates(params, evaluated.result.options, turn) for turn in turns]
+    return [_simulation(context, evaluated, database, numbers, params.confirmation_seed) for numbers in replicates]
 
 
 def _log_end(context: Context, found: Optimisation, names: dict[str, str]) -> None:

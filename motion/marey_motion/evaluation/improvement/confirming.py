@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TypeVar
@@ -31,6 +31,8 @@ ProgressCallback = Callable[[int, int, str], None]
 @dataclass(frozen=True)
 class Confirmed:
     """Effects that were measured in replicates without a part in the choice of the suggestions.
+
+    The probabilities of each metric are corrected for the number of all these effects together; intervals are not.
 
     Parameters
     ----------
@@ -98,7 +100,7 @@ def confirm(
             of,
             result.options,
             trials=[one.trial for one in result.trials],
-            replicates=confirmation_replicates(how),
+            replicates=confirmation_replicates(how, result.options),
             seed=how.confirmation_seed,
             threads=threads,
             progress=stages.within,
@@ -108,18 +110,23 @@ def confirm(
     confirming = simulation(_with_added(database, simulated, collections))
     outside = frozenset(confirming.sources.keys() - clips_by_source(database.clips).keys())
     gone = outside | {clip.source for clip in unused.clips}
-    added = _addition_effects(confirming, how, simulated, outside, stages)
+    found = _addition_effects(confirming, how, simulated, outside, stages)
     whole = stages.next(confirming.by_replicate(outside))
-    ranges = None
     if unused.ranges:
         cut = simulation(without_rows(database, unused.rows))
-        ranges = stages.next(effect_between(how.objective, whole, cut.by_replicate()))
+        found.append(stages.next(effect_between(how.objective, whole, cut.by_replicate())))
+    if unused.clips:
+        found.append(stages.next(effect_of(confirming, how.objective, outside, gone)))
+    found += _plan_effects(confirming, how, plan, gone, stages)
+    # All effects are reported together, so they are one family. They are taken from it in the order of measurement.
+    effects = iter(corrected_effects(found))
+    added = _with_effects(simulated, effects)
     return Confirmed(
         chance=chance_of(confirming, outside),
-        unused=stages.next(effect_of(confirming, how.objective, outside, gone)) if unused.clips else None,
-        ranges=ranges,
-        plan=_with_effects(plan, _plan_effects(confirming, how, plan, gone, stages)),
-        additions=(*_with_effects(simulated, added), *(step for step in additions if step not in simulated)),
+        ranges=next(effects) if unused.ranges else None,
+        unused=next(effects) if unused.clips else None,
+        plan=_with_effects(plan, effects),
+        additions=(*added, *(step for step in additions if step not in simulated)),
     )
 
 
@@ -128,16 +135,16 @@ class _Stages:
 
     def __init__(self, count: int, progress: ProgressCallback | None) -> None:
         self._count, self._ended = count, 0
-        self._tell = progress or (lambda _done, _total, _note: None)
+        self._report = progress or (lambda _done, _total, _note: None)
 
     def within(self, done: int, total: int, note: str) -> None:
         """Report the progress of the current simulation."""
-        self._tell(1000 * self._ended + 1000 * done // max(total, 1), 1000 * self._count, note)
+        self._report(1000 * self._ended + 1000 * done // max(total, 1), 1000 * self._count, note)
 
     def next(self, found: Value) -> Value:
         """Report the end of the current simulation; return what it found."""
         self._ended += 1
-        self._tell(1000 * self._ended, 1000 * self._count, "")
+        self._report(1000 * self._ended, 1000 * self._count, "")
         return found
 
 
@@ -160,28 +167,29 @@ def _with_added(
 
 def _addition_effects(
     confirming: Resimulation, how: SuggestionOptions, steps: Sequence[Addition], outside: Sources, stages: _Stages
-) -> tuple[Effect, ...]:
-    """Measure the effect of each addition; `outside` are the sources of all additions."""
+) -> list[Effect]:
+    """Measure the effect of each addition, not corrected; `outside` are the sources of all additions."""
     states = [outside]
     for step in steps:
         states.append(states[-1] - {step.filling.source})
     # The set with all additions comes first: what needs none of them is then not simulated again without them.
     for absent in reversed(states[1:]):
         stages.next(confirming.outcomes(absent))
-    return corrected_effects([stages.next(effect_of(confirming, how.objective, *pair)) for pair in pairwise(states)])
+    return [stages.next(effect_of(confirming, how.objective, *pair)) for pair in pairwise(states)]
 
 
 def _plan_effects(
     confirming: Resimulation, how: SuggestionOptions, plan: Sequence[PlannedRemoval], gone: Sources, stages: _Stages
-) -> tuple[Effect, ...]:
-    """Measure the effect of each removal of a plan; `gone` are the sources that are absent before the first."""
+) -> list[Effect]:
+    """Measure the effect of each removal of a plan, not corrected; `gone` are the sources absent before the first."""
     effects = []
     for step in plan:
         after = gone | {step.removal.source}
         effects.append(stages.next(effect_of(confirming, how.objective, gone, after)))
         gone = after
-    return corrected_effects(effects)
+    return effects
 
 
-def _with_effects(steps: Sequence[Step], effects: Sequence[Effect]) -> tuple[Step, ...]:
-    return tuple(replace(step, confirmed=effect) for step, effect in zip(steps, effects, strict=True))
+def _with_effects(steps: Sequence[Step], effects: Iterator[Effect]) -> tuple[Step, ...]:
+    """Return the steps with the next effects, one for each."""
+    return tuple(replace(step, confirmed=next(effects)) for step in steps)

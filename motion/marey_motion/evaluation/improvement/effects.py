@@ -15,7 +15,7 @@ from marey_motion.evaluation.compare import OBJECTIVE, MetricChange, corrected_f
 from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, objective_value
 from marey_motion.evaluation.improvement.resimulation import Resimulation, Sources
 from marey_motion.evaluation.result import TrialResult
-from marey_schemas.documents.evaluations import CONFIDENCE
+from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.improvement import ConfirmedEffects, ObjectiveOptions
 
 Replicates = Sequence[Sequence[TrialResult]]
@@ -37,23 +37,9 @@ class Effect:
     headlines: Mapping[str, MetricChange]
 
     @property
-    def nothing(self) -> bool:
-        """Whether no headline metric changed in any replicate."""
-        return all(change.verdict == "same" for change in self.headlines.values())
-
-    def improves(self, tried: int) -> bool:
-        """Check whether the objective falls by more than chance explains.
-
-        Parameters
-        ----------
-        tried : int    number of effects that were tested together with this one
-
-        Returns
-        -------
-        bool    False, too, if there are too few replicates to know
-        """
-        p = self.objective.p
-        return self.objective.change < 0.0 and p is not None and p * tried <= 1.0 - CONFIDENCE
+    def improves(self) -> bool:
+        """Whether the objective falls by more than chance explains; False, too, if there are too few replicates."""
+        return self.objective.verdict == "better"
 
 
 def estimation_replicates(options: ConfirmedEffects) -> range:
@@ -70,19 +56,23 @@ def estimation_replicates(options: ConfirmedEffects) -> range:
     return range(options.estimation_replicates)
 
 
-def confirmation_replicates(options: ConfirmedEffects, turn: int = 0) -> range:
+def confirmation_replicates(options: ConfirmedEffects, evaluation: EvaluationOptions, turn: int = 0) -> range:
     """Return the numbers of the replicates in which effects are confirmed; they had no part in any choice.
+
+    All replicates of the evaluation have a part in choices, because unused clips are those that none of them shows.
 
     Parameters
     ----------
     options : ConfirmedEffects    how many
+    evaluation : EvaluationOptions    options of the evaluation whose set is improved
     turn : int    0 for the first confirmation, 1 for one in yet other replicates
 
     Returns
     -------
-    range    numbers that are not among the estimating ones
+    range    numbers that neither the estimate nor the evaluation uses, whatever the seeds are
     """
-    first = options.estimation_replicates + turn * options.confirmation_replicates
+    chosen_from = max(options.estimation_replicates, evaluation.replicates)
+    first = chosen_from + turn * options.confirmation_replicates
     return range(first, first + options.confirmation_replicates)
 
 
@@ -150,6 +140,26 @@ def corrected_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
         replace(effect, objective=objectives[place], headlines={name: headlines[name][place] for name in HEADLINES})
         for place, effect in enumerate(effects)
     )
+
+
+def corrected_for(effect: Effect, tried: int) -> Effect:
+    """Correct the probabilities of one of several effects that are tested one after another until one is confirmed.
+
+    Parameters
+    ----------
+    effect : Effect    with uncorrected probabilities
+    tried : int    number of effects that may be tested
+
+    Returns
+    -------
+    Effect    with all probabilities times this number, at most 1; intervals stay those of a single effect
+    """
+
+    def raised(change: MetricChange) -> MetricChange:
+        return change if change.p is None else replace(change, p=min(1.0, tried * change.p))
+
+    headlines = {name: raised(change) for name, change in effect.headlines.items()}
+    return replace(effect, objective=raised(effect.objective), headlines=headlines)
 
 
 def chance_of(simulation: Resimulation, removed: Sources) -> dict[str, float]:

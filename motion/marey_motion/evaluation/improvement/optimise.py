@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.effects import Effect, effect_of
+from marey_motion.evaluation.improvement.effects import Effect, corrected_for, effect_of
 from marey_motion.evaluation.improvement.filling import source_seconds
 from marey_motion.evaluation.improvement.objective import headline_means, objective_value
 from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation, Sources
@@ -46,7 +46,8 @@ class OptimisationStep:
     data_s : seconds of data after the step
     evaluations : number of candidates tried, over all steps so far
     changed_trials : trials whose result the step changes, in any replicate of the estimate
-    confirmed : effect of the step in other replicates; None if it was not confirmed, and for the start
+    confirmed : effect of the step in other replicates, its probabilities corrected for the number of candidates that
+        could be confirmed; None if no step is confirmed, and for the start
     """
 
     number: int
@@ -63,7 +64,11 @@ class OptimisationStep:
 
 @dataclass(frozen=True)
 class Unconfirmed:
-    """A candidate of a step whose estimated gain was not confirmed in other replicates, so that it was not applied."""
+    """A candidate of a step whose estimated gain was not confirmed in other replicates, so that it was not applied.
+
+    The probabilities of `effect` are corrected for the number of candidates of the step that could be confirmed; its
+    interval is not. So a refused effect can have an interval without 0.
+    """
 
     action: Action
     sources: tuple[str, ...]
@@ -245,10 +250,8 @@ class _Search:
 
     def _first_confirmed(self, last: OptimisationStep, best: Sequence[_Candidate]) -> OptimisationStep | None:
         for one in best:
-            effect = self._confirm(frozenset(last.absent), one)
-            # What changes no trial and saves data is a gain without any chance in it.
-            certain = effect is not None and effect.nothing and effect.objective.change < 0.0
-            if effect is None or certain or effect.improves(len(best)):
+            effect = self._confirm(frozenset(last.absent), one, len(best))
+            if effect is None or effect.improves or self._is_certain(frozenset(last.absent), one, effect):
                 return self._made(last, one, effect)
             self.refused.append(Unconfirmed(one.action, one.sources, one.gain, effect))
         return None
@@ -263,10 +266,19 @@ class _Search:
             confirmed=effect,
         )
 
-    def _confirm(self, before: Sources, one: _Candidate) -> Effect | None:
+    def _confirm(self, before: Sources, one: _Candidate, tried: int) -> Effect | None:
         if self._confirming is None:
             return None
-        return effect_of(self._confirming, self._options.objective, before, one.absent, with_data=True)
+        effect = effect_of(self._confirming, self._options.objective, before, one.absent, with_data=True)
+        return corrected_for(effect, tried)
+
+    def _is_certain(self, before: Sources, one: _Candidate, effect: Effect) -> bool:
+        """Check whether a candidate saves data and changes no metric of any trial, so that its gain has no chance."""
+        return effect.objective.change < 0.0 and all(
+            simulation.results(before) == simulation.results(one.absent)
+            for simulation in (self._simulation, self._confirming)
+            if simulation is not None
+        )
 
     def _candidates(self, absent: Sources) -> list[tuple[Action, tuple[str, ...], Sources]]:
         simulation = self._simulation

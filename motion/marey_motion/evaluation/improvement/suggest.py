@@ -269,7 +269,7 @@ class _SuggestionStages:
     NAMES = ("duplicates", "similarity", "filling", "lost poses", "leaving out", "planning", "confirming")
 
     def __init__(self, progress: ProgressCallback | None, cancelled: CancelCallback | None) -> None:
-        self._tell = progress or (lambda _done, _total, _note: None)
+        self._report = progress or (lambda _done, _total, _note: None)
         self._cancelled = cancelled
 
     def within(self, stage: str) -> ProgressCallback:
@@ -277,7 +277,7 @@ class _SuggestionStages:
         before = 1000 * self.NAMES.index(stage)
 
         def report(done: int, total: int, note: str) -> None:
-            self._tell(before + 1000 * done // max(total, 1), 1000 * len(self.NAMES), f"{stage}: {note}")
+            self._report(before + 1000 * done // max(total, 1), 1000 * len(self.NAMES), f"{stage}: {note}")
 
         return report
 

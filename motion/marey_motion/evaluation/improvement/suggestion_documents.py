@@ -146,15 +146,15 @@ def _identity_to_tree(metric: MetricDocument | None) -> Tree:
 def _redundant_to_tree(suggestions: Suggestions) -> Tree:
     trials = len(suggestions.result.trials)
 
-    def told(removal: Removal, confirmed: Effect | None = None) -> Tree:
+    def reason_for(removal: Removal, confirmed: Effect | None = None) -> Tree:
         return {"reason": reasons.why_redundant(removal, trials, confirmed)}
 
     return {
         "tried": suggestions.tried[0],
         "needed": suggestions.tried[1],
-        "clips": [{**_removal_to_tree(removal), **told(removal)} for removal in suggestions.redundant],
+        "clips": [{**_removal_to_tree(removal), **reason_for(removal)} for removal in suggestions.redundant],
         "plan": [
-            {**_plain(step), "removal": _removal_to_tree(step.removal), **told(step.removal, step.confirmed)}
+            {**_plain(step), "removal": _removal_to_tree(step.removal), **reason_for(step.removal, step.confirmed)}
             for step in suggestions.plan
         ],
         **_identity_to_tree(suggestions.metric),

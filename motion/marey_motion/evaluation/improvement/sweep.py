@@ -102,7 +102,8 @@ def sweep_weights(
 ) -> tuple[SweepRow, ...]:
     """Run the suite with each setting of the weights; the features and their standard deviations stay the same.
 
-    Progress counts runs of trials over all settings.
+    Each setting also runs in the replicates of the confirmation, because the best settings are known only when all have
+    ended, which may be in other tasks. Progress counts runs of trials over all settings.
 
     Parameters
     ----------
@@ -125,13 +126,15 @@ def sweep_weights(
     EvaluationCancelled    if cancelled
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
-    parts = (estimation_replicates(how), None), (confirmation_replicates(how), how.confirmation_seed)
+    parts = [(estimation_replicates(how), options.seed)]
+    if how.confirmation_replicates:
+        parts.append((confirmation_replicates(how, options), how.confirmation_seed))
     runs = len(settings) * len(wanted) * sum(len(numbers) for numbers, _ in parts)
     ended, report = count(1), progress or (lambda _done, _total, _note: None)
     rows = []
     for weights in settings:
         weighted = reweighted(database, weights)
-        estimating, confirming = (
+        estimating, *confirming = (
             Resimulation(
                 weighted,
                 options,
@@ -147,7 +150,7 @@ def sweep_weights(
         results = [one for replicate in estimating for one in replicate]
         # The price of data is the same for all settings, and left out.
         value = objective_value(how.objective, results, 0.0)
-        again = tuple(objective_value(how.objective, one, 0.0) for one in confirming)
+        again = tuple(objective_value(how.objective, one, 0.0) for part in confirming for one in part)
         rows.append(SweepRow(weights, pooled_metrics(results), headline_means(results), value, again))
     return tuple(rows)
 
@@ -212,8 +215,8 @@ def group_influences(rows: Sequence[SweepRow]) -> tuple[Influence, ...]:
                     confirmed=_confirmed(rows[0], best),
                 )
             )
-    told = iter(corrected_family([one.confirmed for one in found if one.confirmed is not None]))
-    found = [one if one.confirmed is None else replace(one, confirmed=next(told)) for one in found]
+    changes = iter(corrected_family([one.confirmed for one in found if one.confirmed is not None]))
+    found = [one if one.confirmed is None else replace(one, confirmed=next(changes)) for one in found]
     return tuple(sorted(found, key=lambda influence: (-influence.spread, influence.group)))
 
 
