@@ -102,7 +102,8 @@ def joint_axes(
 def merge(
     context: typer.Context,
     places: Annotated[
-        list[str], typer.Argument(help="A project, or skeletons of one rig: project/folder/name, or project/id.")
+        list[str],
+        typer.Argument(help="A project, or several skeletons of one rig: project/folder/name, or project/id."),
     ],
     keep: Annotated[
         str | None, typer.Option(help="The skeleton that remains: project/folder/name, or project/id.")
@@ -123,6 +124,11 @@ def merge(
     with connect(context) as marey:
         project = marey.project(addresses[0].project)
         found = [require_item(marey, one, [Kind.SKELETON]) for one in addresses if one.path]
+        if addresses[0].path and len({one.id for one in found}) == 1:
+            raise WrongUsage(
+                f"{places[0]} alone has nothing to be merged with; name the other skeletons of the rig, too, or merge "
+                f"all of them into this one: marey skeleton merge {addresses[0].project} --keep {places[0]}"
+            )
         kept = found.pop() if keep else None
         answer = project.merge_skeletons(found, keep=kept, dry_run=dry_run)
     if as_json:

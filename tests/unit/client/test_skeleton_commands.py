@@ -1,7 +1,13 @@
 """Command `skeleton map`: assignments of joints, as people type them."""
 
-import pytest
+from __future__ import annotations
 
+from types import SimpleNamespace
+
+import pytest
+from tests.support.command_line import run_here
+
+from marey_client.cli import skeletons
 from marey_client.cli.skeletons import _assigned
 from marey_client.cli.terminal.failures import WrongUsage
 
@@ -28,3 +34,22 @@ def test_a_typing_error_is_answered_with_the_nearest_name(assignment: str, told:
 
 def test_a_name_that_is_not_standard_can_be_cleared() -> None:
     assert _assigned(["leftankle="], KNOWN, MAPPED) == {"leftankle": ""}
+
+
+def test_one_skeleton_alone_is_not_merged(monkeypatch: pytest.MonkeyPatch) -> None:
+    class NoServer:
+        def __enter__(self) -> NoServer:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def project(self, _: str) -> None:
+            pass
+
+    monkeypatch.setattr(skeletons, "connect", lambda context: NoServer())
+    monkeypatch.setattr(skeletons, "require_item", lambda *_: SimpleNamespace(id="skeleton_b"))
+    for words in (["lab/b"], ["lab/b", "lab/b"], ["lab/b", "--keep", "lab/b"]):
+        done = run_here(["skeleton", "merge", *words])
+        assert done.returncode == 2
+        assert "marey skeleton merge lab --keep lab/b" in done.stderr

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,12 +31,20 @@ def add_to(_app: typer.Typer) -> None:
 
 @dataclass(frozen=True)
 class _Row:
-    """A user to create, and the project that the user joins, if any."""
+    """A row of the table: a user, and the project that the user joins, if any. What its cells leave open is None."""
 
     line: int
-    user: UserCreate
+    name: str
+    display_name: str | None
+    administrator: bool | None
     project: str | None
     role: Role | None
+
+    @property
+    def told(self) -> list[tuple[str, object]]:
+        """Statements of the row about the user, by name; None: not stated. Rows of one user must not contradict."""
+        joined = [(f"role in {self.project}", str(self.role))] if self.project else []
+        return [("display_name", self.display_name), ("administrator", self.administrator), *joined]
 
 
 def import_users(
@@ -49,38 +57,79 @@ def import_users(
         ),
     ],
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check the file, and create nothing.")] = False,
+    change_roles: Annotated[
+        bool, typer.Option("--change-roles", help="Also give existing members the roles in the file.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Create the users in a CSV file, and add them to projects.
 
     The users have no password: they sign in with an identity provider, or after `marey user password NAME`. Users that
-    exist are left as they are, but join the projects. If a row is wrong, nothing is created. Repeating the command
-    continues where it was interrupted.
+    exist are left as they are, but join the projects. If a row is wrong, contradicts another row, or would change the
+    role of a member, nothing is created; `--change-roles` changes such roles. Repeating the command continues where it
+    was interrupted.
     """
     rows = _read(table)
     with connect(context) as marey:
         known = {one.name for one in marey.users.list()}
-        for project in sorted({row.project for row in rows if row.project}):
-            marey.project(project).read()  # a missing project is an error before anybody is created
-        created = list(dict.fromkeys(row.user.name for row in rows if row.user.name not in known))
-        joined = [(row.user.name, row.project, row.role) for row in rows if row.project and row.role]
+        joining = _joining(marey, rows, table, change_roles=change_roles)  # errors come before anybody is created
+        created = [one for one in _users(rows) if one.name not in known]
         if not dry_run:
-            _store(marey, rows, set(created))
+            for one in created:
+                marey.users.create(one)
+            for row, project, role in joining:
+                marey.project(project).members.put(row.name, role)
     if as_json:
-        return print_json({"created": created, "joined": joined, "dry_run": dry_run})
+        joined = [(row.name, project, role) for row, project, role in joining]
+        return print_json({"created": [one.name for one in created], "joined": joined, "dry_run": dry_run})
     done = "would be created" if dry_run else "created"
-    existing = len({row.user.name for row in rows}) - len(created)
-    print_message(f"{counted(len(created), 'user')} {done}, {existing} existed; {counted(len(joined), 'membership')}")
+    existing = len({row.name for row in rows}) - len(created)
+    print_message(f"{counted(len(created), 'user')} {done}, {existing} existed; {counted(len(joining), 'membership')}")
     return None
 
 
-def _store(marey: Marey, rows: Sequence[_Row], new: set[str]) -> None:
+def _users(rows: Sequence[_Row]) -> list[UserCreate]:
+    """Return the users of a table, each with what any of its rows says."""
+    from marey_schemas.access import UserCreate
+
+    by_name: dict[str, list[_Row]] = {}
     for row in rows:
-        if row.user.name in new:
-            marey.users.create(row.user)
-            new.remove(row.user.name)
-        if row.project and row.role:
-            marey.project(row.project).members.put(row.user.name, row.role)
+        by_name.setdefault(row.name, []).append(row)
+    return [
+        UserCreate(
+            name=name,
+            display_name=next((row.display_name for row in own if row.display_name), None),
+            administrator=any(row.administrator for row in own),
+        )
+        for name, own in by_name.items()
+    ]
+
+
+def _joining(marey: Marey, rows: Sequence[_Row], table: Path, *, change_roles: bool) -> list[tuple[_Row, str, Role]]:
+    """Return the memberships to store: those that do not exist yet, and with `change_roles` those with another role.
+
+    Raises `WrongUsage`, which names all members whose roles would change, and `NotFound` for a missing project.
+    """
+    wanted = {(row.project, row.name): row for row in rows if row.project}
+    roles = {
+        (project, one.user): one.role
+        for project in sorted({row.project for row in rows if row.project})
+        for one in marey.project(project).members.list()
+    }
+    joining = [
+        (row, row.project, row.role)
+        for place, row in wanted.items()
+        if row.project and row.role and roles.get(place) != row.role
+    ]
+    changed = [
+        f"{table}, row {row.line}: the role of {row.name} in {project} is {roles[project, row.name]}, and would become "
+        f"{role}"
+        for row, project, role in joining
+        if (project, row.name) in roles
+    ]
+    if changed and not change_roles:
+        raise WrongUsage("\n".join([*changed, "nobody was created; `--change-roles` changes the roles of members"]))
+    return joining
 
 
 def _read(table: Path) -> list[_Row]:
@@ -96,9 +145,21 @@ def _read(table: Path) -> list[_Row]:
             found.append(_row(number, {name: (text or "").strip() for name, text in row.items()}))
         except WrongUsage as error:
             wrong.append(f"{table}, row {number}: {error}")
+    wrong += [f"{table}, {error}" for error in _contradictions(found)]
     if wrong:
         raise WrongUsage("\n".join([*wrong, "nobody was created"]))
     return found
+
+
+def _contradictions(rows: Sequence[_Row]) -> Iterator[str]:
+    """Yield what two rows say differently of one user."""
+    first: dict[tuple[str, str], tuple[int, object]] = {}
+    for row in rows:
+        for what, value in row.told:
+            if value is not None:
+                line, before = first.setdefault((row.name, what), (row.line, value))
+                if before != value:
+                    yield f"rows {line} and {row.line}: they disagree on the {what} of {row.name}"
 
 
 def _row(line: int, row: Mapping[str, str]) -> _Row:
@@ -115,10 +176,8 @@ def _row(line: int, row: Mapping[str, str]) -> _Row:
     if role is not None and role not in list(Role):
         raise WrongUsage(f"role: {role!r} must be {one_of([str(one) for one in Role])}")
     try:
-        wanted = checked(
-            UserCreate, name=row["name"], display_name=row.get("display_name") or None,
-            administrator=administrator in YES,
-        )  # fmt: skip
+        user = checked(UserCreate, name=row["name"], display_name=row.get("display_name") or None)
     except BadArgument as error:
         raise WrongUsage(str(error)) from None
-    return _Row(line, wanted, project, None if role is None else Role(role))
+    said = administrator in YES if administrator else None
+    return _Row(line, user.name, user.display_name, said, project, None if role is None else Role(role))
