@@ -7,7 +7,7 @@ import pytest
 from tests.support.scripted_server import ScriptedServer, folder
 
 from marey_client.cli.comparisons import _print_comparison, _print_several
-from marey_client.cli.improvements import OPTIMISE
+from marey_client.cli.improvements import OPTIMISE, _print_steps
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_schemas.encoding.digests import digest_of
@@ -86,6 +86,20 @@ def test_several_sets_are_printed_beside_each_other_with_their_verdicts(
     assert [request.inputs["after"], *request.inputs["others"]] == [one.as_input() for one in others[:3]]
     with pytest.raises(ValueError, match="between 2 and 8"):
         first.compare_request(*others)
+
+
+def test_a_refused_step_is_printed_with_the_probability_by_which_it_was_refused(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    change = {"change": -0.02, "low": -0.035, "high": -0.005, "p": 0.06}
+    refused = {"action": "remove", "sources": ["a"], "estimated_gain": 0.05, "effect": {"objective": change}}
+    _print_steps(
+        {"names": {"a": "walk"}, "steps": [], "unconfirmed": [refused], "ended": "not confirmed", "total": None}
+    )
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Not confirmed: remove walk seemed to change the objective by -0.0500 m; in other replicates" in printed
+    assert "-0.0200 (-0.0350 to -0.0050) m. Among several candidates, chance alone changes it so much" in printed
+    assert "with probability 0.06" in printed
 
 
 def test_weights_of_the_objective_are_read_by_name() -> None:

@@ -125,9 +125,11 @@ def test_the_group_whose_weight_changes_most_is_the_most_influential() -> None:
 
 
 def test_a_sweep_tells_its_progress_and_can_be_stopped(database: MatchingDatabase) -> None:
-    told = []
-    sweep_weights(database, OPTIONS, [FeatureWeights(), OTHER], how=ONCE, progress=lambda *step: told.append(step[:2]))
-    assert told[-1] == (12, 12)
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    reported = []
+    sweep_weights(
+        database, OPTIONS, [FeatureWeights(), OTHER], how=ONCE, progress=lambda *step: reported.append(step[:2])
+    )
+    assert reported[-1] == (12, 12)
+    assert [done for done, _ in reported] == sorted(done for done, _ in reported)
     with pytest.raises(EvaluationCancelled):
         sweep_weights(database, OPTIONS, [OTHER], how=ONCE, cancelled=lambda: True)
