@@ -19,7 +19,7 @@ from marey_server.errors import (
 )
 from marey_server.store import items, projects
 from marey_server.store.items import Draft, skeleton_merges
-from marey_server.store.items.same_rigs import RigDocument, is_same_rig
+from marey_server.store.items.same_rigs import RigDocument, first_of_rig, is_same_rig
 
 
 def rig(
@@ -149,6 +149,10 @@ def test_comparing_many_rigs_reads_each_skeleton_a_fixed_number_of_times() -> No
     rigs = [RigDocument(f"digest {n}", Body(skeleton_tree(60, bone_m=1 + n / 1000))) for n in range(20)]
     assert not any(is_same_rig(one, other, ()) for one in rigs for other in rigs if one is not other)
     assert is_same_rig(rigs[0], rigs[1], [f"j{n}" for n in range(60)])
+    for place, one in enumerate(rigs):
+        assert first_of_rig(rigs[:place], one, tuple) is None
+        assert first_of_rig(rigs, one, tuple) == place
+    assert first_of_rig(rigs[5:], rigs[0], lambda: rigs[0].names) == 0
     assert max(body.reads for one in rigs if isinstance(body := one.body, Body)) <= 4
 
 

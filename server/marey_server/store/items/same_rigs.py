@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Mapping
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -141,6 +141,22 @@ def is_same_rig(known: RigDocument, new: RigDocument, moved: Collection[str]) ->
         return True
     odd = odd_offsets(known, new)
     return odd is not None and odd.issubset(moved)
+
+
+def first_of_rig(known: Sequence[RigDocument], new: RigDocument, moved: Callable[[], Collection[str]]) -> int | None:
+    """Return the place of the skeleton in `known` that is the rig of a new one, or None; all have one structure.
+
+    Skeletons with the same offsets are preferred. `moved`, as in `is_same_rig`, is called only if there are none.
+    """
+    if not known:
+        return None
+    alike = np.all(np.abs(np.stack([rig.others for rig in known]) - new.others) <= SAME_NUMBER, axis=1)
+    odd = np.any(np.abs(np.stack([rig.offsets for rig in known]) - new.offsets) > SAME_NUMBER, axis=2)
+    equal = alike & ~odd.any(axis=1)
+    if alike.any() and not equal.any():
+        replaced = set(moved())
+        equal = alike & ~odd[:, [name not in replaced for name in new.names]].any(axis=1)
+    return int(equal.argmax()) if equal.any() else None
 
 
 def odd_offsets(known: RigDocument, new: RigDocument) -> frozenset[str] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from typing import Any
 
 from sqlalchemy import ColumnElement, and_, func, select
@@ -33,7 +33,7 @@ from marey_server.store.items.facets import repeat_facets
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import item_rows, no_item
 from marey_server.store.items.revisions import read_part_digests
-from marey_server.store.items.same_rigs import RigDocument, odd_offsets, rig_difference
+from marey_server.store.items.same_rigs import RigDocument, first_of_rig, odd_offsets, rig_difference
 from marey_server.store.items.summaries import SKELETON_PARTS
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
@@ -42,8 +42,8 @@ from marey_server.store.transaction import Transaction, in_lists
 
 Tree = dict[str, Any]
 
-_LOADED_TOGETHER = 200
-"""Number of items whose documents are loaded at once."""
+_LOADED_TOGETHER = 50
+"""Number of items whose documents are loaded at once: few, because the first often decides about a rig."""
 
 
 @dataclass
@@ -202,12 +202,13 @@ def _rigs(
     rigs: list[tuple[_Skeleton, list[_Skeleton]]] = []
     alike: defaultdict[Hashable, list[tuple[_Skeleton, list[_Skeleton]]]] = defaultdict(list)
     for one in best_first:
-        moved = _Moved(tx, project, one)
-        same = next((found for found in alike[one.rig.structure] if moved.covers(found[0])), None)
-        if same is None:
+        same_structure = alike[one.rig.structure]
+        place = first_of_rig([kept.rig for kept, _ in same_structure], one.rig, partial(_moved, tx, project, one))
+        if place is None:
             rigs.append((one, []))
-            alike[one.rig.structure].append(rigs[-1])
+            same_structure.append(rigs[-1])
         else:
+            same = same_structure[place]
             _require_same_mapping(same[0], one, request)
             one.odd = odd_offsets(same[0].rig, one.rig) or frozenset()
             same[1].append(one)
@@ -215,7 +216,7 @@ def _rigs(
         first, other = rigs[0][0], rigs[1][0]
         raise InvalidProblem(
             f"The skeletons {first.named['path']} and {other.named['path']} are not one rig: "
-            f"{rig_difference(first.rig, other.rig, _Moved(tx, project, other).joints)}. Name skeletons of one rig, or "
+            f"{rig_difference(first.rig, other.rig, _moved(tx, project, other))}. Name skeletons of one rig, or "
             "none to merge all duplicates.",
             code="other-rig",
         )
@@ -228,30 +229,19 @@ def _rigs(
     return found
 
 
-@dataclass
-class _Moved:
-    """Joints whose offsets the motions of all users of a skeleton replace, read when they are needed."""
+def _moved(tx: Transaction, project: ProjectRow, skeleton: _Skeleton) -> frozenset[str]:
+    """Return the joints whose offsets the motions of all users of a skeleton replace.
 
-    tx: Transaction
-    project: ProjectRow
-    skeleton: _Skeleton
-
-    def covers(self, kept: _Skeleton) -> bool:
-        """Return whether the skeleton is the same rig as `kept`."""
-        odd = odd_offsets(kept.rig, self.skeleton.rig)
-        return odd is not None and (not odd or odd <= self.joints)
-
-    @cached_property
-    def joints(self) -> frozenset[str]:
-        """Those joints: none if there are no users, or so many that the skeleton cannot be merged."""
-        if self.skeleton.user_count > MOST_MOVED:
-            return frozenset()
-        common: frozenset[str] | None = None
-        for user in _users(self.tx, self.project, self.skeleton.row.id, lock=False):
-            common = user.moved if common is None else common & user.moved
-            if not common:
-                break  # most motions replace no offset, so the first one decides
-        return common or frozenset()
+    They are none if there are no users, or so many that the skeleton cannot be merged.
+    """
+    if skeleton.user_count > MOST_MOVED:
+        return frozenset()
+    common: frozenset[str] | None = None
+    for user in _users(tx, project, skeleton.row.id, lock=False):
+        common = user.moved if common is None else common & user.moved
+        if not common:
+            break  # most motions replace no offset, so the first one decides
+    return common or frozenset()
 
 
 def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonMergeRequest) -> None:
