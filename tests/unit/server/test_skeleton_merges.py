@@ -7,7 +7,7 @@ import pytest
 from tests.support.store_fixtures import ALL_RIGHTS, Lab, motion_tree, skeleton_tree
 
 from marey_schemas.documents.skeleton_merges import SKELETON_MERGE, SkeletonMergeRequest
-from marey_schemas.items import ItemCreate
+from marey_schemas.items import ItemCreate, ItemRevert, PartPlace
 from marey_schemas.kinds import Kind
 from marey_server.errors import (
     ApiProblem,
@@ -92,6 +92,25 @@ def test_clips_move_to_one_skeleton_with_the_same_poses_and_nothing_becomes_stal
     assert not stale(lab, made)
     lab.write(items.put_part, "lab", Kind.CLIP, moved.id, "info", {"subject": "eve"}, expected_rev=None)
     assert stale(lab, made)
+    assert merge(lab).rigs == ()
+
+
+def test_revisions_before_a_merge_stay_readable_and_are_merged_again_if_they_come_back(lab: Lab) -> None:
+    first, second = rig(lab, "a"), rig(lab, "b", root_m=3.0)
+    lab.add_clip(first, "walk")
+    moved = lab.add_clip(second, "run", seed=7)
+    merge(lab)
+    place = PartPlace(kind=Kind.SKELETON, item=second.id, revision=1, part="hierarchy")
+    assert lab.read(items.load_parts, "lab", [place]).documents[0] is not None
+    assert lab.read(items.read_part, "lab", Kind.SKELETON, second.id, "hierarchy", revision=1).tree["joints"]
+    with pytest.raises(NotFoundProblem):
+        lab.read(items.read_part, "lab", Kind.SKELETON, second.id, "hierarchy")
+
+    lab.write(items.revert_item, "lab", Kind.CLIP, moved.id, ItemRevert(revision=1), expected_rev=None)
+    back = lab.read(items.read_item, "lab", Kind.CLIP, moved.id)
+    assert (back.revision, back.summary["skeleton"]) == (3, second.id)
+    (again,) = merge(lab).rigs
+    assert (again.kept.id, again.merged[0].id, again.merged[0].moved) == (first.id, second.id, {"clip": 1})
     assert merge(lab).rigs == ()
 
 

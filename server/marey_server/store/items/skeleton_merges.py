@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, func, select
+from sqlalchemy import ColumnElement, and_, exists, func, or_, select
 
 from marey_schemas.access import Role
 from marey_schemas.documents.skeleton_merges import (
@@ -111,7 +111,8 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
         for kept, merged in rigs:
             for one in merged:
                 _move(tx, row, one, kept)
-                delete_item(tx, project, Kind.SKELETON, one.row.id, expected_rev=None)
+                if one.row.deleted_us is None:
+                    delete_item(tx, project, Kind.SKELETON, one.row.id, expected_rev=None)
     shown = [
         MergedRig(
             kept=NamedSkeleton(**kept.named),
@@ -126,11 +127,17 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
 
 
 def _find_skeletons(tx: Transaction, project: ProjectRow, request: SkeletonMergeRequest) -> list[_Skeleton]:
-    """Return the skeletons to compare; lock their rows, so that nobody revises them before they are merged."""
+    """Return the skeletons to compare; lock their rows, so that nobody revises them before they are merged.
+
+    A deleted skeleton is compared if items use it, which an earlier version of a dataset may have brought back.
+    """
     named = {*request.skeletons, *([request.kept] if request.kept else ())}
+    user = item.alias("user")
+    is_used = exists().where(user.c.skeleton_id == item.c.id, user.c.deleted_us.is_(None))
     statement = item_rows().where(
-        item.c.project_id == project.id, item.c.kind == Kind.SKELETON.value, item.c.deleted_us.is_(None)
-    )
+        item.c.project_id == project.id, item.c.kind == Kind.SKELETON.value, item.c.purged_us.is_(None),
+        or_(item.c.deleted_us.is_(None), is_used),
+    )  # fmt: skip
     if request.skeletons:
         statement = statement.where(item.c.id.in_(sorted(named)))
     rows = tx.execute(_locked(statement, request).order_by(item.c.id).limit(MOST_RIGS_COMPARED + 1)).all()
@@ -197,8 +204,11 @@ def _rigs(
     The documents of items are read only where it depends on them whether skeletons are one rig.
     """
     best_first = sorted(
-        skeletons, key=lambda one: (one.row.id != request.kept, not one.is_edited, -one.user_count, one.row.id)
-    )
+        skeletons,
+        key=lambda one: (
+            one.row.id != request.kept, one.row.deleted_us is not None, not one.is_edited, -one.user_count, one.row.id
+        ),
+    )  # fmt: skip
     rigs: list[tuple[_Skeleton, list[_Skeleton]]] = []
     alike: defaultdict[Hashable, list[tuple[_Skeleton, list[_Skeleton]]]] = defaultdict(list)
     for one in best_first:
