@@ -1,6 +1,7 @@
 """Users from CSV files: all rows are checked before anybody is created."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -97,10 +98,25 @@ def test_the_role_of_a_member_changes_only_on_request(team: Team, tmp_path: Path
             "name,project,role\nada,lab,owner\nada,lab,reader\n",
             "rows 2 and 3: they disagree on the role in lab of ada",
         ),
-        ("name\nada,lab\n", "more cells than the file has columns"),
+        ("name\nada,lab\n", "more cells than the table has columns"),
+        ("name\n\n\nada\nBen B\n", "row 5: name: "),
+        ("name,name\nada,eve\n", "has several columns 'name'"),
     ],
 )
 def test_a_wrong_table_is_refused_with_its_row(tmp_path: Path, text: str, told: str) -> None:
     with pytest.raises(WrongUsage) as refused:
         user_tables._read(table(tmp_path, text))
     assert told in str(refused.value)
+
+
+def test_a_refused_row_is_named_with_what_is_stored(team: Team, tmp_path: Path, script: ScriptedServer) -> None:
+
+    def refuse(request: httpx.Request) -> httpx.Response:
+        if request.method == "PUT" and request.url.path.endswith("/lab/members/eve"):
+            return httpx.Response(409)
+        return team(request)
+
+    script.answers = [refuse] * 20
+    done = run_here(["user", "import", str(table(tmp_path, TABLE))])
+    assert done.returncode == 1
+    assert re.search(r"409.*team.csv, row 5; the rows before it are stored", done.stderr, re.DOTALL), done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -41,7 +42,7 @@ class _Row:
     role: Role | None
 
     @property
-    def told(self) -> list[tuple[str, object]]:
+    def statements(self) -> list[tuple[str, object]]:
         """Statements of the row about the user, by name; None: not stated. Rows of one user must not contradict."""
         joined = [(f"role in {self.project}", str(self.role))] if self.project else []
         return [("display_name", self.display_name), ("administrator", self.administrator), *joined]
@@ -66,8 +67,8 @@ def import_users(
 
     The users have no password: they sign in with an identity provider, or after `marey user password NAME`. Users that
     exist are left as they are, but join the projects. If a row is wrong, contradicts another row, or would change the
-    role of a member, nothing is created; `--change-roles` changes such roles. Repeating the command continues where it
-    was interrupted.
+    role of a member, nothing is created; `--change-roles` changes such roles. Each row is a request of its own: if the
+    server refuses one, those before it are kept, and the error names the row. Repeating the command continues there.
     """
     rows = _read(table)
     with connect(context) as marey:
@@ -78,7 +79,8 @@ def import_users(
             for one in created:
                 marey.users.create(one)
             for row, project, role in joining:
-                marey.project(project).members.put(row.name, role)
+                with _in_row(table, row):
+                    marey.project(project).members.put(row.name, role)
     if as_json:
         joined = [(row.name, project, role) for row, project, role in joining]
         return print_json({"created": [one.name for one in created], "joined": joined, "dry_run": dry_run})
@@ -86,6 +88,18 @@ def import_users(
     existing = len({row.name for row in rows}) - len(created)
     print_message(f"{counted(len(created), 'user')} {done}, {existing} existed; {counted(len(joining), 'membership')}")
     return None
+
+
+@contextmanager
+def _in_row(table: Path, row: _Row) -> Iterator[None]:
+    """Name the row of the table in an error of the `with` block."""
+    from marey_client.errors import RequestFailed
+
+    try:
+        yield
+    except RequestFailed as error:
+        error.add_note(f"{table}, row {row.line}; the rows before it are stored")
+        raise
 
 
 def _users(rows: Sequence[_Row]) -> list[UserCreate]:
@@ -135,12 +149,12 @@ def _joining(marey: Marey, rows: Sequence[_Row], table: Path, *, change_roles: b
 def _read(table: Path) -> list[_Row]:
     """Return the rows of the file. Raises `WrongUsage`, which names all wrong lines."""
     rows = rows_of(table)
-    names = [name for name in rows[0] if name]
+    names = [name for name in next(iter(rows.values())) if name]
     if "name" not in names or (unknown := [name for name in names if name not in COLUMNS]):
         odd = "has no column `name`" if "name" not in names else f"has an unknown column {unknown[0]!r}"
         raise WrongUsage(f"{table} {odd}; the columns are {', '.join(COLUMNS)}")
     found, wrong = [], []
-    for number, row in enumerate(rows, 2):
+    for number, row in rows.items():
         try:
             found.append(_row(number, {name: (text or "").strip() for name, text in row.items()}))
         except WrongUsage as error:
@@ -155,7 +169,7 @@ def _contradictions(rows: Sequence[_Row]) -> Iterator[str]:
     """Yield what two rows say differently of one user."""
     first: dict[tuple[str, str], tuple[int, object]] = {}
     for row in rows:
-        for what, value in row.told:
+        for what, value in row.statements:
             if value is not None:
                 line, before = first.setdefault((row.name, what), (row.line, value))
                 if before != value:
@@ -179,5 +193,5 @@ def _row(line: int, row: Mapping[str, str]) -> _Row:
         user = checked(UserCreate, name=row["name"], display_name=row.get("display_name") or None)
     except BadArgument as error:
         raise WrongUsage(str(error)) from None
-    said = administrator in YES if administrator else None
-    return _Row(line, user.name, user.display_name, said, project, None if role is None else Role(role))
+    stated = administrator in YES if administrator else None
+    return _Row(line, user.name, user.display_name, stated, project, None if role is None else Role(role))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from pathlib import Path
 
 from marey_client.cli.terminal.failures import WrongUsage
@@ -11,19 +12,23 @@ _BEYOND = "\0"
 """Name under which the reader stores cells beyond the columns."""
 
 
-def rows_of(table: Path) -> list[dict[str, str | None]]:
-    """Return the rows of a CSV file by the names of its columns.
+def rows_of(table: Path) -> dict[int, dict[str, str | None]]:
+    """Return the rows of a CSV file, by their numbers in a spreadsheet; each has its cells by the names of columns.
 
-    Raises `WrongUsage` if it has no rows, or a row has more cells than there are columns.
+    Raises `WrongUsage` if it has no rows, two columns of one name, or a row with more cells than there are columns.
     """
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file, strict=True, restkey=_BEYOND))
+            reader = csv.DictReader(file, strict=True, restkey=_BEYOND)
+            rows = dict((reader.line_num, row) for row in reader)  # noqa: C402 - the number grows with each row
+            names = Counter(name for name in reader.fieldnames or () if name)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise WrongUsage(f"{table} cannot be read as a CSV file: {error}") from None
     if not rows:
         raise WrongUsage(f"{table} has no rows below its column names")
-    for number, row in enumerate(rows, 2):
+    if twice := [name for name, count in names.items() if count > 1]:
+        raise WrongUsage(f"{table} has several columns {twice[0]!r}; name each column once")
+    for number, row in rows.items():
         if _BEYOND in row:
-            raise WrongUsage(f"{table}, row {number}: the row has more cells than the file has columns")
+            raise WrongUsage(f"{table}, row {number}: the row has more cells than the table has columns")
     return rows

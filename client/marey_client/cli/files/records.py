@@ -126,7 +126,9 @@ def _from_table(
 ) -> Iterator[_RecordChange]:
     """Yield the changes of a table. Raises `WrongUsage` with all wrong rows if there are any."""
     rows = rows_of(table)
-    fields = {name: columns.get(name, name.strip().lower().replace(" ", "_")) for name in rows[0] if name}
+    fields = {
+        name: columns.get(name, name.strip().lower().replace(" ", "_")) for name in next(iter(rows.values())) if name
+    }
     key = next((name for name, field in fields.items() if field in KEYS), None)
     if key is None:
         raise WrongUsage(f"{table} needs a column `clip` or `file`; its columns are {', '.join(fields)}")
@@ -143,7 +145,7 @@ def _from_table(
     known = _keyed(clips, path, fields[key])
     wrong: list[str] = []
     changes: dict[str, _RecordChange] = {}
-    for number, row in enumerate(rows, 2):
+    for number, row in rows.items():
         place = f"row {number}"
         try:
             change = _of_row(row, fields, key, known, place)
