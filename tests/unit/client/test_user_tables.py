@@ -110,7 +110,6 @@ def test_a_wrong_table_is_refused_with_its_row(tmp_path: Path, text: str, told: 
 
 
 def test_a_refused_row_is_named_with_what_is_stored(team: Team, tmp_path: Path, script: ScriptedServer) -> None:
-
     def refuse(request: httpx.Request) -> httpx.Response:
         if request.method == "PUT" and request.url.path.endswith("/lab/members/eve"):
             return httpx.Response(409)
