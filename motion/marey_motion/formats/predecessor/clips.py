@@ -67,8 +67,8 @@ def motion_of_document(
     if skeleton is None:
         raise FormatError(
             "a clip document contains no hierarchy of its joints; import it together with its skeleton document, whose "
-            "name must end in 'skeleton', such as skeleton.json or walk.skeleton, or name a skeleton of the project "
-            "with --skeleton (skeleton)",
+            "name must end in 'skeleton', such as skeleton.json (of several in a folder, the one for walk_01 is "
+            "walk_skeleton.json), or name a skeleton of the project with --skeleton (skeleton)",
             code="skeleton-missing",
             file=file,
         )
