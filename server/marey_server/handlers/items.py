@@ -138,7 +138,9 @@ class SkeletonMerges(Resource):
     path = "/projects/{project}/skeleton-merges"
     tag = "Items"
 
-    @writes(access=Access.MAINTAINER, body=SkeletonMergeRequest, answer=SkeletonMergeAnswer, idempotency="key")
+    @writes(
+        access=Access.MAINTAINER, body=SkeletonMergeRequest, answer=SkeletonMergeAnswer, idempotency="key", names=True
+    )
     async def post(self, project: str, body: SkeletonMergeRequest) -> Rendered:
         """Merge skeletons of one rig that differ only in ways that mean nothing, or preview the merge.
 
