@@ -90,7 +90,7 @@ def test_bytes_of_the_database_and_the_folder_of_blobs_shrink_after_a_purge(
     remove(owner, clips[2], rig.id)
     assert len(purge(owner, collection="").json()["purged"]) == 2
     garbage.collect_garbage(lab.database, grace_us=-1)
-    assert before - measure() > 2.5 * MOTION_BYTES
+    assert before - measure() > 2.4 * MOTION_BYTES
     assert list(fsck.check_store(lab.database)) == []
 
 

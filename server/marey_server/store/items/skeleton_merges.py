@@ -229,6 +229,7 @@ def _rigs(
             f"{rig_difference(first.rig, other.rig, _moved(tx, project, other))}. Name skeletons of one rig, or "
             "none to merge all duplicates.",
             code="other-rig",
+            unnamed="The skeletons are not one rig. Name skeletons of one rig, or none to merge all duplicates.",
         )
     found = [rig for rig in rigs if rig[1] and (request.kept in (None, rig[0].row.id))]
     if sum(one.user_count for _, merged in found for one in merged) > MOST_MOVED:
@@ -260,6 +261,7 @@ def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonM
             f"Somebody made or confirmed the joint maps of {kept.named['path']} and {merged.named['path']}, and they "
             "differ; choose the skeleton that remains with --keep (in requests: kept).",
             code="mappings-differ",
+            unnamed="Joint maps that were made or confirmed by hand differ; choose the skeleton that remains (kept).",
         )
 
 
@@ -275,6 +277,7 @@ def _move(tx: Transaction, project: ProjectRow, merged: _Skeleton, kept: _Skelet
         raise ConflictProblem(
             f"Other requests changed what uses the skeleton {merged.named['path']} at the same time; try again.",
             code="contended",
+            unnamed="Other requests changed what uses a skeleton at the same time; try again.",
         )
     _publish(tx, project, [_draft(tx, user, reference, message) for user in users])
     clips = {user.row.id: user.row.head for user in users if user.kind is Kind.CLIP}
