@@ -302,14 +302,14 @@ def _group(item: pytest.Item) -> str:
 def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
     """Return the tests in the order in which processes start them: large groups first, with fault cases in between.
 
-    Large groups that start late would run alone at the end. Fault cases mostly wait, so they are spread among tests
-    that compute.
+    Large groups that start late would run alone at the end; a whole way counts as twenty tests. Fault cases mostly
+    wait, so they are spread among tests that compute.
     """
     groups: defaultdict[str, list[pytest.Item]] = defaultdict(list)
     for item in items:
         groups[_group_of(item)].append(item)
-    computing = sorted((group for group in groups.values() if not _fault(group[0])), key=len, reverse=True)
-    waiting = [group for group in groups.values() if _fault(group[0])]
+    computing = sorted((group for group in groups.values() if not _fault(group[0])), key=_size, reverse=True)
+    waiting = sorted((group for group in groups.values() if _fault(group[0])), key=_size, reverse=True)
     total, ended = sum(map(len, computing)), 0
     placed: list[tuple[float, list[pytest.Item]]] = []
     for group in computing:
@@ -317,6 +317,10 @@ def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
         ended += len(group)
     placed += [(number / len(waiting), group) for number, group in enumerate(waiting)]
     return [item for _, group in sorted(placed, key=lambda pair: pair[0]) for item in group]
+
+
+def _size(group: Sequence[pytest.Item]) -> int:
+    return sum(20 if _whole_way(item) else 1 for item in group)
 
 
 def _group_of(item: pytest.Item) -> str:

@@ -48,8 +48,8 @@ def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, ru
     listed = run("ls", "lab/walks", "--query", "facet.usage > 0", "--columns", "facet.usage", "--sort=-facet.usage")
     shown = [float(line.split()[-1]) for line in listed.stdout.splitlines() if "walks/walk" in line]
     assert shown == pytest.approx(sorted((one.item.facets["usage"] for one in used), reverse=True), rel=1e-3)
-    shown = f"{used[0].item.facets['usage']:.6g}"
-    assert re.search(rf"facet\.usage +{re.escape(shown)}\n", run("show", f"lab/{used[0].path}").stdout)
+    usage = f"{used[0].item.facets['usage']:.6g}"
+    assert re.search(rf"facet\.usage +{re.escape(usage)}\n", run("show", f"lab/{used[0].path}").stdout)
 
     again = json.loads(run("evaluate", "lab/walks", *grid, "--json").stdout)
     assert again["evaluation"]["revision"] == 1
