@@ -27,12 +27,15 @@ from marey_schemas.processes.limits import die_with_parent
 
 FORKS = sys.platform == "linux"
 """Whether the system has what a forker needs: a process that adopts the orphans among its descendants."""
-MODULES = ("marey_worker.child", "marey_server.motions.child", "marey_server.motions.reading")
+KERNELS = "marey_server.motions.reading"
+"""Module that loads the compiled kernels."""
+MODULES = ("marey_worker.child", "marey_server.motions.child", KERNELS)
 """Modules that children run or load first."""
 LONGEST_ORDER = 1 << 16
 """Greatest size of an order, in bytes; it contains all environment variables."""
 _PR_SET_CHILD_SUBREAPER = 36
-_PID = struct.Struct("<q")
+PID = struct.Struct("<q")
+"""Form of a process id in answers to orders."""
 
 
 class ForkedChild:
@@ -79,12 +82,12 @@ class ChildForker:
             _adopt_orphans(True)
             try:
                 socket.send_fds(self._orders, [order], [descriptor])
-                answer = self._orders.recv(_PID.size)
+                answer = self._orders.recv(PID.size)
             finally:
                 _adopt_orphans(False)
         if not answer:
             raise RuntimeError("the forker has ended; the log of the program says why")
-        return ForkedChild(_PID.unpack(answer)[0])
+        return ForkedChild(PID.unpack(answer)[0])
 
 
 def fork_children() -> None:
@@ -126,7 +129,7 @@ def _serve(orders: socket.socket, parent: int) -> NoReturn:
                 os._exit(1)
             os.setsid()
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
-            orders.send(_PID.pack(os.getpid()))
+            orders.send(PID.pack(os.getpid()))
             _keep_only(*descriptors)
             _run(descriptors[0], **json.loads(order))
         os.close(descriptors[0])

@@ -25,7 +25,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from typing import BinaryIO
 
-from tests.support.forked_children import FORKS, LONGEST_ORDER, fork_children
+from tests.support.forked_children import FORKS, KERNELS, LONGEST_ORDER, PID, fork_children
 from tests.support.forked_children import MODULES as CHILDREN_RUN
 
 MODULES = (
@@ -34,7 +34,7 @@ MODULES = (
     "uvloop",
 )  # fmt: skip
 """Modules of servers, workers and their children, and those that these import when they open a database or start."""
-_PID, _STATUS = struct.Struct("<q"), struct.Struct("<i")
+_STATUS = struct.Struct("<i")
 
 
 class ForkedProgram:
@@ -134,13 +134,13 @@ class Nursery:
         try:
             with self._ordering:
                 socket.send_fds(self._orders, [order], [taken, output, ending])
-                answer = self._orders.recv(_PID.size)
+                answer = self._orders.recv(PID.size)
         finally:
             os.close(ending)
             os.close(taken)
         if not answer:
             raise RuntimeError(f"the nursery has ended with status {self._process.wait()}; its error output says why")
-        return ForkedProgram(_PID.unpack(answer)[0], ended, None if given is None else os.fdopen(given, "wb"))
+        return ForkedProgram(PID.unpack(answer)[0], ended, None if given is None else os.fdopen(given, "wb"))
 
 
 @functools.cache
@@ -157,7 +157,7 @@ def load_modules() -> None:
     with loading_modules():
         for name in MODULES:
             importlib.import_module(name)
-        importlib.import_module("marey_server.motions.reading").load_kernels()
+        importlib.import_module(KERNELS).load_kernels()
     require_one_thread()
 
 
@@ -195,7 +195,7 @@ def main() -> list[str]:
             running[pid] = ending
             os.close(taken)
             os.close(output)
-            orders.send(_PID.pack(pid))
+            orders.send(PID.pack(pid))
 
 
 def tell_statuses(running: dict[int, int]) -> None:

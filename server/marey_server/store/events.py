@@ -99,7 +99,7 @@ def list_events(
         .where(or_(placed.c.until_bytes <= PAGE_BYTES, placed.c.until_bytes == placed.c.size_bytes))
     )
     rows = tx.execute(statement.order_by(number_of(tx))).all()
-    shown = rows[:most]  # the one event more tells whether events follow the page
+    shown = rows[:most]  # one row more was read, to see whether further events exist
     return EventPage([_shown(row) for row in shown], not rows or len(shown) == rows[0].found)
 
 

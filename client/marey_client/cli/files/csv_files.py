@@ -20,7 +20,9 @@ def rows_of(table: Path) -> dict[int, dict[str, str | None]]:
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, strict=True, restkey=_BEYOND)
-            rows = dict((reader.line_num, row) for row in reader)  # noqa: C402 - the number grows with each row
+            rows = {}
+            for row in reader:
+                rows[reader.line_num] = row
             names = Counter(name for name in reader.fieldnames or () if name)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise WrongUsage(f"{table} cannot be read as a CSV file: {error}") from None
