@@ -66,6 +66,8 @@ def test_an_elbow_does_not_jump_where_the_target_passes_the_shoulder(
 
     after = _arm(made.clip)
     assert _excess(before, after, walk.frame_rate_hz) < 0.01
+    elbow_m_s = np.linalg.norm(np.diff(after[:, 1], axis=0), axis=1).max() * walk.frame_rate_hz
+    assert elbow_m_s < 6.0, "an elbow that jumps by 40 cm in a frame of these clips moves at 12 to 34 m/s"
     missed = np.linalg.norm(after[slice(*window), 2] - target, axis=1)
     assert missed.max() < 0.3
     (warning,) = (one for one in _warnings(made) if "is missed" in one)
