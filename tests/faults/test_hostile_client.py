@@ -67,7 +67,9 @@ class Attacked:
 @pytest.fixture
 def attacked(tmp_path: Path, database_url: str) -> Iterator[Attacked]:
     """A server with users, a project and jobs in a separate process, on SQLite and on Postgres."""
-    process = ServerProcess(tmp_path, database_url, **ATTACKED).start()
+    process = ServerProcess(tmp_path, database_url, **ATTACKED)
+    process.own_children = True  # forked children would count the memory that they share several times
+    process.start()
     database = Database(database_url)
     people = People(process.url, database)
     try:

@@ -220,7 +220,9 @@ def main() -> None:
     parser.add_argument("--postgres", action="store_true", help="measure on Postgres instead of SQLite")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, database_of(given.postgres) as address:
-        process = ServerProcess(Path(folder), address, **ATTACKED).start()
+        process = ServerProcess(Path(folder), address, **ATTACKED)
+        process.own_children = True
+        process.start()
         assert process.process is not None
         database = Database(address or f"sqlite:///{process.data / 'marey.db'}")
         try:

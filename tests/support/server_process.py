@@ -36,7 +36,7 @@ class MareyProcess:
     """A process with its own environment; `log` is the file of its output."""
 
     own_children = False
-    """Whether its child processes are new ones, whose arguments `/proc` shows, instead of forked ones."""
+    """Whether its child processes are new ones, which have arguments and share no memory, instead of forked ones."""
 
     def __init__(self, log: Path) -> None:
         self.log = log
