@@ -1,4 +1,4 @@
-"""Import of the predecessor's files that contain no motion: models, trees over samples of models, and graphs.
+"""Import of the predecessor's files that contain no motion: models, trees over samples of models, graphs, records.
 
 The predecessor is the system that Marey replaces; `marey_motion.formats.predecessor` reads its files.
 """
@@ -23,6 +23,7 @@ from marey_motion.importing.items import (
     main_item,
     skeleton_item,
 )
+from marey_motion.importing.records import import_record
 from marey_motion.importing.source import SourceDocument
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.primitive_documents import primitive_to_tree
@@ -46,7 +47,7 @@ _NEEDED: dict[str, str] = {
 
 
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
-    """Import a model, with its cluster tree if the file has one as a companion; or import a graph.
+    """Import a model, with its cluster tree if the file has one as a companion; or import a graph or a record.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
 
     Returns
     -------
-    ImportedFile    items, or the graph
+    ImportedFile    items, or the graph, or both
 
     Raises
     ------
@@ -72,6 +73,12 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
         read = graph_of_document(source.document, name)
         graph = ImportedGraph(file.planned.item_name, file.collection, file.options.tags, read, name, file.digest)
         return ImportedFile(name, graph=graph)
+    if source.subject == "zipped graph":
+        from marey_motion.importing.zipped_graphs import import_zipped_graph
+
+        return import_zipped_graph(file)
+    if source.subject == "record":
+        return import_record(file, source.document)
     given = None if file.skeleton is None else given_skeleton(file.skeleton)
     found = model_of_document(source.document, name, skeleton=given)
     own = found.primitive.skeleton
@@ -79,13 +86,22 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
         message = "the model has a different skeleton from the chosen one; import it without choosing a skeleton"
         raise FormatError(message, code="skeleton-mismatch", file=name)
     ref = {"output": skeleton_output(name)} if file.skeleton is None else file.skeleton.ref
-    item = main_item(file, Kind.MODEL, model_name(file.planned.item_name), _parts(file, found, ref))
+    item = main_item(file, Kind.MODEL, model_name(file.planned.item_name), _parts_of_file(file, found, ref))
     items = (item,) if given is not None else (skeleton_item(file, own), item)
-    return ImportedFile(name, items, _checks(found))
+    return ImportedFile(name, items, model_checks(found))
 
 
-def _checks(found: PredecessorModel) -> tuple[Tree, ...]:
-    """List what was changed in a model, as documents."""
+def model_checks(found: PredecessorModel) -> tuple[Tree, ...]:
+    """List what was changed in a model.
+
+    Parameters
+    ----------
+    found : PredecessorModel    the model that was read
+
+    Returns
+    -------
+    tuple of dict    warnings, as documents
+    """
     if not found.moved_keyframes:
         return ()
     labels, last = ", ".join(found.moved_keyframes), found.primitive.frame_count - 1
@@ -93,25 +109,52 @@ def _checks(found: PredecessorModel) -> tuple[Tree, ...]:
     return ({"code": "keyframes-at-end", "message": message},)
 
 
-def _parts(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[str, Tree]:
-    """Make the documents `model` and, if the companion of the file is a tree, `tree`."""
-    name = found.primitive.name or model_name(file.planned.item_name)
-    model = primitive_to_tree(replace(found.primitive, name=name), skeleton)
+def _parts_of_file(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[str, Tree]:
+    """Make the documents of a model with a file of its own; its companion may be its tree."""
+    name, companion = file.planned.name, str(file.planned.companion)
+    beside = None if file.companion is None or is_skeleton_name(companion) else bytes(file.companion)
+    tree = None if beside is None else (beside, companion)
+    parts = model_parts(found, model_name(file.planned.item_name), skeleton, name, tree)
+    known = parts["model"]["provenance"]["predecessor"]
+    known["original"] = original_of("model", parts["model"], name, file.digest)
+    if "tree" in parts and file.companion_digest is not None:
+        known["tree"] = original_of("tree", parts["tree"], companion, file.companion_digest)
+    return parts
+
+
+def model_parts(
+    found: PredecessorModel, name: str, skeleton: Tree, file: str, tree: tuple[bytes, str] | None
+) -> dict[str, Tree]:
+    """Make the documents of a model.
+
+    Parameters
+    ----------
+    found : PredecessorModel    the model that was read
+    name : str    its name, if the document does not contain one
+    skeleton : dict    reference to its skeleton
+    file : str    name of its file, for messages
+    tree : (bytes, str), optional    content and name of the file with its tree
+
+    Returns
+    -------
+    dict of str to dict    `model` and, if there is a tree, `tree`
+
+    Raises
+    ------
+    FormatError    if the tree is invalid, or does not fit the model
+    """
+    model = primitive_to_tree(replace(found.primitive, name=found.primitive.name or name), skeleton)
     known: Tree = {
         "layout": found.layout,
         "animated_joints": list(found.animated_joints),
         "time_form": None if found.time is None else found.time.form,
         "time_error_frames": found.time_error_frames,
-        "original": original_of("model", model, file.planned.name, file.digest),
         "time": None if found.time is None else _time(found.time, model),
     }
-    parts = {"model": model}
-    companion = str(file.planned.companion)
-    if file.companion is not None and file.companion_digest is not None and not is_skeleton_name(companion):
-        parts["tree"] = _imported_tree(bytes(file.companion), companion, file.planned.name, found.primitive)
-        known["tree"] = original_of("tree", parts["tree"], companion, file.companion_digest)
     model["provenance"] = {"predecessor": known}
-    return parts
+    if tree is None:
+        return {"model": model}
+    return {"model": model, "tree": _imported_tree(*tree, file, found.primitive)}
 
 
 def _time(time: PredecessorTime, model: Tree) -> Tree:
