@@ -175,3 +175,11 @@ def records() -> dict[str, bytes]:
         name: json.dumps(one, indent=2).encode() if isinstance(one, list) else old.encode(one, name)
         for name, one in documents.items()
     }
+
+
+ZIPPED = "grasp.mg.zip"
+
+
+def folder() -> dict[str, bytes]:
+    """Return the files of a folder with one of everything: those of `predecessor_documents`, records, and a graph."""
+    return {**old.folder(), **records(), ZIPPED: zipped_graph()}

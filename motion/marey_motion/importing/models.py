@@ -5,13 +5,16 @@ The predecessor is the system that Marey replaces; `marey_motion.formats.predece
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from pydantic import ValidationError
 
 from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor.graph import graph_of_document
 from marey_motion.formats.predecessor.model import PredecessorModel, model_of_document
+from marey_motion.formats.predecessor.records import fields_of_record
 from marey_motion.formats.predecessor.time_functions import PredecessorTime
 from marey_motion.formats.predecessor.tree import read_predecessor_tree
 from marey_motion.importing.items import (
@@ -23,7 +26,6 @@ from marey_motion.importing.items import (
     main_item,
     skeleton_item,
 )
-from marey_motion.importing.records import import_record
 from marey_motion.importing.source import SourceDocument
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.primitive_documents import primitive_to_tree
@@ -36,6 +38,8 @@ from marey_schemas.imports import skeleton_output
 from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import TreeOptions
 
+MOST_NAMED = 5
+"""Greatest number of places in a file that a warning names."""
 _NEEDED: dict[str, str] = {
     "notes": "an annotation or alignment must be imported together with its motion, and be called like it: for "
     "example, walk_sections.json needs walk.bvh or walk.bson.bz2; to annotate a clip that is already stored, use "
@@ -56,7 +60,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
 
     Returns
     -------
-    ImportedFile    items, or the graph, or both
+    ImportedFile    items, or the graph
 
     Raises
     ------
@@ -73,12 +77,8 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
         read = graph_of_document(source.document, name)
         graph = ImportedGraph(file.planned.item_name, file.collection, file.options.tags, read, name, file.digest)
         return ImportedFile(name, graph=graph)
-    if source.subject == "zipped graph":
-        from marey_motion.importing.zipped_graphs import import_zipped_graph
-
-        return import_zipped_graph(file)
     if source.subject == "record":
-        return import_record(file, source.document)
+        return _imported_record(file, source.document)
     given = None if file.skeleton is None else given_skeleton(file.skeleton)
     found = model_of_document(source.document, name, skeleton=given)
     own = found.primitive.skeleton
@@ -89,6 +89,29 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
     item = main_item(file, Kind.MODEL, model_name(file.planned.item_name), _parts_of_file(file, found, ref))
     items = (item,) if given is not None else (skeleton_item(file, own), item)
     return ImportedFile(name, items, model_checks(found))
+
+
+def _imported_record(file: FileToImport, document: Mapping[str, Any]) -> ImportedFile:
+    """Make the item of a record, whose file is kept as it is; `document` has its form and its decoded content."""
+    fields = fields_of_record(document["content"])
+    record: Tree = {
+        "schema": "marey/predecessor-record@1",
+        "form": document["form"],
+        "fields": dict(fields.shown),
+        "fields_left_out": fields.left_out,
+    }
+    record["original"] = original_of("record", record, file.planned.name, file.digest)
+    item = main_item(file, Kind.RECORD, file.planned.item_name, {"record": record})
+    checks: tuple[Tree, ...] = ()
+    if fields.credentials:
+        more = " and more" if len(fields.credentials) > MOST_NAMED else ""
+        named = ", ".join(fields.credentials[:MOST_NAMED]) + more
+        message = (
+            f"the file contains credentials ({named}); they are not shown, but everybody who may read the project can "
+            "download the file: revoke them, or remove them from the file before you import it"
+        )
+        checks = ({"code": "credentials-in-file", "message": message},)
+    return ImportedFile(file.planned.name, (item,), checks)
 
 
 def model_checks(found: PredecessorModel) -> tuple[Tree, ...]:

@@ -27,14 +27,13 @@ from marey_motion.importing.items import (
     given_skeleton,
     skeleton_item,
 )
-from marey_motion.importing.models import model_checks, model_parts
+from marey_motion.importing.models import MOST_NAMED, model_checks, model_parts
 from marey_motion.importing.predecessor import described_skeleton
 from marey_motion.skeleton import SAME_OFFSET_M, Skeleton, same_hierarchy
 from marey_schemas.imports import skeleton_output
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 
-_FEW = 5
 _CENTIMETRES = ImportOptions(unit="cm", up_axis="y")
 _ENDS = ("-1", "lastFrame", LAST_FRAME)
 _MIDDLE = "middle"
@@ -80,8 +79,8 @@ def _checks(found: ZippedGraph) -> list[Tree]:
         ("transitions-ignored", strays, found.unknown),
     ):
         if names:
-            more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
-            checks.append({"code": code, "message": f"{what}: {', '.join(names[:_FEW])}{more}"})
+            more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+            checks.append({"code": code, "message": f"{what}: {', '.join(names[:MOST_NAMED])}{more}"})
     return checks
 
 

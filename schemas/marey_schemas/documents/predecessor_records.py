@@ -11,7 +11,7 @@ from marey_schemas.documents.originals import StoredOriginal
 
 RecordForm = Literal["job", "transform run", "edit history", "synthesis input"]
 RECORD_FORMS: tuple[RecordForm, ...] = get_args(RecordForm)
-MOST_FIELDS = 1000
+MOST_SHOWN = 1000
 """Greatest number of fields of a record that are shown."""
 LONGEST_TEXT = 1000
 """Greatest number of characters of a field that are shown."""
@@ -32,7 +32,7 @@ class PredecessorRecord(Request):
     form: RecordForm = Field(description="What the document records.")
     fields: dict[FieldPointer, FieldValue] = Field(
         default_factory=dict,
-        max_length=MOST_FIELDS,
+        max_length=MOST_SHOWN,
         description="Values by their JSON Pointers in the document. Credentials are hidden, long texts cut off.",
     )
     fields_left_out: int = Field(0, ge=0, description="Number of further values, which are only in the file.")

@@ -83,7 +83,7 @@ class ClipAnnotations(Resource):
         if kind_of(kind) is not Kind.CLIP:
             raise NotFoundProblem(f"Only clips can be annotated, not items of the kind {kind}.", code="no-annotations")
         clip = await self.look_up(items.find_annotated_clip, project, item)
-        prepared = await self._read(clip, body)
+        prepared = await self._prepared(clip, body)
         return await self.answer_with(
             lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/annotations/{made.id}"),
             items.create_item,
@@ -92,7 +92,7 @@ class ClipAnnotations(Resource):
             prepared,
         )
 
-    async def _read(self, clip: AnnotatedClip, body: AnnotationImport) -> ItemCreate:
+    async def _prepared(self, clip: AnnotatedClip, body: AnnotationImport) -> ItemCreate:
         """Return the annotation to create; the bytes of a file are read in a child process."""
         if body.file is None:
             return await self.compute(annotating.prepare_annotation, clip, body)

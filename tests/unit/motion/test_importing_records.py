@@ -14,7 +14,7 @@ from tests.support import predecessor_records as written
 from marey_motion.importing.files import import_file
 from marey_motion.importing.items import FileToImport, ImportedFile
 from marey_motion.importing.plan import plan_imports
-from marey_schemas.documents.predecessor_records import HIDDEN, LONGEST_TEXT, MOST_FIELDS, PredecessorRecord
+from marey_schemas.documents.predecessor_records import HIDDEN, LONGEST_TEXT, MOST_SHOWN, PredecessorRecord
 from marey_schemas.kinds import Kind
 
 DIGEST = f"sha256:{'1' * 64}"
@@ -79,8 +79,8 @@ def test_what_json_cannot_contain_is_shown_as_text_and_long_documents_are_cut() 
     fields = PredecessorRecord.model_validate(found.items[0].parts["record"]).fields
     assert str(fields["/hparams/when"]).startswith("2019-11-14 00:00:00")
     assert (fields["/hparams/id"], fields["/hparams/nan"], fields["/hparams/big"]) == ("a" * 24, "nan", str(2**60))
-    many = record([["smooth", {"window": number}] for number in range(MOST_FIELDS)])
-    assert (len(many.fields), many.fields_left_out) == (MOST_FIELDS, MOST_FIELDS)
+    many = record([["smooth", {"window": number}] for number in range(MOST_SHOWN)])
+    assert (len(many.fields), many.fields_left_out) == (MOST_SHOWN, MOST_SHOWN)
     long = record([["smooth", {"text": "\ud800" + "x" * 5000}]]).fields["/0/1/text"]
     assert isinstance(long, str)
     assert len(long) == LONGEST_TEXT

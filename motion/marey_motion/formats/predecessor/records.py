@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from marey_schemas.documents.predecessor_records import HIDDEN, LONGEST_TEXT, MOST_FIELDS, RecordForm
+from marey_schemas.documents.predecessor_records import HIDDEN, LONGEST_TEXT, MOST_SHOWN, RecordForm
 
 FieldValue = str | bool | int | float | None
 
@@ -65,7 +65,7 @@ def form_of_record(content: Any) -> RecordForm | None:
 
 
 def fields_of_record(content: Any) -> RecordFields:
-    """List the fields of a record, with credentials hidden, up to `MOST_FIELDS` of them.
+    """List the fields of a record, with credentials hidden, up to `MOST_SHOWN` of them.
 
     Parameters
     ----------
@@ -81,11 +81,11 @@ def fields_of_record(content: Any) -> RecordFields:
     for pointer, value, is_secret in _values(content):
         if is_secret:
             credentials.append(pointer)
-        if len(shown) == MOST_FIELDS or len(pointer) > LONGEST_TEXT:
+        if len(shown) == MOST_SHOWN or len(pointer) > LONGEST_TEXT:
             left_out += 1
         else:
             shown[pointer] = HIDDEN if is_secret else _shown(value)
-    return RecordFields(shown, left_out, tuple(credentials[:MOST_FIELDS]))
+    return RecordFields(shown, left_out, tuple(credentials[:MOST_SHOWN]))
 
 
 def _is_command(entry: Any) -> bool:

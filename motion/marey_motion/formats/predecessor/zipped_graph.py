@@ -39,7 +39,6 @@ _ACTION = "elementary_action_"
 _STATES = {"start_states": "start", "end_states": "end", "idle_states": "idle", "single_states": "single",
            "cycle_states": "cycle_end"}  # fmt: skip
 _MOST_MEMBERS = 4 * MOST_PRIMITIVES
-_FEW = 5
 # Methods whose members `zipfile` unpacks only up to the declared size.
 _BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # All that a damaged or hostile archive raises; RuntimeError stands for encryption and for unknown compression, too.
@@ -203,7 +202,7 @@ def _model(members: Mapping[str, bytes], place: Place, member: str, keyframes: M
 
 
 class _Nodes:
-    """What the definition of a graph and the information about its actions say about its nodes."""
+    """Types, transitions and keyframes of nodes, from the definition of a graph and the information about actions."""
 
     def __init__(
         self, members: Mapping[str, bytes], definition: Mapping[str, Any], places: Sequence[Place], file: str
