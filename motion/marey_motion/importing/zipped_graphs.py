@@ -60,7 +60,7 @@ def import_zipped_graph(file: FileToImport) -> ImportedFile:
     file = replace(file, planned=replace(file.planned, folder=folder))
     skeleton = _skeleton(found, name) if file.skeleton is None else given_skeleton(file.skeleton)
     ref: Tree = {"output": skeleton_output(name)} if file.skeleton is None else file.skeleton.ref
-    items = [] if file.skeleton is not None else [_skeleton_item(file, found, skeleton)]
+    items: list[ImportedItem] = [] if file.skeleton is not None else [_skeleton_item(file, found, skeleton)]
     checks = _checks(found)
     for model in found.models:
         read = _read_model(model, skeleton, f"{name}: {model.member}")

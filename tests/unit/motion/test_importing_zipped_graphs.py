@@ -134,6 +134,10 @@ def test_what_is_no_graph_or_does_not_fit_is_refused_with_the_member() -> None:
     assert "damaged" in refusal(zipped_graph()[:3000])[1]
     assert "no member 'skeleton.json' or 'skeleton.bvh'" in refusal(changed(skeleton=None))[1]
     assert "walk_begin_quaternion_mm.json" in refusal(changed(begin={"sspm": {}, "tspm": {}, "gmm": {}}))[1]
+    twice = "elementary_action_models/elementary_action_walk_begin/walk_begin_walk_mm.json"
+    first = "elementary_action_models/elementary_action_walk/walk_begin_walk_mm.json"
+    both = zipped({"graph_definition.json": {}, "skeleton.json": old.file_skeleton(), first: {}, twice: {}})
+    assert "two models are called 'walk_begin_walk'" in refusal(both)[1]
     other = [old.Node("Hips", None, (0.0, 0.0, 0.0)), *old.RIG[1:5], *old.RIG[5:]]
     other[1] = old.Node("Spine", "Hips", (0.0, 30.0, 0.0))
     code, detail = refusal(changed(skeleton=old.file_skeleton(tuple(other))))

@@ -52,8 +52,7 @@ def read_predecessor(
     if data.startswith(MARK):
         return SourceDocument("zipped graph", {})
     document = decode_content(data, file)
-    subject = None if isinstance(document, list) else _subject_of(document)
-    if subject is not None:
+    if isinstance(document, dict) and (subject := _subject_of(document)) is not None:
         return SourceDocument(subject, document)
     if (form := form_of_record(document)) is not None:
         return SourceDocument("record", {"form": form, "content": document})

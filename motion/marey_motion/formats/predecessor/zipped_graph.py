@@ -18,6 +18,7 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -115,6 +116,9 @@ def read_zipped_graph(data: bytes, file: str) -> ZippedGraph:
         raise FormatError(f"the archive contains no models, such as {example}", file=file)
     if len(models) > MOST_PRIMITIVES:
         raise FormatLimit(f"the graph has {len(models)} nodes; the limit is {MOST_PRIMITIVES}", file=file)
+    names = Counter("_".join(place) for place in models)
+    if (repeated := max(names, key=names.__getitem__)) and names[repeated] > 1:
+        raise FormatError(f"two models are called {repeated!r}, in different actions; rename one", file=file)
     known = _Nodes(members, definition, list(models), file)
     onwards, unknown = known.transitions()
     nodes = {
@@ -222,10 +226,9 @@ class _Nodes:
         for field, kind in _STATES.items():
             if mp in _list_of(self._meta[action], field, self._file):
                 return kind
-        given = field_of(self._definition, "actionDefinitions", dict, self._file).get(action) if (
-            "actionDefinitions" in self._definition
-        ) else None  # fmt: skip
-        sequence = given.get("node_sequence") if isinstance(given, dict) else None
+        actions = self._definition.get("actionDefinitions")
+        described = actions.get(action) if isinstance(actions, dict) else None
+        sequence = described.get("node_sequence") if isinstance(described, dict) else None
         for entry in sequence if isinstance(sequence, list) else []:
             kind = str(entry[1]).removesuffix("_primitive") if isinstance(entry, list) and len(entry) == 2 else ""
             if kind in TYPES and entry[0] == mp:
