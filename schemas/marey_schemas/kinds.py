@@ -21,6 +21,7 @@ class Kind(StrEnum):
     METRIC = "metric"
     STUDY = "study"
     INDEX = "index"
+    RECORD = "record"
 
     @property
     def plural(self) -> str:
@@ -70,5 +71,6 @@ PARTS: dict[Kind, dict[str, PartSpec]] = {
     Kind.METRIC: {"metric": PartSpec("marey/perceptual-metric@1", True)},
     Kind.INDEX: {"index": PartSpec("marey/motion-index@1", True)},
     Kind.STUDY: {"study": PartSpec("marey/study@1", True)},
+    Kind.RECORD: {"record": PartSpec("marey/predecessor-record@1", True)},
 }
 """Parts by kind of item. Kinds whose schema is not fixed yet use `marey/document@1`, which allows any members."""

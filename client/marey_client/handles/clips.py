@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, Unpack
 
 from marey_client.arguments import checked
+from marey_client.blobs import Blobs
 from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.edits import Commands, preview_edit
 from marey_client.items import Items
@@ -69,11 +71,17 @@ class ClipHandle(PosesHandle):
         given: EditPreviewKeywords = {"revision": self.item.revision, **options}
         return preview_edit(self.transport, self.url, commands, bounds, **given)
 
-    def import_annotation(self, document: Mapping[str, Any], **options: Any) -> AnnotationHandle:
-        """Create an annotation in the clip's folder from a document of Marey's predecessor.
+    def import_annotation(self, document: Mapping[str, Any] | str | Path, **options: Any) -> AnnotationHandle:
+        """Create an annotation in the clip's folder from a document of Marey's predecessor, or from the file of one.
 
-        `options` are those of `AnnotationImport`, such as `layer="phases"` or `end_index="exclusive"`.
+        Only a file is given back byte for byte by an export. `options` are those of `AnnotationImport`, such as
+        `layer="phases"` or `end_index="exclusive"`.
         """
-        wanted = checked(AnnotationImport, {"document": document, **options})
+        if isinstance(document, Mapping):
+            source: dict[str, Any] = {"document": document}
+        else:
+            path = Path(document)
+            source = {"file": {"name": path.name, "blob": Blobs(self.transport).put_file(path)}}
+        wanted = checked(AnnotationImport, {**source, **options})
         made = self.transport.post(Item, f"{self.url}/annotations", wanted)
         return AnnotationHandle(self.transport, self.project, made)

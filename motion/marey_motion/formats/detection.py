@@ -50,7 +50,7 @@ def detect_format(data: bytes, name: str) -> FileFormat:
         return named  # BSON begins with its length, whose bytes may be those with which another format begins
     archive = next((kind for mark, kind in _ARCHIVES.items() if data.startswith(mark)), None)
     if data.startswith(_ZIP):
-        if named is not None and named.archive:
+        if named is not None and name.lower().endswith(named.archives):
             return named
         archive = "zip"
     if archive:

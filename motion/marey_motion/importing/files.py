@@ -113,9 +113,7 @@ def _imported(file: FileToImport) -> ImportedFile:
         skeleton=None if file.skeleton is None else given_skeleton(file.skeleton),
     )
     if isinstance(source, SourceDocument):
-        from marey_motion.importing.models import import_document
-
-        return import_document(file, source)
+        return _imported_document(file, source)
     is_inferred = file.options.up_axis is None and source.up_axis is None
     try:
         imported = convert(source, file.planned.name, file.options, file.sibling_axis)
@@ -141,6 +139,17 @@ def _imported(file: FileToImport) -> ImportedFile:
         items += [item] if file.notes is None else noted_items(file, imported, motion, item)
     frames = None if clip is None else clip.frame_count
     return ImportedFile(file.planned.name, tuple(items), checks, frames, axis=axis)
+
+
+def _imported_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
+    """Import a file without motion; the modules that read models are loaded only for such files."""
+    if source.subject == "zipped graph":
+        from marey_motion.importing.zipped_graphs import import_zipped_graph
+
+        return import_zipped_graph(file)
+    from marey_motion.importing.models import import_document
+
+    return import_document(file, source)
 
 
 def mapping_part(found: ImportedFile) -> Tree:

@@ -105,10 +105,11 @@ class ImportedFile:
     Parameters
     ----------
     items : a skeleton, a clip or a model, or else a skeleton followed by a clip or model that uses it. The skeleton has
-        no document `mapping` yet, except that of a file of the predecessor's: see `mapping_part`
+        no document `mapping` yet, except that of a file of the predecessor's: see `mapping_part`. A zipped graph has
+        its skeleton and several models
     checks : findings about the motion, as documents
     frames : number of frames of the clip
-    graph : content of a file that holds a graph instead of items
+    graph : graph in the file, whose item is made after `items` are stored
     axis : what the file shows about its upward axis; None if the axis was given or fixed by the format
     """
 

@@ -1,17 +1,20 @@
-"""Import of the predecessor's files that contain no motion: models, trees over samples of models, and graphs.
+"""Import of the predecessor's files that contain no motion: models, trees over samples of models, graphs, records.
 
 The predecessor is the system that Marey replaces; `marey_motion.formats.predecessor` reads its files.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from pydantic import ValidationError
 
 from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor.graph import graph_of_document
 from marey_motion.formats.predecessor.model import PredecessorModel, model_of_document
+from marey_motion.formats.predecessor.records import fields_of_record
 from marey_motion.formats.predecessor.time_functions import PredecessorTime
 from marey_motion.formats.predecessor.tree import read_predecessor_tree
 from marey_motion.importing.items import (
@@ -35,6 +38,8 @@ from marey_schemas.imports import skeleton_output
 from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import TreeOptions
 
+MOST_NAMED = 5
+"""Greatest number of places in a file that a warning names."""
 _NEEDED: dict[str, str] = {
     "notes": "an annotation or alignment must be imported together with its motion, and be called like it: for "
     "example, walk_sections.json needs walk.bvh or walk.bson.bz2; to annotate a clip that is already stored, use "
@@ -46,7 +51,7 @@ _NEEDED: dict[str, str] = {
 
 
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
-    """Import a model, with its cluster tree if the file has one as a companion; or import a graph.
+    """Import a model, with its cluster tree if the file has one as a companion; or import a graph or a record.
 
     Parameters
     ----------
@@ -72,6 +77,8 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
         read = graph_of_document(source.document, name)
         graph = ImportedGraph(file.planned.item_name, file.collection, file.options.tags, read, name, file.digest)
         return ImportedFile(name, graph=graph)
+    if source.subject == "record":
+        return _imported_record(file, source.document)
     given = None if file.skeleton is None else given_skeleton(file.skeleton)
     found = model_of_document(source.document, name, skeleton=given)
     own = found.primitive.skeleton
@@ -79,13 +86,45 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
         message = "the model has a different skeleton from the chosen one; import it without choosing a skeleton"
         raise FormatError(message, code="skeleton-mismatch", file=name)
     ref = {"output": skeleton_output(name)} if file.skeleton is None else file.skeleton.ref
-    item = main_item(file, Kind.MODEL, model_name(file.planned.item_name), _parts(file, found, ref))
+    item = main_item(file, Kind.MODEL, model_name(file.planned.item_name), _parts_of_file(file, found, ref))
     items = (item,) if given is not None else (skeleton_item(file, own), item)
-    return ImportedFile(name, items, _checks(found))
+    return ImportedFile(name, items, model_checks(found))
 
 
-def _checks(found: PredecessorModel) -> tuple[Tree, ...]:
-    """List what was changed in a model, as documents."""
+def _imported_record(file: FileToImport, document: Mapping[str, Any]) -> ImportedFile:
+    """Make the item of a record, whose file is kept as it is; `document` has its form and its decoded content."""
+    fields = fields_of_record(document["content"])
+    record: Tree = {
+        "schema": "marey/predecessor-record@1",
+        "form": document["form"],
+        "fields": dict(fields.shown),
+        "fields_left_out": fields.left_out,
+    }
+    record["original"] = original_of("record", record, file.planned.name, file.digest)
+    item = main_item(file, Kind.RECORD, file.planned.item_name, {"record": record})
+    checks: tuple[Tree, ...] = ()
+    if fields.credentials:
+        more = " and more" if len(fields.credentials) > MOST_NAMED else ""
+        named = ", ".join(fields.credentials[:MOST_NAMED]) + more
+        message = (
+            f"the file contains credentials ({named}); they are not shown, but everybody who may read the project can "
+            "download the file: revoke them, or remove them from the file before you import it"
+        )
+        checks = ({"code": "credentials-in-file", "message": message},)
+    return ImportedFile(file.planned.name, (item,), checks)
+
+
+def model_checks(found: PredecessorModel) -> tuple[Tree, ...]:
+    """List what was changed in a model.
+
+    Parameters
+    ----------
+    found : PredecessorModel    the model that was read
+
+    Returns
+    -------
+    tuple of dict    warnings, as documents
+    """
     if not found.moved_keyframes:
         return ()
     labels, last = ", ".join(found.moved_keyframes), found.primitive.frame_count - 1
@@ -93,25 +132,52 @@ def _checks(found: PredecessorModel) -> tuple[Tree, ...]:
     return ({"code": "keyframes-at-end", "message": message},)
 
 
-def _parts(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[str, Tree]:
-    """Make the documents `model` and, if the companion of the file is a tree, `tree`."""
-    name = found.primitive.name or model_name(file.planned.item_name)
-    model = primitive_to_tree(replace(found.primitive, name=name), skeleton)
+def _parts_of_file(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[str, Tree]:
+    """Make the documents of a model with a file of its own; its companion may be its tree."""
+    name, companion = file.planned.name, str(file.planned.companion)
+    beside = None if file.companion is None or is_skeleton_name(companion) else bytes(file.companion)
+    tree = None if beside is None else (beside, companion)
+    parts = model_parts(found, model_name(file.planned.item_name), skeleton, name, tree)
+    known = parts["model"]["provenance"]["predecessor"]
+    known["original"] = original_of("model", parts["model"], name, file.digest)
+    if "tree" in parts and file.companion_digest is not None:
+        known["tree"] = original_of("tree", parts["tree"], companion, file.companion_digest)
+    return parts
+
+
+def model_parts(
+    found: PredecessorModel, name: str, skeleton: Tree, file: str, tree: tuple[bytes, str] | None
+) -> dict[str, Tree]:
+    """Make the documents of a model.
+
+    Parameters
+    ----------
+    found : PredecessorModel    the model that was read
+    name : str    its name, if the document does not contain one
+    skeleton : dict    reference to its skeleton
+    file : str    name of its file, for messages
+    tree : (bytes, str), optional    content and name of the file with its tree
+
+    Returns
+    -------
+    dict of str to dict    `model` and, if there is a tree, `tree`
+
+    Raises
+    ------
+    FormatError    if the tree is invalid, or does not fit the model
+    """
+    model = primitive_to_tree(replace(found.primitive, name=found.primitive.name or name), skeleton)
     known: Tree = {
         "layout": found.layout,
         "animated_joints": list(found.animated_joints),
         "time_form": None if found.time is None else found.time.form,
         "time_error_frames": found.time_error_frames,
-        "original": original_of("model", model, file.planned.name, file.digest),
         "time": None if found.time is None else _time(found.time, model),
     }
-    parts = {"model": model}
-    companion = str(file.planned.companion)
-    if file.companion is not None and file.companion_digest is not None and not is_skeleton_name(companion):
-        parts["tree"] = _imported_tree(bytes(file.companion), companion, file.planned.name, found.primitive)
-        known["tree"] = original_of("tree", parts["tree"], companion, file.companion_digest)
     model["provenance"] = {"predecessor": known}
-    return parts
+    if tree is None:
+        return {"model": model}
+    return {"model": model, "tree": _imported_tree(*tree, file, found.primitive)}
 
 
 def _time(time: PredecessorTime, model: Tree) -> Tree:

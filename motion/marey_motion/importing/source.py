@@ -16,7 +16,7 @@ from marey_motion.importing.checks import CheckWarning
 from marey_motion.skeleton import Skeleton
 from marey_schemas.options.imports import Handedness, UpAxis
 
-Subject = Literal["model", "tree", "graph", "notes", "skeleton model"]
+Subject = Literal["model", "tree", "graph", "notes", "skeleton model", "zipped graph", "record"]
 
 
 @dataclass(eq=False)
@@ -85,7 +85,8 @@ class SourceMotion:
 class SourceDocument:
     """A decoded file that holds no motion: a model, a tree over the samples of a model, or a graph of models.
 
-    Other subjects are notes about a motion (an annotation or an alignment), and the skeleton model of a skeleton.
+    Other subjects are notes about a motion (an annotation or an alignment), the skeleton model of a skeleton, a graph
+    zipped together with its models, whose file is not decoded yet, and records of work, with their form and content.
     """
 
     subject: Subject

@@ -26,6 +26,7 @@ CONTENT = {
     "motion": ("joints", "frame_rate_hz", "poses", "translations", "translated_joints"),
     "alignment": ("time_function", "source_frames", "frame_rate_hz", "keyframes"),
     "annotation": ("segments", "keyframes"),
+    "record": ("form", "fields", "fields_left_out"),
 }  # fmt: skip
 """Names of the members whose values come from the imported file, by part.
 

@@ -15,6 +15,7 @@ from marey_schemas.documents.graphs import ModelGraph
 from marey_schemas.documents.metrics import MetricDocument
 from marey_schemas.documents.models import MotionPrimitiveDocument
 from marey_schemas.documents.motion_indexes import MotionIndexDocument
+from marey_schemas.documents.predecessor_records import PredecessorRecord
 from marey_schemas.documents.references import OutputRef as OutputRef
 from marey_schemas.documents.references import RevisionRef as RevisionRef
 from marey_schemas.documents.reports import EvaluationReport, ModelReport
@@ -54,6 +55,7 @@ SCHEMAS: dict[str, type[Request]] = {
         StudyDocument,
         MetricDocument,
         MotionIndexDocument,
+        PredecessorRecord,
         OpenDocument,
     )
 }

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.formats import DEFAULT_END_INDEX, EndIndex
+from marey_schemas.imports import ImportFile
 from marey_schemas.names import ItemName, Label, LayerName, Message
 
 MAX_FRAME = 2**31 - 1
@@ -121,11 +122,18 @@ class AnnotationChange(Request):
 
 
 class AnnotationImport(Request):
-    """Request to import an annotation of a clip from a document of Marey's predecessor.
+    """Request to import an annotation of a clip from a document of Marey's predecessor, or from the file of one.
 
-    The document has one of the forms `sections` and `semantic_annotation`."""
+    The document has one of the forms `sections` and `semantic_annotation`. A file is given back byte for byte when the
+    annotation is exported, unless the annotation was changed.
+    """
 
-    document: dict[str, Any] = Field(description="The predecessor's document, as it stores or exports it.")
+    document: dict[str, Any] | None = Field(
+        None, description="The predecessor's document, as it stores or exports it. Give either this or `file`."
+    )
+    file: ImportFile | None = Field(
+        None, description="File with the document, as JSON, BSON or compressed BSON; the server already has its bytes."
+    )
     layer: LayerName = "imported"
     name: ItemName | None = Field(
         None, description="Name of the annotation; default: the name of the clip, a space, and the name of the layer."
@@ -141,6 +149,12 @@ class AnnotationImport(Request):
         description="Labels to import; absent: all of them. Import labels whose segments overlap into separate layers.",
     )
     message: Message = ""
+
+    @model_validator(mode="after")
+    def _check_source(self) -> Self:
+        if (self.document is None) == (self.file is None):
+            raise ValueError("give either `document` or `file`")
+        return self
 
 
 def command_arguments(command: Request) -> dict[str, Any]:

@@ -20,7 +20,7 @@ ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 MOST_UNPACKED_BYTES = 1 << 29
 """Greatest unpacked size in bytes of a compressed file; readers stop unpacking there."""
 
-Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "item"]
+Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "record", "item"]
 
 AnnotationForm = Literal["labels", "list", "frames"]
 """Layouts of annotation files of Marey's predecessor.
@@ -60,7 +60,7 @@ class FileFormat:
     begins : pattern that only the beginning of such a file matches; None if the name alone identifies the format
     other_endings : endings that also identify the format of a named file, but are ignored in a search of a folder
     euler : whether rotations are Euler angles; an export keeps the rotation orders of the imported file
-    archive : whether files are ZIP archives, although their ending is not `.zip`
+    archives : endings of files that are ZIP archives; the reader unpacks them
     companion : format of a second file that the reader also needs or accepts
     needs_companion : reason why the second file is needed; empty if it is optional
     unread : reason why there is no reader, for formats that users may expect
@@ -75,7 +75,7 @@ class FileFormat:
     begins: re.Pattern[bytes] | None = None
     other_endings: tuple[str, ...] = ()
     euler: bool = False
-    archive: bool = False
+    archives: tuple[str, ...] = ()
     companion: str | None = None
     needs_companion: str = ""
     unread: str = ""
@@ -128,7 +128,7 @@ FORMATS = (
         reads=("motion", "skeleton"),
         writes=("motion",),
         units=("m",),
-        archive=True,
+        archives=(".npz",),
     ),
     FileFormat(
         name="c3d",
@@ -139,13 +139,14 @@ FORMATS = (
     ),
     FileFormat(
         name="predecessor",
-        endings=(".bson.bz2", ".bson", ".json", ".skeleton"),
+        endings=(".bson.bz2", ".bson", ".json", ".skeleton", ".mg.zip"),
         media_type="application/x-bzip2",
-        reads=("motion", "skeleton", "model", "tree", "graph"),
+        reads=("motion", "skeleton", "model", "tree", "graph", "record"),
         writes=("motion", "model", "tree", "graph", "annotation", "alignment"),
         units=("cm",),
         begins=_text(rb"(?:bzh|\{)"),
         other_endings=(".bz2",),
+        archives=(".mg.zip",),
         companion="predecessor",
     ),
     FileFormat(name="json", endings=(".json",), media_type="application/json", writes=("item",)),

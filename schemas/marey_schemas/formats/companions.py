@@ -19,7 +19,8 @@ from marey_schemas.names import base_name
 _PREDECESSOR = format_named("predecessor")
 _ENDINGS = sorted((*_PREDECESSOR.endings, *_PREDECESSOR.other_endings), key=len, reverse=True)
 _MODEL_ENDINGS = ("_quaternion_mm", "_mm")
-_TREE_ENDINGS = ("_quaternion_cluster_tree", "_cluster_tree", "_tree")
+TREE_ENDINGS = ("_quaternion_cluster_tree", "_cluster_tree", "_tree")
+"""Endings of the stems of trees, after the name of the model."""
 _NOTES_ENDINGS = ("_sections", "_annotations", "_annotation", "_alignment")
 _SKELETON = "skeleton"
 _SKELETON_MODEL = "skeleton_model"
@@ -155,12 +156,12 @@ def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
     models: dict[str, str] = {}
     for stem, path in sorted(others, key=lambda one: model_name(one[0]) == one[0]):  # first those called models
         models.setdefault(model_name(stem), path)
-    trees = {_without(stem, _TREE_ENDINGS): path for stem, path in others if _without(stem, _TREE_ENDINGS) != stem}
+    trees = {_without(stem, TREE_ENDINGS): path for stem, path in others if _without(stem, TREE_ENDINGS) != stem}
     for stem, path in skeletons.items():
         if stem in joint_models:
             yield Pairing(path, joint_models[stem], (joint_models[stem],))
     for stem, path in others:
-        model, bare = model_name(stem), _without(stem, _TREE_ENDINGS)
+        model, bare = model_name(stem), _without(stem, TREE_ENDINGS)
         if model in trees and models[model] == path:
             yield Pairing(path, trees[model], (trees[model],))
         elif skeletons and model == stem and (bare == stem or bare not in models):

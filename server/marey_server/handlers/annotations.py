@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from marey_schemas.editing.annotation_commands import AnnotationChange, AnnotationImport
-from marey_schemas.items import Item
+from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, NotFoundProblem, PreconditionFailedProblem
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.http.declarations import Access, RequestBody, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.motions.annotating import apply_commands, prepare_annotation
+from marey_server.motions import annotating
 from marey_server.store import items
+from marey_server.store.items.annotating import AnnotatedClip
 
 MOST_TRIES = 5
 """Greatest number of times that commands with `If-Match: *` are applied while other requests change the annotation."""
@@ -46,7 +49,7 @@ class AnnotationCommands(Resource):
         expected_rev = self.precondition.expected_rev
         for _ in range(MOST_TRIES):
             found = await self.look_up(items.find_annotation, project, item)
-            changed = await self.compute(apply_commands, found, body, expected_rev=expected_rev)
+            changed = await self.compute(annotating.apply_commands, found, body, expected_rev=expected_rev)
             try:
                 return await self.answer(items.put_changed, project, item, changed, body.message)
             except PreconditionFailedProblem:
@@ -73,14 +76,14 @@ class ClipAnnotations(Resource):
         in_folders=True,
     )
     async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
-        """Create an annotation of a clip from a document of Marey's predecessor.
+        """Create an annotation of a clip from a document of Marey's predecessor, or from the file of one.
 
         The path parameter `kind` must be `clips`. The annotation is created in the clip's folder.
         """
         if kind_of(kind) is not Kind.CLIP:
             raise NotFoundProblem(f"Only clips can be annotated, not items of the kind {kind}.", code="no-annotations")
         clip = await self.look_up(items.find_annotated_clip, project, item)
-        prepared = await self.compute(prepare_annotation, clip, body)
+        prepared = await self._prepared(clip, body)
         return await self.answer_with(
             lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/annotations/{made.id}"),
             items.create_item,
@@ -88,6 +91,16 @@ class ClipAnnotations(Resource):
             Kind.ANNOTATION,
             prepared,
         )
+
+    async def _prepared(self, clip: AnnotatedClip, body: AnnotationImport) -> ItemCreate:
+        """Return the annotation to create; the bytes of a file are read in a child process."""
+        if body.file is None:
+            return await self.compute(annotating.prepare_annotation, clip, body)
+        content = await self.look_up(annotating.find_file, body, MAX_DOCUMENT_BYTES)
+        self.holding.grow(len(content))
+        order = partial(annotating.annotation_order, clip, body, content)
+        parts = await self.compute_apart(annotating.READ_ANNOTATION, order, annotating.found_annotation)
+        return annotating.created(clip, body, parts)
 
 
 RESOURCES: tuple[type[Resource], ...] = (AnnotationCommands, ClipAnnotations)

@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
 from marey_schemas.documents.annotations import Annotation
+from marey_schemas.documents.originals import original_of
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.editing.annotation_commands import AnnotationChange, AnnotationImport, command_arguments
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
-from marey_schemas.names import MAX_NAME_LENGTH
+from marey_schemas.names import MAX_NAME_LENGTH, base_name
 from marey_schemas.problems import FieldError
 from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem
+from marey_server.motions.child import Message, pack_tree, unpack_tree
 from marey_server.motions.loading import LOADING
 from marey_server.prepared_documents import PreparedDocument
+from marey_server.store import blobs
 from marey_server.store.items import prepare_part, prepare_parts
 from marey_server.store.items.annotating import AnnotatedClip, ChangedAnnotation, FoundAnnotation
 from marey_server.store.revs import ExpectedRev, is_expected, moved_on
+from marey_server.store.transaction import Transaction
+
+if TYPE_CHECKING:  # numeric modules take a second to load
+    from marey_motion.errors import MotionError
+
+READ_ANNOTATION = "marey_server.motions.annotating:read_annotation"
+"""Function that child processes run."""
 
 MOST_WORK = 30_000_000
 """Greatest amount of work in a request; this amount takes a few seconds.
@@ -74,25 +87,95 @@ def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCrea
 
     Raises `InvalidProblem` if the document is not a valid annotation of this clip.
     """
+    assert given.document is not None
+    part = _imported(given.document, "document", clip.item.id, clip.item.revision, clip.frame_count, given)
+    return created(clip, given, prepare_parts(Kind.ANNOTATION, {"annotation": part}))
+
+
+def created(clip: AnnotatedClip, given: AnnotationImport, parts: dict[str, PreparedDocument]) -> ItemCreate:
+    """Return the request that creates an imported annotation in the folder of its clip."""
+    return ItemCreate(
+        name=given.name or f"{clip.item.name} {given.layer}"[:MAX_NAME_LENGTH],
+        collection=clip.item.collection,
+        parts=parts,
+        message=given.message,
+    )
+
+
+class AnnotationOrder(Message):
+    """Message that asks a child process to read the file of an annotation of Marey's predecessor."""
+
+    content: bytes
+    clip: str
+    revision: int
+    frame_count: int
+    given: AnnotationImport
+
+
+def find_file(tx: Transaction, given: AnnotationImport, most_bytes: int) -> bytes:
+    """Return the content of the file to import.
+
+    Raises `NotFoundProblem` if the caller may not read it, and `TooLargeProblem` if it has more than `most_bytes`.
+    """
+    assert given.file is not None
+    digest = given.file.blob
+    size_bytes = blobs.sizes_of_readable(tx, [digest])[digest]
+    if size_bytes > most_bytes:
+        raise TooLargeProblem(f"The file has {size_bytes:,} bytes; an annotation may have at most {most_bytes:,}.")
+    return blobs.read_blob(tx, digest, 0, size_bytes)
+
+
+def annotation_order(clip: AnnotatedClip, given: AnnotationImport, content: bytes) -> bytes:
+    """Return the packed message that asks a child process to read the file of an annotation."""
+    return AnnotationOrder(
+        content=content, clip=clip.item.id, revision=clip.item.revision, frame_count=clip.frame_count, given=given
+    ).pack()
+
+
+def found_annotation(answer: bytes) -> dict[str, PreparedDocument]:
+    """Return the parts of the annotation that a child process has read."""
+    return prepare_parts(Kind.ANNOTATION, {"annotation": unpack_tree(answer)})
+
+
+def read_annotation(order: bytes) -> bytes:
+    """Carry out an `AnnotationOrder` in a child process; return the packed part `annotation`.
+
+    Raises `InvalidProblem` if the file is not a valid annotation of the clip.
+    """
+    from marey_motion.errors import MotionError
+    from marey_motion.formats.predecessor.encoding import decode_document
+
+    wanted = AnnotationOrder.unpack(order)
+    assert wanted.given.file is not None
+    name = base_name(wanted.given.file.name)
+    try:
+        document = decode_document(wanted.content, name)
+    except MotionError as error:
+        raise _not_an_annotation(error, "/file") from error
+    part = _imported(document, name, wanted.clip, wanted.revision, wanted.frame_count, wanted.given)
+    part["original"] = original_of("annotation", part, name, wanted.given.file.blob)
+    return pack_tree(part)
+
+
+def _imported(
+    document: Mapping[str, Any], name: str, clip: str, revision: int, frame_count: int, given: AnnotationImport
+) -> dict[str, Any]:
+    """Return the part `annotation` that a document of the predecessor becomes."""
     with LOADING:
         from marey_motion import documents
         from marey_motion.errors import MotionError
         from marey_motion.formats.predecessor.annotation import layer_of_document
 
     try:
-        layer = layer_of_document(
-            given.document, "document", clip.frame_count, end_index=given.end_index, labels=given.labels
-        )
+        layer = layer_of_document(document, name, frame_count, end_index=given.end_index, labels=given.labels)
     except MotionError as error:
-        wrong = FieldError(pointer="/document", code=error.code, detail=str(error))
-        raise InvalidProblem(
-            f"The document is not a valid annotation of the clip: {error}", code=error.code, errors=[wrong]
-        ) from error
-    ref = RevisionRef(item=clip.item.id, revision=clip.item.revision)
-    annotation = documents.layer_to_document(layer, ref, given.layer)
-    return ItemCreate(
-        name=given.name or f"{clip.item.name} {given.layer}"[:MAX_NAME_LENGTH],
-        collection=clip.item.collection,
-        parts=prepare_parts(Kind.ANNOTATION, {"annotation": annotation.model_dump(mode="json", by_alias=True)}),
-        message=given.message,
+        raise _not_an_annotation(error, "/document" if given.file is None else "/file") from error
+    annotation = documents.layer_to_document(layer, RevisionRef(item=clip, revision=revision), given.layer)
+    return annotation.model_dump(mode="json", by_alias=True, exclude_none=True)
+
+
+def _not_an_annotation(error: MotionError, pointer: str) -> InvalidProblem:
+    wrong = FieldError(pointer=pointer, code=error.code, detail=str(error))
+    return InvalidProblem(
+        f"The document is not a valid annotation of the clip: {error}", code=error.code, errors=[wrong]
     )

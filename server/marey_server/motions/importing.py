@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from marey_schemas.access import Role
@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # numeric modules take a second to load, so they are loaded o
 REFUSED_ALTOGETHER = (401, 403, 404, 499, 503, 507)
 """HTTP status codes of errors that concern the whole request and not a single file."""
 
-MAIN_KINDS = (Kind.CLIP, Kind.PROCESSED, Kind.MODEL, Kind.GRAPH, Kind.SKELETON)
+MAIN_KINDS = (Kind.CLIP, Kind.PROCESSED, Kind.MODEL, Kind.GRAPH, Kind.SKELETON, Kind.RECORD)
 """Kinds of items of which a file contains at least one."""
 
 READ_FILE = "marey_server.motions.reading:read_file"
@@ -345,14 +345,11 @@ def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport], 
         new_bytes = blobs.put_uncounted(tx, sources, project_id=row.id) if sources else 0
         if new_bytes:
             daily.require_sendable(tx, sent_bytes + new_bytes)
-        every = [
-            draft
-            for file in fresh
-            for draft in (file.drafts if file.graph is None else (graph_draft(tx, row.name, file.graph),))
-        ]
         rights = rights_of_caller(tx, row)
-        published = items.publish(tx, row, every, author_id=tx.principal.user_id, rights=rights)
-        made = {one.name: one for one in published}
+        store = partial(items.publish, tx, row, author_id=tx.principal.user_id, rights=rights)
+        made = {one.name: one for one in store([draft for file in fresh for draft in file.drafts])}
+        graphs = [graph_draft(tx, row.name, file.graph) for file in fresh if file.graph is not None]
+        made |= {one.name: one for one in store(graphs)}
     return _Stored([file.entry or _entry(file, made) for file in files], new_bytes)
 
 

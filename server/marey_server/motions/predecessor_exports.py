@@ -39,6 +39,7 @@ DOCUMENTS_OF: dict[Kind, tuple[str, ...]] = {
     Kind.ANNOTATION: ("annotation",),
     Kind.MODEL: ("model", "tree"),
     Kind.GRAPH: ("graph",),
+    Kind.RECORD: ("record",),
 }
 """Parts of items that are read to find the file that an item was imported from."""
 
@@ -84,6 +85,8 @@ def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) ->
         return None
     if kind is Kind.GRAPH:
         return _if_unchanged("graph", parts["graph"], parts["graph"].get("original"))
+    if kind is Kind.RECORD:
+        return _if_unchanged("record", parts["record"], parts["record"]["original"])
     if kind is Kind.ANNOTATION:
         return _if_unchanged("annotation", parts["annotation"], parts["annotation"].get("original"))
     if kind is Kind.MODEL:
@@ -141,6 +144,13 @@ def _written(
         return "_sections.json", _annotation(parts["annotation"], options)
     if kind is Kind.GRAPH:
         return ".json", _graph(parts["graph"])
+    if kind is Kind.RECORD:
+        blob = parts["record"]["original"]["blob"]
+        raise InvalidProblem(
+            "The fields of this record were changed, so it is no longer the imported file. That file is its first "
+            f"revision, and the blob {blob}.",
+            code="cannot-be-exported",
+        )
     if kind is Kind.SKELETON:
         return _skeleton(name, parts, options)
     if kind is Kind.PROCESSED:

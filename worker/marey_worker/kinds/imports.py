@@ -1,4 +1,4 @@
-"""Kind `import`: imports stored files as skeletons, clips, annotations, aligned clips, models and graphs."""
+"""Kind `import`: imports stored files as skeletons, clips, annotations, aligned clips, models, graphs and records."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 from marey_motion.errors import MotionError
 from marey_motion.importing.files import import_file, mapping_part, planned_entry, refusal_of
 from marey_motion.importing.graphs import FEW, NamedModel, graph_item
-from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
+from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile, ImportedItem
 from marey_motion.importing.plan import PlannedFile, plan_imports, reading_order
 from marey_motion.importing.siblings import AxisFinding, axes_of_skeletons, axis_of_siblings
 from marey_schemas.documents.clips import Check
@@ -81,7 +81,7 @@ class _Importing:
             found = self._read(planned, sibling_axis)
             if found.axis is not None and not found.axis.is_clear and not is_last:
                 return None, found.axis
-            items = found.items if found.graph is None else (self._graph_item(found.graph),)
+            items = found.items if found.graph is None else (*found.items, self._graph_item(found))
         except NoSuchThing as error:
             return refused_entry(planned.name, Refusal(code="blob-missing", detail=str(error))), None
         except FileTooLarge as error:
@@ -124,8 +124,17 @@ class _Importing:
         hierarchy = self._context.document(Kind.SKELETON, item.id, item.revision, "hierarchy")
         return GivenSkeleton(item.id, item.revision, hierarchy)
 
-    def _graph_item(self, graph: ImportedGraph) -> ImportedItem:
-        return graph_item(graph, self._find_models)
+    def _graph_item(self, found: ImportedFile) -> ImportedItem:
+        """Return the item of the graph in a file; its models may be in the same file."""
+        assert found.graph is not None
+        before = len(self._models)
+        for item in found.items:
+            self._note_model(item)
+        try:
+            return graph_item(found.graph, self._find_models)
+        except MotionError:
+            del self._models[before:]  # the file is refused
+            raise
 
     def _find_models(self, name: str, collection: str | None) -> tuple[int, list[NamedModel]]:
         """Find models of this job and of the project by name; return their number and the first few of them.
@@ -158,6 +167,10 @@ class _Importing:
                 same_skeleton=item.same_skeleton,
             )
         )
+        self._note_model(item)
+
+    def _note_model(self, item: ImportedItem) -> None:
+        """Remember a model, to which graphs of this job may refer."""
         if item.kind is Kind.MODEL:
             path = f"{item.collection}/{item.item_name}".lstrip("/")
             self._models.append((item.collection, item.item_name, NamedModel(path, {"output": item.name})))

@@ -14,7 +14,7 @@ from marey_client.cli.terminal.following import JOB, Sources, Wait, clips_at, fo
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_pairs, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
-from marey_client.cli.terminal.typed_values import assignment, is_frame, json_or_text, read_json
+from marey_client.cli.terminal.typed_values import assignment, is_frame, json_or_text
 from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationForm, EndIndex
 from marey_schemas.wording import counted
 
@@ -222,7 +222,7 @@ def import_annotation(
         typer.Argument(
             exists=True,
             dir_okay=False,
-            help="A JSON file of Marey's predecessor, the older programs that Marey replaces.",
+            help="A file of Marey's predecessor, the older programs that Marey replaces (JSON, BSON or bz2).",
         ),
     ],
     layer: Annotated[str, typer.Option(help="Name of the annotation layer, such as steps.")] = "imported",
@@ -240,16 +240,16 @@ def import_annotation(
     label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import an annotation of a clip from a file of Marey's predecessor."""
+    """Import an annotation of a clip from a file of Marey's predecessor.
+
+    `marey annotation export` writes this file again, byte for byte, unless the annotation was changed.
+    """
     from marey_schemas.kinds import Kind
 
-    document = read_json(file)
-    if not isinstance(document, dict):
-        raise WrongUsage(f"{file} does not contain a JSON object")
     options = {"layer": layer, "name": name, "end_index": end_index, "labels": tuple(label) if label else None}
     with connect(context) as marey:
         found = require_item(marey, Address.parse(clip), [Kind.CLIP])
-        made = found.import_annotation(document, **{key: value for key, value in options.items() if value is not None})
+        made = found.import_annotation(file, **{key: value for key, value in options.items() if value is not None})
     return print_json(made.item) if as_json else typer.echo(f"{made.project}/{made.path}")
 
 

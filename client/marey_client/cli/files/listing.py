@@ -300,9 +300,13 @@ def _rounded(value: object) -> object:
 
 
 def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
-    """Yield names and values that describe an item; for a clip also its skeleton, source and warnings."""
+    """Yield names and values that describe an item; for a clip also its skeleton, source and warnings.
+
+    For a record of the predecessor, yield also its fields.
+    """
     from marey_client.errors import NotFound
     from marey_client.handles.clips import ClipHandle
+    from marey_schemas.kinds import Kind
 
     yield from item.item.model_dump(mode="json", exclude={"parts", "summary", "facets", "rev", "tags"}).items()
     yield "tags", " ".join(item.item.tags)
@@ -319,6 +323,8 @@ def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
         yield "stale", f"{edge.kind} {edge.name} has newer revisions than {edge.revision}"
     for name, one in item.item.parts.items():
         yield f"part {name}", f"{one.size_bytes} bytes, {one.schema_}, {one.document}"
+    if item.item.kind is Kind.RECORD:
+        yield from item.part("record").get("fields", {}).items()
     if isinstance(item, ClipHandle) and "info" in item.item.parts:
         info = item.info()
         if info.source is not None:

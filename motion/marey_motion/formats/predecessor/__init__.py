@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor.annotation import is_annotation
 from marey_motion.formats.predecessor.clips import motion_of_document, write_predecessor, write_predecessor_skeleton
-from marey_motion.formats.predecessor.encoding import decode_document
+from marey_motion.formats.predecessor.encoding import decode_content
 from marey_motion.formats.predecessor.graph import is_graph
 from marey_motion.formats.predecessor.model_layouts import layout_of
+from marey_motion.formats.predecessor.records import form_of_record
 from marey_motion.formats.predecessor.skeleton_model import is_skeleton_model
 from marey_motion.formats.predecessor.tree import is_tree
+from marey_motion.formats.predecessor.zipped_graph import MARK
 from marey_motion.importing.source import SourceDocument, SourceMotion, Subject
 from marey_motion.skeleton import Skeleton
 
@@ -40,16 +43,22 @@ def read_predecessor(
 
     Returns
     -------
-    SourceMotion or SourceDocument    motion in centimetres, or the document of a model, tree or graph
+    SourceMotion or SourceDocument    motion in centimetres, or the document of a model, tree, graph or record
 
     Raises
     ------
     FormatError    if a document is invalid; the error names the field, and the joint if there is one
     """
-    document = decode_document(data, file)
-    subject = _subject_of(document)
-    if subject is not None:
+    if data.startswith(MARK):
+        return SourceDocument("zipped graph", {})
+    document = decode_content(data, file)
+    if isinstance(document, dict) and (subject := _subject_of(document)) is not None:
         return SourceDocument(subject, document)
+    if (form := form_of_record(document)) is not None:
+        return SourceDocument("record", {"form": form, "content": document})
+    if isinstance(document, list):
+        message = "the file contains a list, but is no history of edits, whose entries are [command, parameters]"
+        raise FormatError(message, code="document-unknown", file=file)
     return motion_of_document(
         document,
         file,

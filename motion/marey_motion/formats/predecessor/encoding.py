@@ -49,10 +49,32 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
     ------
     FormatError    if the bytes are in none of the three encodings or contain no document
     """
+    document = decode_content(data, file)
+    if not isinstance(document, dict):
+        raise FormatError("the file contains no document", code="document-damaged", file=file)
+    return document
+
+
+def decode_content(data: bytes, file: str) -> dict[str, Any] | list[Any]:
+    """Decode a file that contains a document or, in JSON, a list; otherwise as `decode_document`.
+
+    Parameters
+    ----------
+    data : bytes    content of the file
+    file : str    name of the file, for messages
+
+    Returns
+    -------
+    dict or list    the document or the list
+
+    Raises
+    ------
+    FormatError    if the bytes are in none of the three encodings or contain neither
+    """
     if data.startswith(_BZ2_MARK):
         data = _decompressed(data, file)
     try:
-        if data.lstrip()[:1] == b"{" and not _is_bson(data):
+        if data.lstrip()[:1] in (b"{", b"[") and not _is_bson(data):
             document = json.loads(data.decode("utf-8-sig"))
         else:
             document = bson.decode(data)
@@ -60,7 +82,7 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
         if isinstance(error, bson.errors.BSONError) and not str(error):
             raise MemoryError from error  # which bson replaces by an error of its own without a text
         raise FormatError(f"the document cannot be read: {error}", code="document-damaged", file=file) from error
-    if not isinstance(document, dict):
+    if not isinstance(document, dict | list):
         raise FormatError("the file contains no document", code="document-damaged", file=file)
     return document
 

@@ -53,7 +53,8 @@ def read_skeleton_document(document: Document, file: str) -> SourceMotion:
         raise FormatError(
             "the document is neither a clip, which has a field 'poses' or 'frames', nor a skeleton, which "
             "has a field 'jointDescs' or 'root'; of the predecessor's documents, Marey imports clips, skeletons, "
-            "skeleton models, annotations, aligned clips, models, their trees, and graphs",
+            "skeleton models, annotations, aligned clips, models, their trees, graphs, and records of jobs, "
+            "transforms, edits and synthesis inputs",
             code="document-unknown",
             file=file,
         )

@@ -213,6 +213,8 @@ class _Publication:
                 if one.draft.kind is Kind.MODEL and part == "tree":
                     body = references.with_model_digest(body, digests.get("model"))
                 changed = body != one.bodies[part]
+                if one.draft.kind is Kind.GRAPH and changed:
+                    body = references.with_imported_content(body, one.bodies[part])
                 digest = content.digest
                 if isinstance(content, PreparedDocument):
                     fresh.append(with_body(content, body) if changed else content)

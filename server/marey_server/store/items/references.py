@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import select
 
+from marey_schemas.documents.originals import content_digest
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_schemas.wording import counted
@@ -37,6 +38,17 @@ def with_model_digest(tree: Tree, digest: str | None) -> Tree:
     if digest is None or isinstance(tree["model_digest"], str):
         return tree
     return {**tree, "model_digest": digest}
+
+
+def with_imported_content(tree: Tree, before: Tree) -> Tree:
+    """Return a graph that still counts as imported unchanged after its references to drafts were resolved.
+
+    `before` is the graph with the references to drafts, from which the digest of its content was computed.
+    """
+    original = tree.get("original")
+    if original is None or original["content"] != content_digest("graph", before):
+        return tree
+    return {**tree, "original": {**original, "content": content_digest("graph", tree)}}
 
 
 def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:

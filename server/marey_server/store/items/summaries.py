@@ -52,6 +52,9 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
         return _moved(bodies["motion"], skeleton, {"warnings": warnings, **take_record(info)})
     if kind is Kind.PROCESSED:
         return _moved(bodies["motion"], skeleton, _aligned(bodies["info"]))
+    if kind is Kind.RECORD:
+        record = bodies["record"]
+        return Summary({"form": record["form"], "fields": len(record.get("fields", {}))})
     if kind is Kind.STUDY:
         study = bodies["study"]
         return Summary({"title": study["title"], "motions": len(study["motions"])})

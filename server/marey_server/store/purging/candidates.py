@@ -24,8 +24,8 @@ MOST_REVISIONS = 20_000
 """Greatest number of revisions that one request purges; a single item may have more."""
 
 _ORDER = (
-    Kind.INDEX, Kind.STUDY, Kind.METRIC, Kind.CHARACTER, Kind.EVALUATION, Kind.GRAPH, Kind.EDIT, Kind.ANNOTATION,
-    Kind.MODEL, Kind.PROCESSED, Kind.CLIP, Kind.SKELETON,
+    Kind.RECORD, Kind.INDEX, Kind.STUDY, Kind.METRIC, Kind.CHARACTER, Kind.EVALUATION, Kind.GRAPH, Kind.EDIT,
+    Kind.ANNOTATION, Kind.MODEL, Kind.PROCESSED, Kind.CLIP, Kind.SKELETON,
 )  # fmt: skip
 """Kinds in the order of a purge.
 

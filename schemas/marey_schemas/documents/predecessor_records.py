@@ -1,0 +1,39 @@
+"""Records of work with Marey's predecessor: documents that have no other form in Marey."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field, StringConstraints
+
+from marey_schemas.base import Request
+from marey_schemas.documents.originals import StoredOriginal
+
+RecordForm = Literal["job", "transform run", "edit history", "synthesis input"]
+RECORD_FORMS: tuple[RecordForm, ...] = get_args(RecordForm)
+MOST_SHOWN = 1000
+"""Greatest number of fields of a record that are shown."""
+LONGEST_TEXT = 1000
+"""Greatest number of characters of a field that are shown."""
+HIDDEN = "(not shown: a credential)"
+"""What is shown in place of a credential."""
+
+FieldPointer = Annotated[str, StringConstraints(pattern=r"^(?:/|$)", max_length=LONGEST_TEXT)]
+FieldValue = Annotated[str, StringConstraints(max_length=LONGEST_TEXT)] | bool | int | float | None
+
+
+class PredecessorRecord(Request):
+    """Part `record`: a document of Marey's predecessor that is kept, and given back, as it is.
+
+    Marey does not carry it out. Its fields are shown for people; `original` is the file itself.
+    """
+
+    schema_: Literal["marey/predecessor-record@1"] = Field("marey/predecessor-record@1", alias="schema")
+    form: RecordForm = Field(description="What the document records.")
+    fields: dict[FieldPointer, FieldValue] = Field(
+        default_factory=dict,
+        max_length=MOST_SHOWN,
+        description="Values by their JSON Pointers in the document. Credentials are hidden, long texts cut off.",
+    )
+    fields_left_out: int = Field(0, ge=0, description="Number of further values, which are only in the file.")
+    original: StoredOriginal = Field(description="The imported file.")

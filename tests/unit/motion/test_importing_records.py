@@ -1,0 +1,100 @@
+"""Import of records of work with the predecessor: what is recognised, shown and hidden."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from typing import Any
+
+import bson
+import pytest
+from tests.support import predecessor_documents as old
+from tests.support import predecessor_records as written
+
+from marey_motion.importing.files import import_file
+from marey_motion.importing.items import FileToImport, ImportedFile
+from marey_motion.importing.plan import plan_imports
+from marey_schemas.documents.predecessor_records import HIDDEN, LONGEST_TEXT, MOST_SHOWN, PredecessorRecord
+from marey_schemas.kinds import Kind
+
+DIGEST = f"sha256:{'1' * 64}"
+
+
+def imported(data: bytes, name: str = "one.json") -> ImportedFile:
+    return import_file(FileToImport(plan_imports([name])[0], data, DIGEST))
+
+
+def record(content: Any) -> PredecessorRecord:
+    found = imported(json.dumps(content).encode())
+    assert found.refusal is None, found.refusal
+    (item,) = found.items
+    assert item.kind is Kind.RECORD
+    return PredecessorRecord.model_validate(item.parts["record"])
+
+
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [("train_job.json", "job"), ("statistics_run.bson", "transform run"), ("begin_history.json", "edit history"),
+     ("fetch_input.json", "synthesis input")],
+)  # fmt: skip
+def test_each_record_is_recognised_by_its_members_in_each_encoding(name: str, form: str) -> None:
+    found = imported(written.records()[name], f"in/{name}")
+    assert found.refusal is None
+    (item,) = found.items
+    assert (item.kind, item.collection, item.item_name) == (Kind.RECORD, "in", name.split(".")[0])
+    assert item.parts["record"]["form"] == form
+    assert item.parts["record"]["original"]["blob"] == DIGEST
+
+
+def test_fields_are_shown_by_their_pointers_with_lists_of_plain_values_as_one() -> None:
+    shown = record(written.synthesis_input()).fields
+    assert shown["/elementaryActions/0/action"] == "walk"
+    assert shown["/elementaryActions/0/constraints/0/trajectoryConstraints/1/position"] == "[40.0, null, 350.5]"
+    assert shown["/elementaryActions/1/constraints/0/keyframeConstraints/0/time"] == 1.5
+    shown = record(written.edit_history()).fields
+    assert (shown["/0/0"], shown["/1"]) == ("rotate_joint", '["mirror_animation", null]')
+    assert record([]).fields == {"": "[]"}
+
+
+def test_credentials_are_hidden_and_named_in_a_warning() -> None:
+    found = imported(json.dumps(written.job()).encode())
+    fields = found.items[0].parts["record"]["fields"]
+    assert fields["/token"] == fields["/job_desc/aws/secret_key"] == fields["/job_desc/aws/access_key"] == HIDDEN
+    assert fields["/job_desc/aws/src_bucket"] == "in"
+    assert written.SECRET not in json.dumps(found.items[0].parts)
+    (check,) = found.checks
+    assert check["code"] == "credentials-in-file"
+    assert "/job_desc/aws/secret_key" in check["message"]
+    assert imported(old.encode(written.transform_run(), "one.json")).checks == (), "its token is empty"
+    below = record({**written.job(), "token": {"value": [written.SECRET]}})
+    assert below.fields["/token"] == HIDDEN
+
+
+def test_what_json_cannot_contain_is_shown_as_text_and_long_documents_are_cut() -> None:
+    when = datetime.datetime(2019, 11, 14, tzinfo=datetime.UTC)
+    kept = {"when": when, "id": bson.ObjectId("a" * 24), "raw": b"\x00", "nan": float("nan"), "big": 2**60}
+    odd = {**written.transform_run(), "hparams": kept}
+    found = imported(bson.encode(odd), "one.bson")
+    assert found.refusal is None, found.refusal
+    fields = PredecessorRecord.model_validate(found.items[0].parts["record"]).fields
+    assert str(fields["/hparams/when"]).startswith("2019-11-14 00:00:00")
+    assert (fields["/hparams/id"], fields["/hparams/nan"], fields["/hparams/big"]) == ("a" * 24, "nan", str(2**60))
+    many = record([["smooth", {"window": number}] for number in range(MOST_SHOWN)])
+    assert (len(many.fields), many.fields_left_out) == (MOST_SHOWN, MOST_SHOWN)
+    long = record([["smooth", {"text": "\ud800" + "x" * 5000}]]).fields["/0/1/text"]
+    assert isinstance(long, str)
+    assert len(long) == LONGEST_TEXT
+
+
+def test_fields_that_look_like_references_to_stored_bytes_are_none() -> None:
+    forged = {"dtype": "<f4", "shape": [1], "content": DIGEST, "blob": DIGEST, "output": "x"}
+    fields = record({**written.transform_run(), "hparams": forged}).fields
+    assert fields["/hparams/blob"] == DIGEST
+    assert not {"blob", "content", "dtype"} & fields.keys()
+
+
+def test_other_lists_are_refused_with_the_form_of_a_history() -> None:
+    refused = imported(b"[1, 2]").refusal
+    assert refused is not None
+    assert refused.code == "document-unknown"
+    assert "[command, parameters]" in refused.detail
