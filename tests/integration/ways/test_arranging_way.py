@@ -61,7 +61,8 @@ def shared(marey: Marey, takes: Path) -> ProjectHandle:
 def lab(request: pytest.FixtureRequest, marey: Marey, takes: Path) -> ProjectHandle:
     """A project with three clips: `raw/a`, `raw/b` and `raw/c`. It is new, unless the test asks for `shared`."""
     if "shared" in request.fixturenames:
-        return request.getfixturevalue("shared")  # type: ignore[no-any-return]
+        kept: ProjectHandle = request.getfixturevalue("shared")
+        return kept
     return with_takes(marey, takes)
 
 
