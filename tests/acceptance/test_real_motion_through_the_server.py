@@ -1,4 +1,4 @@
-"""Upload of every BVH file of a real collection to a server, and its download in every format."""
+"""Upload of the BVH files of a real collection to a server, and their download in every format."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.support.another_loader import files_to_compare, positions_by_another_loader
-from tests.support.server_process import ServerProcess
+from tests.support.server_process import serving
 
 from marey_client import Marey
 from marey_client.handles.clips import ClipHandle
@@ -37,17 +37,17 @@ class Uploaded:
 
 @pytest.fixture(scope="module")
 def uploaded(mocap: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Uploaded]:
-    server = ServerProcess(tmp_path_factory.mktemp("collection")).start(workers=1)
-    with server.client() as marey:
+    """The collection on a server; of many files with the same skeleton, a few, except in the tier `soak`."""
+    with serving(tmp_path_factory.mktemp("collection")) as server, server.client() as marey:
         lab = marey.project("lab")
         marey.transport.send("POST", "/projects", content=b'{"name": "lab"}')
-        files = [file for file in find_files([mocap]).files if file.name.endswith(".bvh")]
+        named = {file.name: file for file in find_files([mocap]).files if file.name.endswith(".bvh")}
+        files = [named[name] for name in files_to_compare(list(named))]
         entries = lab.imports.upload(files)
         paths = {file.name: file.path for file in files}
         clips = {entry.name: lab.clips.get(entry.item) for entry in entries if entry.frames and entry.item}
         assert len(clips) >= len(files) - 3
         yield Uploaded(marey, lab, paths, clips)
-    server.stop()
 
 
 def test_originals_come_back_byte_for_byte(uploaded: Uploaded, tmp_path: Path) -> None:
@@ -56,10 +56,8 @@ def test_originals_come_back_byte_for_byte(uploaded: Uploaded, tmp_path: Path) -
 
 
 def test_bvh_files_put_every_joint_where_the_clip_has_it(uploaded: Uploaded, tmp_path: Path) -> None:
-    compared = files_to_compare(list(uploaded.clips))
-    assert len(compared) > 40
-    for name in compared:
-        clip = uploaded.clips[name]
+    assert len(uploaded.clips) > 40
+    for name, clip in uploaded.clips.items():
         written = positions_by_another_loader(clip.export(tmp_path, format="bvh")) * 0.01
         assert np.abs(written - positions_of(uploaded.lab, clip)).max() < 1e-4, name
 

@@ -58,6 +58,7 @@ def test_the_wheel_serves_pages_and_a_new_database_without_the_source_tree_and_n
     words = ["serve", "--workers", "0", "--port", str(port), "--data", str(tmp_path / "data")]
     environment = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
     environment |= {"PYTHONPATH": str(tmp_path / "installed"), "PATH": str(tmp_path / "no-programs")}
+    environment["MAREY_WARM_UP"] = "false"  # a new installation would compile all kernels
     with (tmp_path / "log").open("wb") as log:
         server = subprocess.Popen(
             [sys.executable, "-m", "marey_client.cli", *words], cwd=tmp_path, env=environment, stdout=log, stderr=log

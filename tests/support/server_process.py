@@ -94,6 +94,8 @@ class ServerProcess(MareyProcess):
 
     def __init__(self, folder: Path, database_url: str | None = None, **environment: str) -> None:
         super().__init__(folder / "server.log")
+        self.worker: WorkerProcess | None = None
+        """The worker that `serving` has started."""
         self.data = folder / "data"
         self.port = reserved_port()
         self.url = f"http://127.0.0.1:{self.port}"
@@ -159,12 +161,21 @@ class WorkerProcess(MareyProcess):
 
 @contextlib.contextmanager
 def serving(folder: Path, database_url: str | None = None, **environment: str) -> Iterator[ServerProcess]:
-    """Run a server with one worker while the `with` block runs; then check the server's exit status."""
-    process = ServerProcess(folder, database_url, **environment).start(workers=1)
+    """Run a server with one worker while the `with` block runs; then check the server's exit status.
+
+    Unlike a worker that the server starts, this worker is forked, and so are its children. They need not import their
+    modules, which takes a few seconds of processor time.
+    """
+    process = ServerProcess(folder, database_url, **environment).start()
+    worker = process.worker = WorkerProcess(folder / "worker.log", **environment)
     try:
+        worker.start(process.url, process.token, folder, name="worker")
         yield process
     finally:
-        status = process.stop()
+        try:
+            worker.stop()
+        finally:
+            status = process.stop()
     assert status == 0, process.log.read_text()[-3000:]
 
 

@@ -45,12 +45,25 @@ def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def lab(marey: Marey, takes: Path) -> ProjectHandle:
-    """A project with three clips: `raw/a`, `raw/b` and `raw/c`."""
+def with_takes(marey: Marey, takes: Path) -> ProjectHandle:
     project = marey.create_project(ProjectCreate(name=next(NAMES)))
     project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
     return project
+
+
+@pytest.fixture(scope="module")
+def shared(marey: Marey, takes: Path) -> ProjectHandle:
+    """The project of all tests that change nothing."""
+    return with_takes(marey, takes)
+
+
+@pytest.fixture
+def lab(request: pytest.FixtureRequest, marey: Marey, takes: Path) -> ProjectHandle:
+    """A project with three clips: `raw/a`, `raw/b` and `raw/c`. It is new, unless the test asks for `shared`."""
+    if "shared" in request.fixturenames:
+        kept: ProjectHandle = request.getfixturevalue("shared")
+        return kept
+    return with_takes(marey, takes)
 
 
 @pytest.fixture
@@ -101,6 +114,7 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
     assert [(one["id"], one["name"], one["collection"]) for one in moved["moved"]] == [(ids["a"], "walk", "")]
 
 
+@pytest.mark.usefixtures("shared")
 @pytest.mark.parametrize(
     ("arguments", "status", "told"),
     [
@@ -137,6 +151,7 @@ def test_what_cannot_be_is_told_and_changes_nothing(
     assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
 
 
+@pytest.mark.usefixtures("shared")
 def test_clips_whose_records_cannot_be_changed_are_named_with_the_reason(
     run: Command, lab: ProjectHandle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +164,7 @@ def test_clips_whose_records_cannot_be_changed_are_named_with_the_reason(
     assert "raw/b: the server has stopped" in told
 
 
+@pytest.mark.usefixtures("shared")
 def test_explanations_of_several_kinds_are_one_document(run: Command, lab: ProjectHandle) -> None:
     arguments = ("ls", "lab", "--explain", "--query", "name = a", "--kind", "clip", "--kind", "skeleton", "--json")
     assert len(json.loads(run(*arguments).stdout)) == 2
@@ -405,6 +421,7 @@ def test_no_item_is_tagged_if_one_would_have_too_many_tags(run: Command, lab: Pr
     assert all("slow" not in clip.item.tags for clip in lab.clips.list())
 
 
+@pytest.mark.usefixtures("shared")
 def test_a_query_is_explained_by_what_each_condition_hides(run: Command) -> None:
     shown = run("ls", "lab", "--query", "frames > 1 and name != a", "--explain")
     assert "2 of 3 clips" in shown.stderr
@@ -412,6 +429,7 @@ def test_a_query_is_explained_by_what_each_condition_hides(run: Command) -> None
     assert re.search(r"frames > 1 +0 +0", shown.stdout)
 
 
+@pytest.mark.usefixtures("shared")
 @pytest.mark.parametrize(
     ("rows", "told"),
     [
@@ -434,6 +452,7 @@ def test_a_wrong_table_changes_no_record(
     assert {clip.item.revision for clip in lab.clips.list()} == {1}
 
 
+@pytest.mark.usefixtures("shared")
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

@@ -36,7 +36,7 @@ WORDS = ("--speeds", "1", "--turns=-50,50", "--duration", "3", "--no-baseline")
 """The options of `GRID` on the command line."""
 BISECT_WITHOUT_LIMIT = ("dataset", "bisect", "lab/gaits", "--good", "v1", "--metric", "offset_mean_m", *WORDS)
 BISECT = (*BISECT_WITHOUT_LIMIT, "--half-way")
-LONG = ("--speeds", "1:3:0.5", "--duration", "20")
+LONG = ("--speeds", "1:3:0.5", "--duration", "20", "--replicates", "3")
 """Options that make an evaluation take so long that it can be interrupted."""
 LEFT_TURNS = [f"raw/walk {speed} 60" for speed in ("1", "1.5", "2")]
 
@@ -142,7 +142,7 @@ def test_clips_are_loops_in_the_versions_that_have_their_tag(
     loops = {}
     for version in ("v1", "main"):
         clips = DatasetInput(dataset="gaits", version=version)
-        found = lab.evaluation(lab.evaluate(clips, name=version, database={"end_policy": "loop"}, **GRID))
+        found = lab.evaluation(lab.evaluate(clips, name=version, database={"end_policy": "loop"}, report=False, **GRID))
         loops[version] = [one["clip"] for one in found.clips() if one["loop"]]
     assert loops == {"v1": [], "main": [clip.path]}
 
@@ -184,7 +184,8 @@ def test_versions_that_cannot_be_evaluated_are_skipped(gaits: DatasetHandle, run
 def test_an_interrupted_search_is_continued_by_the_same_command(
     lab: ProjectHandle, gaits: DatasetHandle, run: CommandLine, marey: Marey
 ) -> None:
-    spoiled = spoil(gaits)
+    gaits.commit("Rename a walk", changes=moved("raw/walk 1 0", "raw/slow"))
+    spoiled = gaits.commit("Drop the left turns", changes=removed(*LEFT_TURNS))
     process = run.start(*BISECT, *LONG)
     assert process.stderr is not None
     for line in process.stderr:

@@ -26,14 +26,15 @@ pytestmark = pytest.mark.timeout(300)
 SMALL: dict[str, Any] = {
     "speeds_m_s": (1.0, 2.0),
     "turn_rates_deg_s": (-50.0, 0.0, 50.0),
-    "duration_s": 10.0,
+    "duration_s": 4.0,
     "replicates": 1,
+    "report": False,
 }
 """12 trials in 2 tasks."""
 
 
 def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, run: CommandLine, tmp_path: Path) -> None:
-    grid = ("--speeds", "1:2:1", "--turns=-50:50:50", "--duration", "10", "--replicates", 3)
+    grid = ("--speeds", "1:2:1", "--turns=-50:50:50", "--duration", "4", "--replicates", 3)
     told = run("evaluate", "lab/walks", *grid, "--out", "report.html").stdout
     (found,) = lab.evaluations.list()
     assert found.path == "walks-eval"

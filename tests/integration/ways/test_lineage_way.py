@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.evaluation_takes import quick
 
 from marey_client.project import ProjectHandle
 
@@ -28,7 +29,7 @@ def test_the_commands_of_the_page_trace_results_and_outdated_inputs(
 ) -> None:
     page = PAGE.read_text(encoding="utf-8").replace("lineage.svg", str(tmp_path / "lineage.svg"))
     made, inputs, exported, outdated = (
-        [shlex.split(line, comments=True)[1:] for line in block.splitlines()]
+        [quick(shlex.split(line, comments=True)[1:]) for line in block.splitlines()]
         for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     )
     for line in made:

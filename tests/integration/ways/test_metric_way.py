@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.evaluation_takes import QUICK as EVALUATION
 
 from marey_client import Marey
 from marey_client.errors import Invalid, JobUnsuccessful
@@ -20,6 +21,8 @@ from marey_schemas.documents.metrics import built_in_metric
 
 pytestmark = pytest.mark.timeout(300)
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "compare-clips-as-people-see-them.md"
+QUICK = {"evaluate": EVALUATION, "suggest": ("--estimation-replicates", "1", "--confirmation-replicates", "3")}
+"""Options that shorten commands of the page."""
 
 
 def test_the_commands_and_the_example_of_the_page_run(
@@ -29,7 +32,8 @@ def test_the_commands_and_the_example_of_the_page_run(
     for clip, name in zip(list(lab.clips.list(sort="name"))[:2], ("slow", "fast"), strict=True):
         run("mv", f"lab/{clip.path}", f"lab/walks/{name}")
     blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
-    done = [run(*shlex.split(line, comments=True)[1:]) for block in blocks for line in block.splitlines()]
+    lines = [shlex.split(line, comments=True)[1:] for block in blocks for line in block.splitlines()]
+    done = [run(*line, *QUICK.get(line[0], ())) for line in lines]
     assert "Only natural walks were judged." in done[0].stderr
     assert "metric: published/manhattan" in done[6].stdout
     assert "by the metric published/positions-sigmoid" in done[8].stdout

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.evaluation_takes import quick
 
 from marey_client.project import ProjectHandle
 from marey_motion.formats import write_bvh
@@ -52,7 +53,7 @@ def words_of(printed: str) -> list[list[str]]:
 
 def test_the_page_leaves_out_clips_by_rules_and_says_later_why(run: CommandLine, lab: ProjectHandle) -> None:
     def follow(*lines: str) -> list[subprocess.CompletedProcess[str]]:
-        return [run(*shlex.split(line, comments=True)[1:]) for line in lines]
+        return [run(*quick(shlex.split(line, comments=True)[1:])) for line in lines]
 
     def listed(line: str) -> list[Any]:
         (done,) = follow(f"{line} --json")

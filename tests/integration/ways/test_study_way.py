@@ -23,6 +23,8 @@ from marey_motion.arrays import Floats
 pytestmark = pytest.mark.timeout(600)
 
 TEXT = (Path(__file__).parents[3] / "docs" / "how-to" / "run-a-study.md").read_text(encoding="utf-8")
+TRIALS = 21
+"""Number of trials of each participant; the default of the page is three times as many."""
 
 
 def commands() -> list[list[str]]:
@@ -42,7 +44,7 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
 ) -> None:
     (run.folder / "consent.txt").write_text("I take part in this study.\n", encoding="utf-8")
     create, invite, status, listing, show, *exports, analyse, store, withdraw = commands()
-    run(*create)
+    run(*create, "--trials", TRIALS)
     made = run(*invite)
     codes = re.findall(r"/s/#(mareystudy_\w+)", made.stdout)
     assert len(codes) == 3
@@ -66,7 +68,7 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
     with httpx.Client(base_url=f"{server.url}/api/v1", headers={"Sec-Fetch-Site": "same-origin"}) as browser:
         assert browser.post("/browser-sessions", json={"code": page.fragment}).status_code == 201
         seen = browser.get(f"/projects/lab/studies/{study.id}/differences?revision=1").json()
-        assert (seen["participants"], seen["trials"], len(seen["order"])) == (3, 189, len(design.motions))
+        assert (seen["participants"], seen["trials"], len(seen["order"])) == (3, 3 * TRIALS, len(design.motions))
         assert browser.delete("/browser-sessions/lab").status_code == 204
         assert browser.get("/projects/lab").status_code in (401, 404)
 
@@ -75,7 +77,7 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
     rows = list(csv.DictReader((run.folder / "trials.csv").open(encoding="utf-8")))
     pairs = list(csv.DictReader((run.folder / "pairs.csv").open(encoding="utf-8")))
     people = json.loads((run.folder / "trials.json").read_text(encoding="utf-8"))
-    assert (len(rows), len(pairs), len(people)) == (3 * 63, 3 * 63 * 5, 3)
+    assert (len(rows), len(pairs), len(people)) == (3 * TRIALS, 3 * TRIALS * 5, 3)
     assert {row["participant"] for row in rows} == {"p1", "p2", "p3"}
 
     printed = run(*analyse)
@@ -83,7 +85,7 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
     assert metric["schema"] == "marey/perceptual-metric@1"
     assert metric["study"] == {"item": study.id, "revision": 1}
     assert abs(sum(one["share"] for one in metric["components"]) - 1) < 1e-6
-    assert (metric["fit"]["participants"], metric["fit"]["trials"]) == (3, 189)
+    assert (metric["fit"]["participants"], metric["fit"]["trials"]) == (3, 3 * TRIALS)
     report = (run.folder / "report.html").read_text(encoding="utf-8")
     assert "velocities, manhattan" in report
     assert "best rmse" in printed.stdout

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.evaluation_takes import quick
 from tests.support.server_process import ServerProcess, serving
 
 from marey_client.archives import receiving, transfers
@@ -62,7 +63,7 @@ def told(run: CommandLine, server: ServerProcess, other_server: ServerProcess) -
 
     def say(line: str, *, status: int = 0) -> str:
         line = line.replace("$PARTNER", other_server.url).replace("$STUDIO", server.url)
-        done = run(*shlex.split(line, comments=True)[1:], status=status, MAREY_DATA=str(run.folder / "none"))
+        done = run(*quick(shlex.split(line, comments=True)[1:]), status=status, MAREY_DATA=str(run.folder / "none"))
         return done.stdout + done.stderr
 
     return say

@@ -22,9 +22,13 @@ pytestmark = pytest.mark.timeout(300)
 EXAMPLES = 12
 
 
+QUICK: dict[str, Any] = {"report_samples": 20, "spatial_components": 1, "seed": 5}
+"""Options of a model whose report has one component and figures of few samples."""
+
+
 @pytest.fixture(scope="module")
 def walk(lab: ProjectHandle) -> ModelHandle:
-    return lab.model(lab.train_model("aligned", name="walk", into="models", tags=("nightly",), seed=5))
+    return lab.model(lab.train_model("aligned", name="walk", into="models", tags=("nightly",), **QUICK))
 
 
 def test_a_model_tells_how_good_it_is_and_what_it_was_made_of(lab: ProjectHandle, walk: ModelHandle) -> None:
@@ -46,7 +50,7 @@ def test_a_model_tells_how_good_it_is_and_what_it_was_made_of(lab: ProjectHandle
 
 
 def test_the_same_clips_options_and_seed_make_the_same_model(lab: ProjectHandle, walk: ModelHandle) -> None:
-    again = lab.model(lab.train_model("aligned", name="walk", into="again", seed=5, cache="off"))
+    again = lab.model(lab.train_model("aligned", name="walk", into="again", cache="off", **QUICK))
     assert again.item.parts["model"].document == walk.item.parts["model"].document
     assert again.item.parts["report"].document == walk.item.parts["report"].document
 

@@ -23,6 +23,8 @@ pytestmark = pytest.mark.timeout(300)
 
 EXAMPLES = 12
 SAMPLES = 1500
+QUICK: dict[str, Any] = {"leave_one_out": False, "report_samples": 0, "report": False}
+"""Options of a model that is trained without measuring how good it is."""
 AHEAD = {"type": "root_position", "at": "end", "target_m": [None, 1.2]}
 TAIL = {"type": "joint_position", "at": "end", "joint": "tail", "target_m": [0, 0, 0]}
 
@@ -30,13 +32,13 @@ TAIL = {"type": "joint_position", "at": "end", "joint": "tail", "target_m": [0, 
 @pytest.fixture(scope="module")
 def bare(lab: ProjectHandle) -> ModelHandle:
     """A model without a tree."""
-    return lab.model(lab.train_model("aligned", name="bare", into="models", report=False))
+    return lab.model(lab.train_model("aligned", name="bare", into="models", **QUICK))
 
 
 @pytest.fixture(scope="module")
 def walk(lab: ProjectHandle) -> ModelHandle:
     """A model with a tree."""
-    made = lab.model(lab.train_model("aligned", name="walk", into="models", report=False))
+    made = lab.model(lab.train_model("aligned", name="walk", into="models", **QUICK))
     made.make_tree(seed=3, samples=SAMPLES)
     return lab.models.get(made.id)
 
@@ -100,9 +102,9 @@ def test_a_model_without_a_tree_is_searched_with_one_drawn_for_it(bare: ModelHan
 
 
 def test_a_tree_of_a_model_that_was_trained_anew_is_not_used(lab: ProjectHandle) -> None:
-    made = lab.model(lab.train_model("aligned", name="changing", into="models", report=False))
+    made = lab.model(lab.train_model("aligned", name="changing", into="models", **QUICK))
     made.make_tree(samples=500)
-    again = lab.model(lab.train_model("aligned", name="changing", into="models", report=False, scaling="none"))
+    again = lab.model(lab.train_model("aligned", name="changing", into="models", **QUICK, scaling="none"))
     assert again.id == made.id
     assert set(again.item.parts) == {"model", "tree"}
     assert [step.tree for step in again.search([AHEAD]).steps] == ["drawn"]
