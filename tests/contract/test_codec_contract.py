@@ -107,7 +107,7 @@ def test_every_codec_reads_or_refuses_rubbish_and_never_crashes(data: bytes) -> 
 
 
 @given(tree=objects, changes=st.lists(st.tuples(st.integers(0), st.integers(0, 255)), min_size=1, max_size=4))
-@settings(max_examples=examples(300 if is_soak() else 100))
+@settings(max_examples=examples(300))
 def test_every_codec_reads_or_refuses_changed_bytes_and_never_crashes(
     tree: object, changes: list[tuple[int, int]]
 ) -> None:
@@ -121,7 +121,7 @@ def test_every_codec_reads_or_refuses_changed_bytes_and_never_crashes(
 
 
 @given(tree=objects, cut=st.integers(0))
-@settings(max_examples=examples(100 if is_soak() else 50))
+@settings(max_examples=examples(100))
 def test_every_codec_refuses_truncated_bytes(tree: object, cut: int) -> None:
     for codec in CODECS:
         data = codec.encode(tree)
