@@ -11,7 +11,6 @@ import os
 import shlex
 import signal
 import socket
-import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, nullcontext
@@ -46,6 +45,7 @@ from marey_server.http.openapi import build_document
 from marey_server.http.resource import Resource
 from marey_server.http.routes import RouteTable
 from marey_server.launchers.pools import keeping_workers
+from marey_server.process import programs
 from marey_server.process.administrators import TOKEN_FILE, make_first_administrator
 from marey_server.process.children import Children
 from marey_server.process.computing import compute_on_one_thread_each
@@ -344,9 +344,7 @@ async def warming(children: Children) -> AsyncIterator[None]:
 
     The server answers requests meanwhile. At the end of the `async with` block, an unfinished compilation is stopped.
     """
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "marey_motion.warm_up", env=clean_environment()
-    )
+    process = await programs.start_program("-m", "marey_motion.warm_up", environment=clean_environment())
 
     async def warm() -> None:
         await process.wait()

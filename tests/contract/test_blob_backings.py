@@ -25,6 +25,8 @@ from marey_server.store.object_storage.awaiting import Carried
 from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.xdist_group("object storage")
+
 SIZES = (0, 1, 1000, CHUNK_BYTES - 1, CHUNK_BYTES, CHUNK_BYTES + 1, 3 * CHUNK_BYTES + 17)
 OLD_US = 2 * 24 * 3600 * 1_000_000
 

@@ -27,13 +27,23 @@ def making(cluster: StubCluster, **options: bool) -> Callable[[LaunchContext], L
     return lambda context: make_kubernetes_launcher(replace(context, options=usual | options))
 
 
-class TestKubernetesLauncher(LauncherContract):
+class StubContract(LauncherContract):
+    """Rules for launchers, checked with the stub cluster."""
+
+    @pytest.fixture
+    def new_processes(self, cluster: StubCluster) -> Iterator[None]:
+        cluster.kubelet.new_processes = True
+        yield
+        cluster.kubelet.new_processes = False
+
+
+class TestKubernetesLauncher(StubContract):
     @pytest.fixture
     def make_launcher(self, cluster: StubCluster) -> Callable[[LaunchContext], Launcher]:
         return making(cluster)
 
 
-class TestIndexedJobs(LauncherContract):
+class TestIndexedJobs(StubContract):
     @pytest.fixture
     def make_launcher(self, cluster: StubCluster) -> Callable[[LaunchContext], Launcher]:
         return making(cluster, indexed=True)

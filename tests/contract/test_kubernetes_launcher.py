@@ -6,7 +6,6 @@ import asyncio
 import base64
 import datetime
 import logging
-import sys
 from collections.abc import Coroutine, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +13,7 @@ from typing import Any, TypeVar
 
 import pytest
 from kubernetes.aio.config import incluster_config
+from tests.support.cluster.kubelet import SCRIPT
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
 from tests.support.webhook_receiver import SELF_SIGNED
 
@@ -27,9 +27,9 @@ from marey_server.launchers.launcher import EngineError, LaunchContext, Launcher
 T = TypeVar("T")
 
 SECRET = "marey_secret_of_workers"
-WAITS = (sys.executable, "-c", "import signal, sys, time; signal.signal(15, lambda *_: sys.exit(0)); time.sleep(600)")
-FAILS = (sys.executable, "-uc", "import sys; print('first line'); sys.exit('no such device')")
-ENDS = (sys.executable, "-c", "pass")
+WAITS = (*SCRIPT, "import signal, sys, time; signal.signal(15, lambda *_: sys.exit(0)); time.sleep(600)")
+FAILS = (*SCRIPT, "import sys; print('first line', flush=True); sys.exit('no such device')")
+ENDS = (*SCRIPT, "pass")
 PATIENCE_S = 60.0
 
 
@@ -230,7 +230,7 @@ def test_a_worker_whose_deadline_passes_is_ended(bench: Bench) -> None:
 
 
 def test_an_evicted_worker_is_replaced_once_it_has_ended(bench: Bench, cluster: StubCluster) -> None:
-    cluster.kubelet.images[IMAGE] = (sys.executable, "-c", "import time; time.sleep(600)")
+    cluster.kubelet.images[IMAGE] = (*SCRIPT, "import time; time.sleep(600)")
     (name,) = bench.start()
     bench.until({name: "running"})
     (pod,) = cluster.running_pods()

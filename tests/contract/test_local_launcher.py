@@ -10,6 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 from tests.support.attached_worker import python_path
+from tests.support.forked_programs import start_program
 from tests.support.launcher_contract import LABELS, PATIENCE_S, Engine, LauncherContract, processes_of
 from tests.support.server_process import ServerProcess
 
@@ -18,12 +19,19 @@ from marey_schemas.queue.jobs import JobCreate
 from marey_server.launchers import local
 from marey_server.launchers.launcher import LaunchContext, Launcher, LauncherUnusable
 from marey_server.launchers.local import LocalLauncher
+from marey_server.process import programs
 
 
 class TestLocalLauncher(LauncherContract):
     @pytest.fixture
     def make_launcher(self) -> Callable[[LaunchContext], Launcher]:
         return LocalLauncher
+
+    @pytest.fixture(autouse=True)
+    def forked_workers(self, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Fork the workers, unless a test needs new processes."""
+        if "new_processes" not in request.fixturenames:
+            monkeypatch.setattr(programs, "start_program", start_program)
 
     def test_a_worker_that_was_killed_is_started_again(self, engine: Engine) -> None:
         (name,) = engine.start(1, key="k7")

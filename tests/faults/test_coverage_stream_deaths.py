@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.support.server_process import ServerProcess
+from tests.support.tiers import is_soak
 
 from marey_motion.evaluation.online import OnlineCoverage
 from marey_schemas.access import ProjectCreate
@@ -21,6 +22,8 @@ pytestmark = pytest.mark.timeout(900)
 RATE_HZ = 60.0
 CHUNK = 12
 DEATHS = 3
+SECONDS, BETWEEN_DEATHS = (30.0, 20) if is_soak() else (8.0, 10)
+"""Duration of the recording, and number of answers before each death."""
 
 
 @pytest.fixture
@@ -43,7 +46,7 @@ def test_frames_sent_while_the_server_is_killed_count_once_each(server: ServerPr
     marey = server.client()
     marey.create_project(ProjectCreate(name="lab"))
     stream = marey.project("lab").coverage_streams.begin(RATE_HZ)
-    roots = performance(30.0)
+    roots = performance(SECONDS)
     answers: list[CoverageProgress] = []
 
     def perform() -> None:
@@ -55,7 +58,7 @@ def test_frames_sent_while_the_server_is_killed_count_once_each(server: ServerPr
     performer = threading.Thread(target=perform)
     performer.start()
     for death in range(DEATHS):
-        while len(answers) < 20 * (death + 1):
+        while len(answers) < BETWEEN_DEATHS * (death + 1):
             assert performer.is_alive()
             time.sleep(0.001)
         server.kill()

@@ -2,34 +2,65 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
-import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.support.endurance.faults import FAULTS, plan
 from tests.support.endurance.installation import left_behind
 from tests.support.endurance.measured_growth import growth_of
+from tests.support.forked_programs import nursery
 
 pytestmark = pytest.mark.timeout(900)
 
 
-def trial(*words: str) -> subprocess.CompletedProcess[str]:
-    """Run a trial as its users do: it adopts orphans of its processes, which would disturb other tests."""
-    command = [sys.executable, "-m", "tests.support.endurance", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=800, check=False)
+@dataclass(frozen=True)
+class Ended:
+    """How a trial ended: its exit status, and its output with its errors."""
+
+    status: int
+    output: str
 
 
-def test_jobs_under_faults_have_the_results_of_a_quiet_run() -> None:
+Trial = Callable[..., Ended]
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Trial:
+    """Function that runs a trial in a process of its own: it adopts orphans, which would disturb other tests."""
+
+    def run(*words: str) -> Ended:
+        file = tmp_path / "output"
+        with file.open("wb") as output:
+            process = nursery().start(
+                ["tests.support.endurance", *words],
+                dict(os.environ),
+                output=output.fileno(),
+                with_stdin=False,
+                own_children=True,
+            )
+        try:
+            return Ended(process.wait(800), file.read_text())
+        finally:
+            process.kill()
+
+    return run
+
+
+def test_jobs_under_faults_have_the_results_of_a_quiet_run(trial: Trial) -> None:
     done = trial("faults", "--rounds", "10", "--seconds", "8", "--every", "0.7", "--workers", "3")
-    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
-    assert "fault 2 of" in done.stdout, done.stdout
-    assert "fire: 15 jobs" in done.stdout, done.stdout
+    assert done.status == 0, done.output[-6000:]
+    assert "fault 2 of" in done.output, done.output
+    assert "fire: 15 jobs" in done.output, done.output
 
 
 @pytest.mark.soak
-def test_the_trial_finds_that_fences_are_not_compared() -> None:
+def test_the_trial_finds_that_fences_are_not_compared(trial: Trial) -> None:
     """A worker that is suspended while it draws completes a job that another worker has by then.
 
     In one trial, all suspended workers may be idle, so there are up to three.
@@ -38,16 +69,16 @@ def test_the_trial_finds_that_fences_are_not_compared() -> None:
     told = ""
     for _ in range(3):
         done = trial("faults", *words, "--only", "worker suspended", "--without-fence")
-        told += done.stdout[-3000:] + done.stderr[-1000:]
-        if done.returncode == 1 and re.search(r"BROKEN (the item draw|fire)", done.stdout):
+        told += done.output[-3000:]
+        if done.status == 1 and re.search(r"BROKEN (the item draw|fire)", done.output):
             return
     pytest.fail(told)
 
 
 @pytest.mark.soak
-def test_a_short_load_breaks_no_rule() -> None:
+def test_a_short_load_breaks_no_rule(trial: Trial) -> None:
     done = trial("load", "--minutes", "1", "--rate", "8", "--read-ms", "5000")
-    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
+    assert done.status == 0, done.output[-6000:]
 
 
 def test_equal_seeds_give_equal_faults_and_every_kind_happens() -> None:

@@ -28,6 +28,8 @@ from marey_server.store.monitoring.readiness import find_faults
 from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.object_storage.client import Bucket, ObjectStorage, ObjectStorageProblem, StoredObject
 
+pytestmark = pytest.mark.xdist_group("object storage")
+
 DATA = os.urandom(100_000)
 DIGEST = digest_of(DATA)
 OLD_S = 2 * 24 * 3600.0

@@ -14,6 +14,7 @@ import psutil
 import pytest
 import sqlalchemy
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
+from tests.support.short_walks import write_short_walks
 from tests.support.tcp_proxy import TcpProxy
 from tests.support.tiers import is_soak
 
@@ -23,7 +24,7 @@ from marey_client.imports import LocalFile, find_files
 from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
 from marey_motion.formats import write_motion
-from marey_motion.gait import game_skeleton, generate_gait
+from marey_motion.gait import game_skeleton
 from marey_schemas.access import ProjectCreate
 from marey_schemas.encoding.digests import digest_of
 from marey_schemas.imports import ImportEntry
@@ -34,12 +35,8 @@ pytestmark = pytest.mark.timeout(900)
 
 @pytest.fixture(scope="session")
 def takes(tmp_path_factory: pytest.TempPathFactory) -> list[LocalFile]:
-    """Different short walks as BVH files: 60, or 200 in the tier `soak`."""
-    folder = tmp_path_factory.mktemp("takes")
-    for number in range(200 if is_soak() else 60):
-        clip = generate_gait(1.0 + number / 200, 0.0, 0.5, 30)
-        (folder / f"walk-{number:03d}.bvh").write_bytes(write_motion(clip, "bvh"))
-    return list(find_files([folder]).files)
+    """Different short walks as BVH files: 24, or 200 in the tier `soak`."""
+    return write_short_walks(tmp_path_factory.mktemp("takes"), 200 if is_soak() else 24)
 
 
 @pytest.fixture
@@ -204,7 +201,6 @@ def test_a_server_killed_among_many_uploads_keeps_what_it_acknowledged(
     server.check_database()
 
 
-@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["publish.before_commit", "publish.after_commit", "blob.put.before_commit"])
 def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
     server: ServerProcess, takes: list[LocalFile], place: str
@@ -213,20 +209,19 @@ def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
     with server.client(patient=False) as marey:
         make_lab(marey)
         with pytest.raises(MareyError):
-            _upload_one_by_one(marey, takes[:8])
+            _upload_one_by_one(marey, takes[:5])
     assert server.wait_until_dead() == -signal.SIGKILL
 
     server.start()
     with server.client() as marey:
         lab = marey.project("lab")
-        entries = lab.imports.upload(takes[:8])
+        entries = lab.imports.upload(takes[:5])
         assert {entry.status for entry in entries} <= {"created", "unchanged"}
-        assert sorted(revision for _, revision in clips_by_name(lab).values()) == [1] * 8
+        assert sorted(revision for _, revision in clips_by_name(lab).values()) == [1] * 5
     server.check_database()
 
 
-@pytest.mark.every_database
-@pytest.mark.parametrize("place", ["complete.before_commit@11", "complete.after_commit@17"])
+@pytest.mark.parametrize("place", ["complete.before_commit@3", "complete.after_commit@6"])
 def test_a_server_killed_among_many_completes_publishes_each_result_once(
     server: ServerProcess,
     takes: list[LocalFile],
@@ -263,7 +258,6 @@ def test_a_server_killed_among_many_completes_publishes_each_result_once(
 # -- the worker dies, sleeps, or is cut off ----------------------------------------------------------------------------
 
 
-@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["after_claim", "after_blob", "before_complete", "after_complete"])
 def test_a_job_of_a_killed_worker_is_finished_by_another_with_one_result(
     server: ServerProcess,
@@ -381,12 +375,12 @@ def test_a_lost_answer_to_complete_is_asked_for_again(
     server.start()
     with server.client() as marey, TcpProxy(server.port) as proxy:
         lab = make_lab(marey)
-        entries = lab.imports.upload(takes[:10])
+        entries = lab.imports.upload(takes[:5])
         skeleton = import_game_skeleton(lab, tmp_path)
-        proxy.lose_answers(b"/complete ", 5)
+        proxy.lose_answers(b"/complete ", 3)
         start_worker("behind-proxy", port=proxy.port)
         finished = ended(marey, submit_retargets(lab, entries, skeleton, into="game"))
-        assert proxy.lost == 5
+        assert proxy.lost == 3
         assert_published_once(lab, finished)
     server.check_database()
 
@@ -458,14 +452,15 @@ def test_a_database_that_is_away_for_a_while_delays_work_and_loses_none(
     with server.client() as marey:
         lab = make_lab(marey)
         uploaded: list[ImportEntry] = []
-        uploading = threading.Thread(target=lambda: uploaded.extend(lab.imports.upload(takes[:40])))
+        sent = takes[:40]
+        uploading = threading.Thread(target=lambda: uploaded.extend(lab.imports.upload(sent)))
         uploading.start()
         _disturb(database_url, seconds=5)
         uploading.join(120)
         # an import that was cut short and sent again finds what went in before
-        assert len(uploaded) == 40
+        assert len(uploaded) == len(sent)
         assert {entry.status for entry in uploaded} <= {"created", "unchanged"}
-        assert sorted(revision for _, revision in clips_by_name(lab).values()) == [1] * 40
+        assert sorted(revision for _, revision in clips_by_name(lab).values()) == [1] * len(sent)
     server.check_database()
 
 

@@ -19,7 +19,7 @@ from tests.support.server_process import QUICK_LEASES, READY_S, ServerProcess
 
 from marey_schemas.access import ProjectCreate
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.timeout(600), pytest.mark.xdist_group("shared port")]  # whose tests share one server
 
 PROGRAM, WORKER = "marey_server.process_program", "marey_worker"
 COLLECTIONS = "/projects/lab/collections"

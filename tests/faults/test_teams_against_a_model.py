@@ -142,6 +142,7 @@ PLANTS: dict[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]] = {
 """Faults that are planted, and for each the kinds of steps in the programs that must find it."""
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
 @pytest.mark.every_database

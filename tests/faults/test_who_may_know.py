@@ -76,6 +76,7 @@ HOLES: dict[str, tuple[Any, str, Callable[..., Any]]] = {
 }
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("hole", HOLES)
 def test_a_planted_hole_is_found(server: Server, monkeypatch: pytest.MonkeyPatch, hole: str) -> None:
     monkeypatch.setattr(*HOLES[hole])

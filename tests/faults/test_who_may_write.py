@@ -28,14 +28,15 @@ from marey_server.store.items import changing
 from marey_server.store.tables import item
 from marey_server.store.transaction import Transaction
 
-pytestmark = [pytest.mark.every_database, pytest.mark.timeout(1200)]
+pytestmark = pytest.mark.timeout(1200)
 
 SEED = 20261126
-CALLS = 20_000 if is_soak() else 500
+CALLS = 20_000 if is_soak() else 300
 CALLS_TO_FIND_A_HOLE = 1_500
 BY_STATE = rights._by_state
 
 
+@pytest.mark.every_database
 def test_every_member_writes_where_the_model_says(lab: Lab) -> None:
     program = WritingProgram(lab, SEED)
     program.run(CALLS)
@@ -82,6 +83,7 @@ HOLES: dict[str, tuple[Any, str, Callable[..., Any]]] = {
 }
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("hole", HOLES)
 def test_a_planted_hole_is_found(lab: Lab, monkeypatch: pytest.MonkeyPatch, hole: str) -> None:
     monkeypatch.setattr(*HOLES[hole])
@@ -121,6 +123,7 @@ def count_items(tx: Transaction) -> int:
     return len(tx.execute(select(item.c.id)).all())
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("first", ["the item", "the role"])
 def test_an_item_is_created_before_its_folder_is_protected_or_not_at_all(lab: Lab, other: Database, first: str) -> None:
     folder = lab.write(collections.create_collection, "lab", CollectionCreate(path="delivered")).id
@@ -137,6 +140,7 @@ def test_an_item_is_created_before_its_folder_is_protected_or_not_at_all(lab: La
     assert seen == [after]
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("first", ["the item", "the role"])
 def test_a_reader_writes_only_before_the_role_in_the_folder_is_withdrawn(lab: Lab, other: Database, first: str) -> None:
     folder = lab.write(collections.create_collection, "lab", CollectionCreate(path="delivered")).id
@@ -156,6 +160,7 @@ def test_a_reader_writes_only_before_the_role_in_the_folder_is_withdrawn(lab: La
     assert isinstance(made, ForbiddenProblem) == (first == "the role")
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("how", ["removed", "a reader"])
 def test_a_member_whose_role_ends_before_the_rights_are_read_writes_nothing(
     lab: Lab, other: Database, monkeypatch: pytest.MonkeyPatch, how: str
@@ -180,6 +185,7 @@ def test_a_member_whose_role_ends_before_the_rights_are_read_writes_nothing(
     assert lab.read(count_items) == 0
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("how", ["removed", "a reader"])
 def test_the_role_of_a_member_ends_after_the_writes_that_have_read_it(lab: Lab, other: Database, how: str) -> None:
     seen: list[int] = []

@@ -2,16 +2,20 @@
 
 A child that computes needs two seconds of processor time to import its modules and to load compiled kernels, and tests
 that kill servers and workers start hundreds of such children. So each program of the nursery (see `forked_programs`)
-has a forker: a copy of the nursery with one thread, which forks the children of the program. A child has the arguments,
-the environment, the session and the descriptor that a new process would have, and its parent is the program.
+has a forker: a copy of the nursery with one thread, which forks the children of the program, and the programs that it
+starts: the workers of a server, and the processes that share a port. A child has the arguments, the environment, the
+session and the descriptors that a new process would have, and its parent is the program.
 """
 
 from __future__ import annotations
 
+import asyncio
 import ctypes
+import fcntl
 import importlib
 import json
 import os
+import runpy
 import signal
 import socket
 import struct
@@ -19,11 +23,15 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from io import FileIO
 from typing import NoReturn
+
+from tests.support.awaited_programs import AwaitedProgram
 
 from marey_schemas.processes import child_process
 from marey_schemas.processes.child_process import exit_status
 from marey_schemas.processes.limits import die_with_parent
+from marey_server.process import programs
 
 FORKS = sys.platform == "linux"
 """Whether the system has what a forker needs: a process that adopts the orphans among its descendants."""
@@ -36,6 +44,11 @@ LONGEST_ORDER = 1 << 16
 _PR_SET_CHILD_SUBREAPER = 36
 PID = struct.Struct("<q")
 """Form of a process id in answers to orders."""
+MOST_DESCRIPTORS = 8
+LONGEST_NAME = 4096
+"""Number of bytes in which the arguments of a forked process must fit."""
+FORKER = "forker"
+"""What `/proc` shows as the only argument of a forker."""
 
 
 class ForkedChild:
@@ -44,6 +57,7 @@ class ForkedChild:
     def __init__(self, pid: int) -> None:
         self.pid = pid
         self.returncode: int | None = None
+        self._descriptor: int | None = None
 
     def poll(self) -> int | None:
         """Return the exit status, or None if the process still runs; a negative number is a signal."""
@@ -55,7 +69,15 @@ class ForkedChild:
         """Return the exit status when the process has ended."""
         if self.returncode is None:
             self.returncode = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+            if self._descriptor is not None:
+                os.close(self._descriptor)
         return self.returncode
+
+    def fileno(self) -> int:
+        """Return a descriptor that can be read from when the process has ended."""
+        if self._descriptor is None:
+            self._descriptor = os.pidfd_open(self.pid)
+        return self._descriptor
 
 
 class ChildForker:
@@ -68,6 +90,7 @@ class ChildForker:
         if os.fork() == 0:
             _keep_only(theirs.fileno())
             die_with_parent()
+            take_name([FORKER])
             signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a test may send it to all descendants of its program
             _serve(theirs, parent)
         theirs.close()
@@ -76,12 +99,52 @@ class ChildForker:
         self, module: str, arguments: Sequence[str], descriptor: int, environment: Mapping[str, str]
     ) -> ForkedChild:
         """Start a child as `child_process.start_module` does."""
-        order = json.dumps({"module": module, "arguments": arguments, "environment": dict(environment)}).encode()
+        return self._order(module, [str(descriptor), *arguments], environment, {descriptor: descriptor}, program=False)
+
+    async def start_program(
+        self, *arguments: str, environment: Mapping[str, str], stdin: int | None = None, inherited: Sequence[int] = ()
+    ) -> AwaitedProgram:
+        """Start a program as `programs.start_program` does."""
+        assert arguments[0] == "-m"
+        given: FileIO | None = None
+        places = {one: one for one in inherited}
+        if stdin == asyncio.subprocess.PIPE:
+            stdin, giving = os.pipe()
+            given = FileIO(giving, "wb")
+        if stdin is not None:
+            places[0] = stdin
+        forked = self._order(arguments[1], arguments[2:], environment, places, program=True)
+        if given is not None:
+            os.close(places[0])
+        return AwaitedProgram(forked, given)
+
+    def _order(
+        self,
+        module: str,
+        arguments: Sequence[str],
+        environment: Mapping[str, str],
+        places: Mapping[int, int],
+        *,
+        program: bool,
+    ) -> ForkedChild:
+        """Start a module with the descriptors in `places`, by the numbers that they get in the new process.
+
+        A program is started as `python -m` does, and has a forker of its own; a child has a session of its own.
+        """
+        order = json.dumps(
+            {
+                "module": module,
+                "arguments": arguments,
+                "environment": dict(environment),
+                "places": [*places],
+                "program": program,
+            }
+        ).encode()
         assert len(order) < LONGEST_ORDER
         with self._ordering:
             _adopt_orphans(True)
             try:
-                socket.send_fds(self._orders, [order], [descriptor])
+                socket.send_fds(self._orders, [order], [*places.values()])
                 answer = self._orders.recv(PID.size)
             finally:
                 _adopt_orphans(False)
@@ -91,8 +154,23 @@ class ChildForker:
 
 
 def fork_children() -> None:
-    """Let a forker fork the children of this process from now on."""
-    child_process.start_module = ChildForker().start  # type: ignore[assignment]
+    """Let a forker fork the children of this process and its programs from now on."""
+    forker = ChildForker()
+    child_process.start_module = forker.start  # type: ignore[assignment]
+    programs.start_program = forker.start_program  # type: ignore[assignment]
+
+
+def take_name(arguments: Sequence[str]) -> None:
+    """Let `/proc` show these arguments as those of this process.
+
+    The arguments of the nursery, which all forked processes show otherwise, leave room for `LONGEST_NAME` bytes.
+    """
+    with open("/proc/self/stat") as file:
+        fields = file.read().rpartition(")")[2].split()
+    start, end = int(fields[45]), int(fields[46])
+    text = b"\0".join(word.encode() for word in arguments)
+    assert len(text) < end - start
+    ctypes.memmove(start, text.ljust(end - start, b"\0"), end - start)
 
 
 def _adopt_orphans(adopts: bool) -> None:
@@ -101,9 +179,10 @@ def _adopt_orphans(adopts: bool) -> None:
 
 
 def _keep_only(*descriptors: int) -> None:
-    """Close all other descriptors but those of the output, and take the standard input from nowhere."""
-    nothing = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(nothing, 0)
+    """Close all other descriptors but those of the output; without a standard input, take it from nowhere."""
+    if 0 not in descriptors:
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(nothing, 0)
     kept = sorted({0, 1, 2, *descriptors})
     for after, before in zip(kept, [*kept[1:], os.sysconf("SC_OPEN_MAX")], strict=True):
         os.closerange(after + 1, before)
@@ -115,7 +194,7 @@ def _serve(orders: socket.socket, parent: int) -> NoReturn:
     A child is forked twice: when the process between has ended, the parent adopts the child.
     """
     while True:
-        order, descriptors, _, _ = socket.recv_fds(orders, LONGEST_ORDER, 1)
+        order, descriptors, _, _ = socket.recv_fds(orders, LONGEST_ORDER, MOST_DESCRIPTORS)
         if not order:
             os._exit(0)
         between = os.fork()
@@ -127,19 +206,37 @@ def _serve(orders: socket.socket, parent: int) -> NoReturn:
                 time.sleep(0.0002)
             if os.getppid() != parent:  # the parent was killed, and another process has adopted this one
                 os._exit(1)
-            os.setsid()
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            ordered = json.loads(order)
+            if not ordered["program"]:
+                os.setsid()
+            take_name([sys.executable, "-m", ordered["module"], *ordered["arguments"]])
             orders.send(PID.pack(os.getpid()))
-            _keep_only(*descriptors)
-            _run(descriptors[0], **json.loads(order))
-        os.close(descriptors[0])
+            orders.detach()
+            _place(descriptors, ordered.pop("places"))
+            _run(**ordered)
+        for descriptor in descriptors:
+            os.close(descriptor)
         os.waitpid(between, 0)
 
 
-def _run(descriptor: int, module: str, arguments: list[str], environment: dict[str, str]) -> NoReturn:
+def _place(descriptors: list[int], places: list[int]) -> None:
+    """Give descriptors their numbers, and close all others but those of the output."""
+    free = 1 + max((2, *descriptors, *places))
+    moved = [fcntl.fcntl(descriptor, fcntl.F_DUPFD, free) for descriptor in descriptors]
+    for descriptor, place in zip(moved, places, strict=True):
+        os.dup2(descriptor, place)
+    _keep_only(*places)
+
+
+def _run(module: str, arguments: list[str], environment: dict[str, str], program: bool) -> NoReturn:
     from tests.support.forked_programs import take_on
 
     take_on(environment)
-    sys.argv = [module, str(descriptor), *arguments]
-    importlib.import_module(module).main()
+    sys.argv = [module, *arguments]
+    if program:
+        fork_children()
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    else:
+        importlib.import_module(module).main()
     sys.exit()

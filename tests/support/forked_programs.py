@@ -9,6 +9,7 @@ tests can signal, kill and wait for. `tests/unit/server/test_app.py` starts `mar
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import importlib
@@ -23,9 +24,18 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping, Sequence
-from typing import BinaryIO
+from io import FileIO
 
-from tests.support.forked_children import FORKS, KERNELS, LONGEST_ORDER, PID, fork_children
+from tests.support.awaited_programs import AwaitedProgram
+from tests.support.forked_children import (
+    FORKS,
+    KERNELS,
+    LONGEST_NAME,
+    LONGEST_ORDER,
+    PID,
+    fork_children,
+    take_name,
+)
 from tests.support.forked_children import MODULES as CHILDREN_RUN
 
 MODULES = (
@@ -34,13 +44,14 @@ MODULES = (
     "uvloop",
 )  # fmt: skip
 """Modules of servers, workers and their children, and those that these import when they open a database or start."""
+STANDARD_ERROR = 2
 _STATUS = struct.Struct("<i")
 
 
 class ForkedProgram:
     """Process that the nursery has forked. It can be used like `subprocess.Popen`."""
 
-    def __init__(self, pid: int, ended: int, stdin: BinaryIO | None) -> None:
+    def __init__(self, pid: int, ended: int, stdin: FileIO | None) -> None:
         self.pid = pid
         self.stdin = stdin
         self.returncode: int | None = None
@@ -61,6 +72,10 @@ class ForkedProgram:
             assert timeout is not None
             raise subprocess.TimeoutExpired(f"forked program {self.pid}", timeout)
         return status
+
+    def fileno(self) -> int:
+        """Return a descriptor that can be read from when the process has ended."""
+        return self._ended
 
     def send_signal(self, number: int) -> None:
         """Send a signal to the process, unless it has ended."""
@@ -94,7 +109,7 @@ class Nursery:
         surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.support.forked_programs", str(theirs.fileno())],
+                [sys.executable, "-m", "tests.support.forked_programs", str(theirs.fileno()), " " * LONGEST_NAME],
                 env=surroundings | {"OPENBLAS_NUM_THREADS": "1"},
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -115,10 +130,12 @@ class Nursery:
         output: int,
         with_stdin: bool,
         own_children: bool = False,
+        own_group: bool = False,
     ) -> ForkedProgram:
         """Start `python -m` with `arguments`; the output is written to the descriptor `output`.
 
-        With `own_children`, the program starts its child processes as new processes, instead of forking them.
+        With `own_children`, the program starts its child processes as new processes, instead of forking them. With
+        `own_group`, it is the first process of a process group.
         """
         order = json.dumps(
             {
@@ -126,6 +143,7 @@ class Nursery:
                 "environment": dict(environment),
                 "folder": os.getcwd(),
                 "own_children": own_children,
+                "own_group": own_group,
             }
         ).encode()
         assert len(order) < LONGEST_ORDER
@@ -140,13 +158,27 @@ class Nursery:
             os.close(taken)
         if not answer:
             raise RuntimeError(f"the nursery has ended with status {self._process.wait()}; its error output says why")
-        return ForkedProgram(PID.unpack(answer)[0], ended, None if given is None else os.fdopen(given, "wb"))
+        return ForkedProgram(PID.unpack(answer)[0], ended, None if given is None else FileIO(given, "wb"))
 
 
 @functools.cache
 def nursery() -> Nursery:
     """Return the nursery of this test process, which ends with the process."""
     return Nursery()
+
+
+async def start_program(
+    *arguments: str,
+    environment: Mapping[str, str],
+    stdin: int | None = None,
+    output: int = STANDARD_ERROR,
+    own_group: bool = False,
+) -> AwaitedProgram:
+    """Let the nursery start a program, as `marey_server.process.programs.start_program` does."""
+    assert arguments[0] == "-m"
+    with_stdin = stdin == asyncio.subprocess.PIPE
+    forked = nursery().start(arguments[1:], environment, output=output, with_stdin=with_stdin, own_group=own_group)
+    return AwaitedProgram(forked, forked.stdin)
 
 
 def load_modules() -> None:
@@ -181,6 +213,7 @@ def main() -> list[str]:
             if not order:  # the test process has ended
                 sys.exit()
             taken, output, ending = descriptors
+            ordered = json.loads(order)
             pid = os.fork()
             if pid == 0:
                 signal.set_wakeup_fd(-1)
@@ -191,7 +224,9 @@ def main() -> list[str]:
                     unused.close()
                 for descriptor in (taken, output, ending, *running.values()):
                     os.close(descriptor)
-                return adopt(**json.loads(order))
+                return adopt(**ordered)
+            if ordered["own_group"]:  # the caller may send a signal to the group before the process has run
+                os.setpgid(pid, pid)
             running[pid] = ending
             os.close(taken)
             os.close(output)
@@ -209,8 +244,14 @@ def tell_statuses(running: dict[int, int]) -> None:
             os.close(descriptor)
 
 
-def adopt(arguments: list[str], environment: dict[str, str], folder: str, own_children: bool) -> list[str]:
-    """Take on the environment and the folder of a program; unless it starts its own children, give it a forker."""
+def adopt(
+    arguments: list[str], environment: dict[str, str], folder: str, own_children: bool, own_group: bool
+) -> list[str]:
+    """Take on the name, the environment and the folder of a program; unless it has own children, give it a forker."""
+    if own_group:
+        os.setpgid(0, 0)
+    if FORKS:
+        take_name([sys.executable, "-m", *arguments])
     os.chdir(folder)
     take_on(environment)
     if FORKS and not own_children:

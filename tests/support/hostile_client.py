@@ -1,7 +1,6 @@
 """A malicious client: it sends requests that cost much or confuse the server to every route, as every kind of caller.
 
-The routes come from the server's table of routes. A *shot* is a malicious request as bytes, with the manner of sending
-it.
+The routes come from the server's table of routes. A *shot* is a malicious request, with the manner of sending it.
 """
 
 from __future__ import annotations
@@ -67,14 +66,28 @@ class Shape:
 
 @dataclass(frozen=True)
 class Shot:
-    """Malicious request as bytes; `refusal` contains the statuses with which the server may refuse the caller."""
+    """Malicious request; `refusal` contains the statuses with which the server may refuse the caller.
+
+    The bytes are made when they are needed: those of all attacks by all callers would take gigabytes.
+    """
 
     route: str
     person: str
     attack: str
-    data: bytes
-    manner: Manner
+    plan: Planned
+    shape: Shape
+    token: str | None
     refusal: frozenset[int]
+
+    @property
+    def manner(self) -> Manner:
+        """The manner in which the request is sent."""
+        return self.shape.manner
+
+    @property
+    def data(self) -> bytes:
+        """The bytes of the request."""
+        return _bytes_of(self.plan, self.shape, self.token)
 
     @property
     def label(self) -> str:
@@ -210,9 +223,8 @@ def shots(
         for attack, shape in _shapes(route, plan):
             for name in people:
                 refusal = verdict(PEOPLE[name], route.operation)
-                data = _bytes_of(plan, shape, house.tokens[name])
                 label = f"{route.operation.method} {route.template}"
-                found.append(Shot(label, name, attack, data, shape.manner, refusal))
+                found.append(Shot(label, name, attack, plan, shape, house.tokens[name], refusal))
     return found
 
 
@@ -262,14 +274,15 @@ async def _exchange(address: str, shot: Shot) -> str:
 
 
 async def _send(writer: asyncio.StreamWriter, shot: Shot) -> None:
+    data = shot.data
     with contextlib.suppress(ConnectionError):  # refused early: the answer may be there
         if shot.manner is Manner.SLOWLY:
-            for piece in (shot.data[:-9], shot.data[-9:-1], shot.data[-1:]):
+            for piece in (data[:-9], data[-9:-1], data[-1:]):
                 writer.write(piece)
                 await writer.drain()
                 await asyncio.sleep(0.05)
             return
-        writer.write(shot.data * 6 if shot.manner is Manner.UNREAD else shot.data)
+        writer.write(data * 6 if shot.manner is Manner.UNREAD else data)
         await writer.drain()
         if shot.manner is Manner.HALF_CLOSED:
             writer.write_eof()

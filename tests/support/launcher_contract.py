@@ -203,6 +203,11 @@ class LauncherContract:
         assert not set(other) & set(names)
         assert {name: len(processes_of(name)) for name in (*names, *other)} == dict.fromkeys((*names, *other), 1)
 
+    @pytest.fixture
+    def new_processes(self) -> None:
+        """Let the launcher start new processes, of which `/proc` shows the variables, instead of forked ones."""
+
+    @pytest.mark.usefixtures("new_processes")
     def test_the_token_is_in_no_argument_variable_or_log(self, engine: Engine, tmp_path: Path) -> None:
         (name,) = engine.start(1, key="k6")
         job = engine.submit("wait", tmp_path / "job")

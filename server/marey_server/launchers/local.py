@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import sys
 import time
 from asyncio.subprocess import Process
 from collections.abc import Mapping
@@ -29,6 +28,7 @@ from marey_server.launchers.launcher import (
     read_options,
     worker_arguments,
 )
+from marey_server.process import programs
 from marey_server.process.data_folder import WORKER_CACHE
 
 log = logging.getLogger(__name__)
@@ -94,10 +94,10 @@ class _LocalWorker:
         self._token = context.token
         log = {"MAREY_LOG_FORM": context.log_form, "MAREY_LOG_LEVEL": context.log_level}
         self._environment = {**context.variables, **log}
-        self._command = [
-            sys.executable, *worker_arguments(request, context.url), "--attached", "--name", name,
+        self._arguments = (
+            *worker_arguments(request, context.url), "--attached", "--name", name,
             "--cache", str(context.data / WORKER_CACHE),
-        ]  # fmt: skip
+        )  # fmt: skip
         self._started_at: datetime | None = None
         self._stopping = asyncio.Event()
 
@@ -145,9 +145,8 @@ class _LocalWorker:
         return f"ended with status {status}"
 
     async def _start(self) -> Process:
-        process = await asyncio.create_subprocess_exec(
-            *self._command, stdin=asyncio.subprocess.PIPE, env=clean_environment() | self._environment
-        )
+        environment = clean_environment() | self._environment
+        process = await programs.start_program(*self._arguments, environment=environment, stdin=asyncio.subprocess.PIPE)
         assert process.stdin is not None
         process.stdin.write(self._token.encode() + b"\n")
         self._started_at = datetime.now(UTC)

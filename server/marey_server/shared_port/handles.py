@@ -7,12 +7,12 @@ import logging
 import os
 import signal
 import socket
-import sys
 import time
 from asyncio.subprocess import Process
 from contextlib import suppress
 from typing import Self
 
+from marey_server.process import programs
 from marey_server.process.notices import NOTIFY_VARIABLE
 from marey_server.shared_port.orders import KEEP_WORKERS, PROGRAM, READY, StartOrder
 
@@ -42,13 +42,12 @@ class ProcessHandle:
         """Start a process, which inherits the sockets in its order. Raises `OSError`."""
         ours, theirs = socket.socketpair()
         with theirs:
-            process = await asyncio.create_subprocess_exec(
-                sys.executable,
+            process = await programs.start_program(
                 "-m",
                 PROGRAM,
+                environment={name: text for name, text in os.environ.items() if name != NOTIFY_VARIABLE},
                 stdin=theirs.fileno(),
-                pass_fds=(*order.sockets, *order.metrics_sockets),
-                env={name: text for name, text in os.environ.items() if name != NOTIFY_VARIABLE},
+                inherited=(*order.sockets, *order.metrics_sockets),
             )
         reader, writer = await asyncio.open_connection(sock=ours)
         writer.write(order.to_line())

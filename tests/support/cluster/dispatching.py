@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from tests.support.cluster.kubelet import SCRIPT
 from tests.support.cluster.objects import Document
 from tests.support.queue_desk import KINDS, Desk
 
@@ -22,9 +22,9 @@ from marey_server.store.jobs.claiming.rights import pod_token, read_pod_key
 
 T = TypeVar("T")
 
-WAITS = (sys.executable, "-c", "import signal, sys, time; signal.signal(15, lambda *_: sys.exit(143)); time.sleep(600)")
-ENDS = (sys.executable, "-c", "pass")
-REFUSED = (sys.executable, "-c", "import sys; sys.exit(42)")
+WAITS = (*SCRIPT, "import signal, sys, time; signal.signal(15, lambda *_: sys.exit(143)); time.sleep(600)")
+ENDS = (*SCRIPT, "pass")
+REFUSED = (*SCRIPT, "import sys; sys.exit(42)")
 LARGE = Resources(memory_limit_mb=8000)
 OWN_IMAGE = f"registry.example.org/motion/torch@sha256:{'cd' * 32}"
 PATIENCE_S = 60.0

@@ -15,10 +15,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tests.support.awaited_programs import AwaitedProgram
 from tests.support.cluster.objects import Document, Objects, Refused, condition, now, set_condition
+from tests.support.forked_programs import start_program
 
 MAREY = (sys.executable, "-m", "marey_client.cli")
 """Command that the entry point of the images runs."""
+SCRIPT = (sys.executable, "-I", "-S", "-c")
+"""Command that runs a text of Python, without the installed packages, whose search takes most of the start."""
 GRACE_S = 30.0
 
 
@@ -36,7 +40,9 @@ class Kubelet:
     environment: dict[str, str] = field(default_factory=dict)
     paused: bool = False
     """Whether no pod is started."""
-    processes: dict[str, Process] = field(default_factory=dict)
+    new_processes: bool = False
+    """Whether modules run in new processes, which `/proc` shows with their own variables, instead of forked ones."""
+    processes: dict[str, Process | AwaitedProgram] = field(default_factory=dict)
     commands: list[tuple[list[str], dict[str, str]]] = field(default_factory=list)
     """Arguments and variables of all processes that were started."""
     _running: dict[str, asyncio.Task[None]] = field(default_factory=dict)
@@ -147,7 +153,7 @@ class Kubelet:
         seconds = pod["spec"].get("activeDeadlineSeconds", 10**6)
         return asyncio.get_running_loop().call_later(seconds, end)
 
-    async def _start(self, pod: Document) -> Process:
+    async def _start(self, pod: Document) -> Process | AwaitedProgram:
         name = pod["metadata"]["name"]
         (container,) = pod["spec"]["containers"]
         places = self._mount(pod)
@@ -159,10 +165,16 @@ class Kubelet:
         environment = inherited | {"HOME": places["/tmp"], "TMPDIR": places["/tmp"]} | self.environment | own
         self.commands.append((command, environment))
         with (self.folder / f"{name}.log").open("ab") as log:
-            process = await asyncio.create_subprocess_exec(
-                *command, env=environment, stdin=asyncio.subprocess.DEVNULL, stdout=log, stderr=log,
-                start_new_session=True,
-            )  # fmt: skip
+            process: Process | AwaitedProgram
+            if command[:2] == [sys.executable, "-m"] and not self.new_processes:
+                process = await start_program(
+                    *command[1:], environment=environment, output=log.fileno(), own_group=True
+                )
+            else:
+                process = await asyncio.create_subprocess_exec(
+                    *command, env=environment, stdin=asyncio.subprocess.DEVNULL, stdout=log, stderr=log,
+                    start_new_session=True,
+                )  # fmt: skip
         self.processes[name] = process
         return process
 
@@ -200,7 +212,7 @@ class Kubelet:
         process.terminate()
         asyncio.get_running_loop().call_later(GRACE_S, self._kill_late, process)
 
-    def _kill_late(self, process: Process) -> None:
+    def _kill_late(self, process: Process | AwaitedProgram) -> None:
         if process.returncode is None:
             process.kill()
 

@@ -1,0 +1,20 @@
+"""Start of programs beside the server: workers, the processes at a shared port, and the compilation of kernels."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from asyncio.subprocess import Process
+from collections.abc import Mapping, Sequence
+
+
+async def start_program(
+    *arguments: str, environment: Mapping[str, str], stdin: int | None = None, inherited: Sequence[int] = ()
+) -> Process:
+    """Start a Python interpreter with arguments, which inherits descriptors, and return its process.
+
+    `stdin` is a descriptor, `asyncio.subprocess.PIPE`, or None for that of this process. Raises `OSError`.
+    """
+    return await asyncio.create_subprocess_exec(
+        sys.executable, *arguments, stdin=stdin, pass_fds=inherited, env=environment
+    )
