@@ -201,6 +201,7 @@ def test_a_server_killed_among_many_uploads_keeps_what_it_acknowledged(
     server.check_database()
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["publish.before_commit", "publish.after_commit", "blob.put.before_commit"])
 def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
     server: ServerProcess, takes: list[LocalFile], place: str
@@ -221,6 +222,7 @@ def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
     server.check_database()
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["complete.before_commit@3", "complete.after_commit@6"])
 def test_a_server_killed_among_many_completes_publishes_each_result_once(
     server: ServerProcess,
@@ -258,6 +260,7 @@ def test_a_server_killed_among_many_completes_publishes_each_result_once(
 # -- the worker dies, sleeps, or is cut off ----------------------------------------------------------------------------
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["after_claim", "after_blob", "before_complete", "after_complete"])
 def test_a_job_of_a_killed_worker_is_finished_by_another_with_one_result(
     server: ServerProcess,
