@@ -152,5 +152,5 @@ def _maps(subject: ComparedSet) -> bytes:
     for number, pair in enumerate(subject.drawn_pairs()):
         arrays |= {f"pair{number}_{name}": values for name, values in subject.arrays(pair).items()}
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
