@@ -92,7 +92,7 @@ class ChildForker:
 
 def fork_children() -> None:
     """Let a forker fork the children of this process from now on."""
-    child_process.start_module = ChildForker().start  # type: ignore[assignment]
+    child_process.start_module = ChildForker().start  # pyrefly: ignore[bad-assignment]  # does what a `Child` does here
 
 
 def _adopt_orphans(adopts: bool) -> None:
