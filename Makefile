@@ -83,7 +83,7 @@ soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases;
 lint: $(VENV)/.installed-dev ## Style, types, and which package may import which
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -n auto || { [ $$? = 2 ] && $(BIN)/mypy; } # 2: its processes did not find each other, on a busy machine
+	$(BIN)/pyrefly check --python-interpreter-path $(BIN)/python
 	$(BIN)/lint-imports
 	$(BIN)/python -m lint
 
@@ -112,4 +112,4 @@ bom: $(VENV)/.installed-audit ## Bill of materials of what users run, as Cyclone
 	@echo marey-bom.json
 
 clean: ## Remove the environment and what tools leave behind
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis marey-demo marey-bom.json web/node_modules server/marey_server/webui
+	rm -rf $(VENV) .ruff_cache .pytest_cache .hypothesis marey-demo marey-bom.json web/node_modules server/marey_server/webui

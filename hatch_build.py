@@ -66,7 +66,7 @@ def _run(npm: str, *words: str) -> None:
         raise PagesNotBuilt(f"`npm {' '.join(words)}` failed in {SOURCES}; see its output above")
 
 
-class PagesHook(BuildHookInterface):  # type: ignore[type-arg]
+class PagesHook(BuildHookInterface[Any]):
     """Hook of hatchling that builds the pages before a wheel; editable installations use `make web`."""
 
     PLUGIN_NAME = "custom"

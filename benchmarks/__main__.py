@@ -62,7 +62,7 @@ def _table(rows: list[Row]) -> Table:
         ("goal", "left"),
         ("", "left"),
     ):
-        table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+        table.add_column(heading, justify=justify)
     for row in rows:
         ratio = f"{row.ratio:.1f}x" if row.ratio is not None else ""
         table.add_row(row.job, row.size, row.ours, row.peer, ratio, row.goal, _VERDICTS[row.met])

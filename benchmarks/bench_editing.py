@@ -120,7 +120,7 @@ def _peers(walk: Clip) -> list[tuple[str, str, AnyCommand, Callable[[], Any]]]:
         return [Slerp(frames, one)(places).as_quat(scalar_first=True).astype(np.float32) for one in joints]
 
     def filtered() -> NDArray[np.float32]:
-        means = savgol_filter(walk.poses.astype(np.float64), 15, 3, axis=0)
+        means = np.asarray(savgol_filter(walk.poses.astype(np.float64), 15, 3, axis=0))
         rotations = means[:, 3:].reshape(walk.frame_count, -1, 4)
         rotations /= np.linalg.norm(rotations, axis=-1, keepdims=True)
         return means.astype(np.float32)

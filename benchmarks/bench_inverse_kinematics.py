@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares  # pyrefly: ignore[implicit-reexport]  # scipy collects its names when it runs
 
 from benchmarks.material import with_fingers
 from benchmarks.timing import Row, time_in_turn

@@ -1,4 +1,4 @@
-"""Exact nearest neighbours, as motion matching needs them, compared with numpy, scipy's cKDTree and faiss."""
+"""Exact nearest neighbours, as motion matching needs them, compared with numpy, scipy's KDTree and faiss."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import faiss
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from benchmarks.material import matching_features
 from benchmarks.timing import Row, Timing, time_in_turn
@@ -88,7 +88,7 @@ def _shown(name: str, timing: Timing, queries: int) -> str:
 def _peers(rows: Floats, selectable: NDArray[np.bool_]) -> dict[str, Callable[[Floats], Rows]]:
     chosen = np.flatnonzero(selectable)
     kept = np.ascontiguousarray(rows[chosen])
-    tree = cKDTree(kept)
+    tree = KDTree(kept)
     flat: Any = faiss.IndexFlatL2(rows.shape[1])
     flat.add(kept.astype(np.float32))
 
@@ -97,7 +97,7 @@ def _peers(rows: Floats, selectable: NDArray[np.bool_]) -> dict[str, Callable[[F
 
     return {
         "numpy": numpy_answers,
-        "cKDTree": lambda queries: chosen[tree.query(queries)[1]],
+        "KDTree": lambda queries: chosen[tree.query(queries)[1]],
         FLAT: lambda queries: chosen[flat.search(queries.astype(np.float32), 1)[1][:, 0]],
     }
 
@@ -138,6 +138,7 @@ def _play(index: SearchIndex, starts: Rows, desired: Floats, hard: bool) -> _Pla
     stops = np.repeat(starts[1:], np.diff(starts))
     shown = rng.choice(np.flatnonzero(index.selectable), TRIALS)
     queries, rows = [], []
+    at = np.zeros(TRIALS, dtype=np.int64)
     for search in range(SEARCHES):
         if search % NEW_GOAL_EVERY == 0:
             at = rng.integers(0, len(desired), TRIALS)

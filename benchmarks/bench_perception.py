@@ -49,7 +49,7 @@ def _by_scipy(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric) -> Flo
     pairs = zip(_points(a, metric), _points(b, metric), strict=True)
     found = sum(weight * cdist(one, other) for (weight, one), (_, other) in pairs)
     (component,) = metric.components
-    return np.asarray(component.constant * (np.asarray(found) > 0.0) + component.norm * found)
+    return np.asarray(component.constant * (np.asarray(found) > 0.0) + component.norm * found, dtype=np.float64)
 
 
 def _by_loop(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric) -> Floats:

@@ -75,7 +75,7 @@ def upload_steadily(port: int, token: str, skeleton: RevisionRef, *, frames: int
     def once(connection: Connection) -> None:
         nonlocal made
         made += 1
-        moved = replace(clip, poses=clip.poses + np.float32(0.001 * made) * sideways)
+        moved = replace(clip, poses=np.asarray(clip.poses + np.float32(0.001 * made) * sideways, dtype=np.float32))
         body = encode_tree({"name": f"{run}-{made}", "parts": clip_parts(moved, skeleton)}, MSGPACK, arrays="blocks")
         path = f"/projects/{PROJECT}/clips"
         connection.exchange(connection.head("POST", path, length=len(body), Content_Type=MSGPACK) + body)

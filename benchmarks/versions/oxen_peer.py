@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import oxen  # type: ignore[import-not-found, unused-ignore]
+import oxen
 
 REPEATS = 5
 

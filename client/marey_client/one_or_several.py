@@ -11,4 +11,4 @@ from pydantic import BaseModel
 
 def several(given: str | Path | Mapping[str, Any] | BaseModel | Iterable[Any]) -> tuple[Any, ...]:
     """Return one value or several as a tuple; a text, a path, a document or a model is one value."""
-    return (given,) if isinstance(given, str | Path | Mapping | BaseModel) else tuple(given)
+    return (given,) if isinstance(given, (str, Path, Mapping, BaseModel)) else tuple(given)

@@ -8,7 +8,7 @@ import ssl
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 from urllib.parse import quote
@@ -49,7 +49,7 @@ class BearerToken(httpx.Auth):
         """The current token."""
         return self._source.token if isinstance(self._source, TokenFile) else self._source
 
-    def auth_flow(self, request: httpx.Request) -> Iterator[httpx.Request]:  # type: ignore[override]
+    def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
         """Set the header `Authorization` of a request to the current token."""
         request.headers["Authorization"] = f"Bearer {self.token}"
         yield request
@@ -327,7 +327,7 @@ def as_json(model: BaseModel | None) -> bytes | None:
 def _revealed(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _revealed(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_revealed(item) for item in value]
     return value.get_secret_value() if hasattr(value, "get_secret_value") else value
 

@@ -24,7 +24,7 @@ inlined = _options(forceinline=True)
 
 
 @_options(inline="always")
-def product(a, b):  # type: ignore[no-untyped-def]
+def product(a, b):
     """Return the rotation that applies `b`, then `a`.
 
     The function is inlined before types are inferred, so that the caller's rules of arithmetic apply to the function.
@@ -38,19 +38,19 @@ def product(a, b):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def put_rotation(array, row, q):  # type: ignore[no-untyped-def]
+def put_rotation(array, row, q):
     """Write a quaternion to a row of an array."""
     array[row, 0], array[row, 1], array[row, 2], array[row, 3] = q
 
 
 @compiled
-def inverse(q):  # type: ignore[no-untyped-def]
+def inverse(q):
     """Return the inverse of a unit quaternion."""
     return q[0], -q[1], -q[2], -q[3]
 
 
 @compiled
-def rotate_vector(q, x, y, z):  # type: ignore[no-untyped-def]
+def rotate_vector(q, x, y, z):
     """Rotate the vector (x, y, z) by a unit quaternion."""
     tx = 2.0 * (q[2] * z - q[3] * y)
     ty = 2.0 * (q[3] * x - q[1] * z)

@@ -20,7 +20,7 @@ VECTOR = 3 * ROW
 
 
 @contracted
-def _turn(parent, joint):  # type: ignore[no-untyped-def]
+def _turn(parent, joint):
     """Replace local rotations of a joint by rotations in the world: joint = parent · joint.
 
     `parent` (4, frames) contains rotations of the parent in the world. `joint` (4, frames) is overwritten.
@@ -33,7 +33,7 @@ def _turn(parent, joint):  # type: ignore[no-untyped-def]
 
 
 @contracted
-def _place(rotation, origin, point):  # type: ignore[no-untyped-def]
+def _place(rotation, origin, point):
     """Replace offsets of a point by positions in the world: point = origin + rotation · point.
 
     `rotation` (4, frames) and `origin` (3, frames) are the rotation and position of the point's parent in the world.
@@ -51,7 +51,7 @@ def _place(rotation, origin, point):  # type: ignore[no-untyped-def]
 
 
 @contracted
-def _load(block, first_column, rows, row_count):  # type: ignore[no-untyped-def]
+def _load(block, first_column, rows, row_count):
     for f in range(block.shape[0]):
         frame = block[f]
         for c in range(row_count):
@@ -59,7 +59,7 @@ def _load(block, first_column, rows, row_count):  # type: ignore[no-untyped-def]
 
 
 @contracted
-def _store(rows, block):  # type: ignore[no-untyped-def]
+def _store(rows, block):
     for f in range(block.shape[0]):
         frame = block[f]
         for c in range(block.shape[1]):
@@ -67,7 +67,7 @@ def _store(rows, block):  # type: ignore[no-untyped-def]
 
 
 @contracted
-def _load_offsets(offsets, translations, slots, start, count, points):  # type: ignore[no-untyped-def]
+def _load_offsets(offsets, translations, slots, start, count, points):
     for p in range(1, offsets.shape[0]):
         for c in range(3):
             row = points[p * VECTOR + c * ROW : p * VECTOR + c * ROW + ROW]
@@ -79,7 +79,7 @@ def _load_offsets(offsets, translations, slots, start, count, points):  # type: 
 
 
 @contracted
-def positions(poses, offsets, parents, translations, slots, turned, out):  # type: ignore[no-untyped-def]
+def positions(poses, offsets, parents, translations, slots, turned, out):
     """Fill `out` (F, 3·P) with global positions of P points: J joints, then end sites.
 
     The inputs are poses (F, 3 + 4·J), offsets (P, 3), parents (P,) and translations (F, k, 3). `slots` (P,) is the
@@ -103,7 +103,7 @@ def positions(poses, offsets, parents, translations, slots, turned, out):  # typ
 
 
 @contracted
-def rotations(local, parents, out):  # type: ignore[no-untyped-def]
+def rotations(local, parents, out):
     """Convert local rotations `local` (F, 4·J) to global rotations `out` (F, 4·J)."""
     rotation = np.zeros(parents.shape[0] * QUATERNION, local.dtype)
     for start in range(0, local.shape[0], BLOCK):

@@ -5,7 +5,7 @@ Ground positions are (x, z) in metres; headings are in radians and increase in a
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -126,4 +126,4 @@ def about_vertical(angles_rad: AnyFloats) -> Floats:
     (..., 4) float64    unit quaternions (w, x, y, z)
     """
     zero = np.zeros_like(angles_rad)
-    return np.stack((np.cos(0.5 * angles_rad), zero, np.sin(0.5 * angles_rad), zero), axis=-1)
+    return cast(Floats, np.stack((np.cos(0.5 * angles_rad), zero, np.sin(0.5 * angles_rad), zero), axis=-1))

@@ -12,12 +12,12 @@ from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 
 @compiled
-def _length(x, y, z):  # type: ignore[no-untyped-def]
+def _length(x, y, z):
     return np.sqrt(x * x + y * y + z * z)
 
 
 @compiled
-def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, turns, halves, opposite):  # type: ignore[no-untyped-def]
+def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, turns, halves, opposite):
     """Fill `turns` (B, F, 4) with the shortest rotations of B bones from their directions in `rigid` to `moved`.
 
     `rigid` and `moved` (F, J, 3) are positions of joints. `halves` (2, B, F) receives the sine and cosine of half of
@@ -48,7 +48,7 @@ def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, t
 
 
 @compiled
-def turn_joints(world, parents, joints, turns, out):  # type: ignore[no-untyped-def]
+def turn_joints(world, parents, joints, turns, out):
     """Apply rotations in world axes to B joints, and fill `out` (F, 4·J) with the new local rotations of all J joints.
 
     `world` (F, J, 4) are the global rotations of all joints before the turns. Rotation b of `turns` (B, F, 4) is

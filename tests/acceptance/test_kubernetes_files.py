@@ -11,6 +11,7 @@ import pytest
 import yaml
 from docs.generate import ROOT
 from tests.support.cluster.admission import VERSIONS, validate
+from tests.support.present import present
 from tests.support.told_commands import unknown_options
 
 from marey_server.launchers.kubernetes.launcher import make_kubernetes_launcher
@@ -91,7 +92,7 @@ def test_pods_run_as_the_user_of_the_images_without_rights() -> None:
 
 
 def test_containers_can_write_where_the_images_write() -> None:
-    written = set(re.search(r"^VOLUME \[(.*)\]", CONTAINERFILE, re.MULTILINE)[1].replace('"', "").split(", "))
+    written = set(present(re.search(r"^VOLUME \[(.*)\]", CONTAINERFILE, re.MULTILINE))[1].replace('"', "").split(", "))
     for pod, unneeded in zip(pods(), ({"/run/marey-token"}, set()), strict=True):
         mounted = {mount["mountPath"] for mount in pod["containers"][0]["volumeMounts"]}
         assert mounted == written - unneeded
@@ -130,7 +131,7 @@ def test_a_stopping_server_can_end_its_requests() -> None:
 
 def test_the_settings_of_the_page_are_valid(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    settings = yaml.safe_load(re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[1])["data"]
+    settings = yaml.safe_load(present(re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL))[1])["data"]
     for name, text in settings.items():
         monkeypatch.setenv(name, text)
     found = Settings()

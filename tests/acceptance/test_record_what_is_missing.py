@@ -45,7 +45,7 @@ def test_the_example_runs_as_it_is_written(server: Server, capsys: pytest.Captur
             {"evaluation": {"schema": "marey/evaluation@1", "verdict": "Bad.", "headline": {}, **measured}},
         )
         drawn: list[Any] = []
-        names = {
+        names: dict[str, Any] = {
             "marey": marey, "skeleton_id": skeleton.id, "evaluation_id": evaluation.id,
             "capture": np.array_split(take.poses, 24), "draw": drawn.append,
         }  # fmt: skip

@@ -32,7 +32,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_contains_every_file_of_the_packages_and_the_migrations(wheel: Path) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    packages = [ROOT / folder for folder in project["tool"]["mypy"]["mypy_path"] if folder != "."]
+    packages = [ROOT / folder for folder in project["tool"]["pyrefly"]["search-path"] if folder != "."]
     homes = {package: package.name for folder in packages for package in folder.glob("marey*/")}
     homes[ROOT / "migrations"] = "marey_server/migrations"
     needed = {
@@ -41,9 +41,9 @@ def test_the_wheel_contains_every_file_of_the_packages_and_the_migrations(wheel:
         for file in folder.rglob("*")
         if file.is_file() and not UNNEEDED & set(file.parts)
     }
-    assert {name.partition("/")[0] for name in needed if name.endswith("/py.typed")} == {
-        name for name in project["tool"]["mypy"]["packages"] if name.startswith("marey")
-    }
+    assert {name.partition("/")[0] for name in needed if name.endswith("/py.typed")} == set(
+        project["tool"]["importlinter"]["root_packages"]
+    )
     assert needed - set(zipfile.ZipFile(wheel).namelist()) == set()
 
 

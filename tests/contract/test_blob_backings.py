@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from threading import Barrier
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from sqlalchemy import Connection
@@ -191,7 +191,7 @@ def test_many_small_blobs_take_time_in_proportion_to_their_number(monkeypatch: p
     monkeypatch.setattr(blob_backings, "_INSERT_CHUNK", inserting)
     monkeypatch.setattr(blob_backings, "BYTES_PER_STATEMENT", 4000)
 
-    DatabaseBlobs().write(None, {str(number): [Counted(10)] for number in range(1000)})
+    DatabaseBlobs().write(cast(Any, None), {str(number): [Counted(10)] for number in range(1000)})
 
     assert written == [400, 400, 200]
     assert len(lengths_asked) == 1000

@@ -6,7 +6,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from enum import StrEnum
-from typing import Any
+from functools import reduce
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -221,9 +222,7 @@ class TestEveryCodec:
         assert (error.code, error.pointer) == ("reserved-keys", "/a")
 
     def test_nesting_is_allowed_to_its_limit_and_refused_beyond(self, codec: Codec) -> None:
-        tree: Any = 1
-        for _ in range(codecs.MAX_DEPTH):
-            tree = {"a": tree}
+        tree: Any = reduce(lambda inner, _: {"a": inner}, range(codecs.MAX_DEPTH), cast(Any, 1))
         assert same(codec.decode(codec.encode(tree)), tree)
         with pytest.raises(CodecError) as caught:
             codec.decode(codec.encode(tree), max_depth=codecs.MAX_DEPTH - 1)

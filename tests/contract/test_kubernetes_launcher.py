@@ -15,6 +15,7 @@ import pytest
 from kubernetes.aio.config import incluster_config
 from tests.support.cluster.kubelet import SCRIPT
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
+from tests.support.present import present
 from tests.support.webhook_receiver import SELF_SIGNED
 
 from marey_schemas.backoff import Backoff
@@ -211,8 +212,8 @@ def test_deaths_are_explained(bench: Bench, cluster: StubCluster) -> None:
     cluster.run(lambda: cluster.kubelet.kill(pod, "OOMKilled"))
     bench.until({name: "ended"})
     end = bench.end(name)
-    assert (end.reason, end.status) == ("out-of-memory", -9)
-    assert bench.end("marey-crew-k0-0").reason == "unknown"
+    assert (present(end).reason, present(end).status) == ("out-of-memory", -9)
+    assert present(bench.end("marey-crew-k0-0")).reason == "unknown"
 
 
 def test_the_log_explains_a_failure(bench: Bench, cluster: StubCluster) -> None:
@@ -226,7 +227,7 @@ def test_a_worker_whose_deadline_passes_is_ended(bench: Bench) -> None:
     (name,) = bench.start(deadline_s=2)
     bench.until({name: "running"})
     bench.until({name: "ended"})
-    assert bench.end(name).reason == "deadline"
+    assert present(bench.end(name)).reason == "deadline"
 
 
 def test_an_evicted_worker_is_replaced_once_it_has_ended(bench: Bench, cluster: StubCluster) -> None:
@@ -247,7 +248,7 @@ def test_ended_workers_disappear_with_their_logs_and_secrets(bench: Bench, clust
     (name,) = bench.start()
     bench.until({})
     assert (cluster.all("pods"), cluster.all("secrets")) == ([], [])
-    assert bench.end(name).reason == "unknown"
+    assert present(bench.end(name)).reason == "unknown"
 
 
 def test_an_image_that_does_not_exist_is_logged_once(
@@ -285,7 +286,7 @@ def test_without_watches_lists_show_changes(bench: Bench, cluster: StubCluster, 
     (pod,) = cluster.running_pods()
     cluster.run(lambda: cluster.kubelet.kill(pod))
     bench.until({name: "ended"})
-    assert bench.end(name).reason == "killed"
+    assert present(bench.end(name)).reason == "killed"
 
 
 def test_watches_that_fail_at_once_do_not_flood_the_cluster(bench: Bench, cluster: StubCluster) -> None:

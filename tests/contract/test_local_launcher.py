@@ -12,6 +12,7 @@ import pytest
 from tests.support.attached_worker import python_path
 from tests.support.forked_programs import start_program
 from tests.support.launcher_contract import LABELS, PATIENCE_S, Engine, LauncherContract, processes_of
+from tests.support.present import present
 from tests.support.server_process import ServerProcess
 
 from marey_schemas.access import ProjectCreate
@@ -59,7 +60,7 @@ class TestLocalLauncher(LauncherContract):
                 marey.create_project(ProjectCreate(name="lab"))
                 job = JobCreate(kind="add", params={"a": 1, "b": 2}, labels=LABELS)
                 ended = marey.jobs.wait(marey.jobs.submit("lab", job).id, timeout_s=PATIENCE_S)
-                assert ended.result["sum"] == 3
+                assert present(ended.result)["sum"] == 3
                 (attempt,) = marey.jobs.attempts(ended.id)
             assert attempt.worker.startswith("own-")
             deadline = time.monotonic() + PATIENCE_S

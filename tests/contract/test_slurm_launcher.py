@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from tests.support.attached_worker import python_path
 from tests.support.launcher_contract import REQUEST, Engine, LauncherContract, processes_of
+from tests.support.present import present
 from tests.support.server_process import ServerProcess
 from tests.support.slurm_cluster import CPUS, SlurmCluster, running_cluster
 
@@ -89,7 +90,7 @@ class TestSlurmLauncher(LauncherContract):
         cluster.ask("scontrol", "requeue", task)
         engine.until(lambda: not first.is_running())
         (tmp_path / "job" / "go").touch()
-        assert engine.marey.jobs.wait(job.id).result["waited"]
+        assert present(engine.marey.jobs.wait(job.id).result)["waited"]
         outcomes = [(attempt.worker, attempt.outcome) for attempt in engine.marey.jobs.attempts(job.id)]
         assert outcomes == [(name, "interrupted"), (name, "succeeded")]
 
@@ -106,7 +107,7 @@ class TestSlurmLauncher(LauncherContract):
                 engine.do(call)
         job = engine.submit("wait", tmp_path / "job")
         (tmp_path / "job" / "go").touch()
-        assert engine.marey.jobs.wait(job.id).result["waited"]
+        assert present(engine.marey.jobs.wait(job.id).result)["waited"]
         monkeypatch.undo()
         os.environ[slurm.CONFIGURATION] = str(cluster.configuration)
         cluster.start_controller()
@@ -129,7 +130,7 @@ class TestSlurmLauncher(LauncherContract):
         def work() -> str:
             with server.client() as marey:
                 job = marey.jobs.submit("lab", JobCreate(kind="add", params={"a": 1, "b": 2}, cache="off"))
-                assert marey.jobs.wait(job.id).result["sum"] == 3
+                assert present(marey.jobs.wait(job.id).result)["sum"] == 3
                 (attempt,) = marey.jobs.attempts(job.id)
                 return attempt.worker
 
@@ -205,7 +206,7 @@ def test_when_the_controller_has_forgotten_a_task_the_records_explain_its_end(
     lines = f"echo '7_1|COMPLETED|0:0'; echo '7_2|{record}'"
     commands(tmp_path, monkeypatch, squeue="exit 0", sacct=lines)
     end = asyncio.run(SlurmLauncher(context_of(tmp_path)).why_ended("crew-k1-2"))
-    assert (end.reason, end.status) == (reason, status)
+    assert (present(end).reason, present(end).status) == (reason, status)
 
 
 def test_without_accounting_the_end_of_a_forgotten_task_is_unknown(
@@ -213,7 +214,7 @@ def test_without_accounting_the_end_of_a_forgotten_task_is_unknown(
 ) -> None:
     commands(tmp_path, monkeypatch, squeue="exit 0", sacct="echo accounting is disabled >&2; exit 1")
     end = asyncio.run(SlurmLauncher(context_of(tmp_path)).why_ended("crew-k1-2"))
-    assert (end.reason, end.status) == ("unknown", None)
+    assert (present(end).reason, present(end).status) == ("unknown", None)
 
 
 def test_logs_that_cannot_be_kept_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import pytest
 from sqlalchemy import update
 from tests.support.committing_desk import CommittingDesk
 from tests.support.interleaving import Step, interleave
+from tests.support.present import present
 from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import WRITE, requiring
 from tests.support.store_writer import StoreWriter
@@ -72,7 +73,7 @@ def seen(gaits: CommittingDesk, job_id: str, branch: str = "main") -> Seen:
 
 def dies(desk: Desk, url: str, work: str, fault: str) -> bool:
     """Do some work in a process that is killed at a fault point; return whether the process was killed there."""
-    return StoreWriter(url, desk.user.user_id, "ann").run(work, f"{fault}:kill") != 0
+    return StoreWriter(url, present(desk.user.user_id), "ann").run(work, f"{fault}:kill") != 0
 
 
 @pytest.mark.parametrize("place", [*BEFORE, *AFTER])

@@ -83,8 +83,13 @@ def tasks_of(lab: ProjectHandle, job: Job) -> list[Job]:
 
 def warm_up(marey: Marey, lab: ProjectHandle) -> Job:
     """Run a short evaluation of two tasks to its end, so that every worker has started; return the job."""
-    options = {**LONG, "name": "warm-up", "speeds_m_s": (1.0,), "turn_rates_deg_s": LONG["turn_rates_deg_s"]}
-    job = lab.evaluate("walks", cache="off", **{**options, "duration_s": 1.0})
+    options: dict[str, Any] = {
+        **LONG,
+        "name": "warm-up",
+        "speeds_m_s": (1.0,),
+        "turn_rates_deg_s": LONG["turn_rates_deg_s"],
+    }
+    job = lab.evaluate("walks", cache="off", **(options | {"duration_s": 1.0}))
     return marey.jobs.wait(job.id)
 
 
@@ -123,7 +128,7 @@ def test_a_worker_killed_at_four_fifths_costs_only_the_tasks_it_was_at(
 def test_one_worker_and_two_make_the_same_bytes(
     marey: Marey, lab: ProjectHandle, start_worker: Callable[[str], WorkerProcess]
 ) -> None:
-    options = {**LONG, "speeds_m_s": (1.0, 1.5), "duration_s": 5.0, "baseline": True, "replicates": 2}
+    options: dict[str, Any] = {**LONG, "speeds_m_s": (1.0, 1.5), "duration_s": 5.0, "baseline": True, "replicates": 2}
     start_worker("one")
     alone = digests(lab.evaluation(lab.evaluate("walks", **options)))
     start_worker("two")

@@ -10,6 +10,7 @@ import obstore
 import pytest
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.faulty_s3 import FaultyS3, faulty_s3
+from tests.support.present import present
 from tests.support.s3_servers import S3Server
 from tests.support.store_fixtures import Lab
 from tests.support.store_writer import FILES, StoreWriter
@@ -210,7 +211,9 @@ def test_large_objects_are_sent_in_parts(remote: Lab, proxy: FaultyS3) -> None:
 def test_a_sender_that_dies_leaves_whole_blobs_and_objects_that_are_swept(
     remote: Lab, behind_proxy: Bucket, database_url: str, clock: AdjustableClock, fault: str, stored: int
 ) -> None:
-    writer = StoreWriter(database_url, remote.owner.user_id, remote.owner.user_name, bucket=behind_proxy)
+    writer = StoreWriter(
+        database_url, present(remote.owner.user_id), present(remote.owner.user_name), bucket=behind_proxy
+    )
     assert writer.run("send", fault) == -signal.SIGKILL
     assert remote.read(blobs.readable, map(digest_of, FILES)) == {digest_of(data) for data in FILES[:stored]}
     assert defects(remote) == []
@@ -256,7 +259,7 @@ def test_a_move_that_dies_leaves_every_blob_readable_and_goes_on(
         lab.write(blobs.put_blob, data)
         publish(lab, digest_of(data))
     lab.database.blobs = ObjectBlobs(ObjectStorage(behind_proxy), DatabaseBlobs())
-    writer = StoreWriter(database_url, lab.owner.user_id, lab.owner.user_name, bucket=behind_proxy)
+    writer = StoreWriter(database_url, present(lab.owner.user_id), present(lab.owner.user_name), bucket=behind_proxy)
     assert writer.run("move", fault) == -signal.SIGKILL
     assert [lab.read(blobs.read_blob, digest_of(data)) for data in FILES] == FILES
     assert sum(lab.read(blobs.object_of, digest_of(data)) is not None for data in FILES) == 1

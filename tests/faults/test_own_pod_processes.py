@@ -13,6 +13,7 @@ from tests.support.cluster.dispatching import LARGE, OWN_IMAGE
 from tests.support.cluster.kubelet import MAREY
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
 from tests.support.git_repositories import committed
+from tests.support.present import present
 from tests.support.server_process import QUICK_LEASES, ServerProcess
 
 from marey_client import Marey
@@ -163,7 +164,7 @@ def test_a_script_with_an_image_runs_in_a_pod_with_this_image(
         job = project.scripts.at("train").run({}, into="trained")
         cluster.wait_for(lambda: "its script names the image" in explain_job(marey, job.id)[0])
         cluster.kubelet.paused = False
-        assert marey.jobs.wait(job.id, timeout_s=PATIENCE_S).result["fields"] == {"ran": 1}
+        assert present(marey.jobs.wait(job.id, timeout_s=PATIENCE_S).result)["fields"] == {"ran": 1}
     (pod,) = cluster.all("pods")
     assert pod["spec"]["containers"][0]["image"] == OWN_IMAGE
     server.check_database()
@@ -177,7 +178,7 @@ def test_tasks_share_an_indexed_job_of_which_one_pod_is_killed(cluster: StubClus
         job = marey.jobs.submit("lab", JobCreate(kind="tally", params={"tasks": 3}, resources=LARGE))
         pod = cluster.wait_for(cluster.running_pods, PATIENCE_S)[0]
         cluster.run(lambda: cluster.kubelet.kill(pod))
-        assert marey.jobs.wait(job.id, timeout_s=PATIENCE_S).result["seen"] == [[0, 3], [1, 3], [2, 3]]
+        assert present(marey.jobs.wait(job.id, timeout_s=PATIENCE_S).result)["seen"] == [[0, 3], [1, 3], [2, 3]]
         indexed = [one for one in cluster.all("jobs") if one["spec"].get("completionMode") == "Indexed"]
         assert len(indexed) == 1
     server.check_database()
@@ -196,6 +197,6 @@ def test_a_job_that_exhausts_the_memory_of_every_pod_fails(
         failed = marey.jobs.wait(job.id, timeout_s=PATIENCE_S, require_success=False)
         assert (failed.state, failed.attempt) == ("failed", 3)
         other = marey.jobs.submit("lab", JobCreate(kind="add", params={"a": 1, "b": 2}, resources=LARGE))
-        assert marey.jobs.wait(other.id, timeout_s=PATIENCE_S).result["sum"] == 3
+        assert present(marey.jobs.wait(other.id, timeout_s=PATIENCE_S).result)["sum"] == 3
     assert "out-of-memory" in server.log.read_text()
     server.check_database()

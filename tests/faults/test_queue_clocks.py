@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 import pytest
+from tests.support.present import present
 from tests.support.queue_desk import Desk
 
 from marey_schemas.queue.worker_protocol import ClaimRequest
@@ -93,7 +94,7 @@ def test_a_worker_that_does_not_stop_at_the_time_limit_loses_its_job_even_if_it_
         desk.heartbeat(lease)
         desk.clock.advance(50)
     assert desk.reap() == 1
-    assert desk.job(job).failure.code == "time-limit"
+    assert present(desk.job(job).failure).code == "time-limit"
     assert desk.state(job) == "failed"
 
 

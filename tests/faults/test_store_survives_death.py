@@ -4,6 +4,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from tests.support.present import present
 from tests.support.store_fixtures import Lab
 from tests.support.store_writer import ALL_US, FILES, LARGE_FILES, StoreWriter
 
@@ -31,7 +32,7 @@ def writer(lab: Lab, database_url: str, folder: str) -> StoreWriter:
 
     if folder:
         lab.database.blobs = DirectoryBlobs(Path(folder))
-    return StoreWriter(database_url, lab.owner.user_id, lab.owner.user_name, folder)
+    return StoreWriter(database_url, present(lab.owner.user_id), present(lab.owner.user_name), folder)
 
 
 def stored(lab: Lab) -> list[bool]:

@@ -32,7 +32,7 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     folder = tmp_path_factory.mktemp("nginx")
     server = ServerProcess(folder, MAREY_TRUST_PROXY="true").start()
     port = reserved_port()
-    proxy = subprocess.Popen([NGINX, "-c", str(_write_configuration(folder, port, server.port))])
+    proxy = subprocess.Popen([str(NGINX), "-c", str(_write_configuration(folder, port, server.port))])
     try:
         address = f"http://127.0.0.1:{port}"
         _wait_for(address)

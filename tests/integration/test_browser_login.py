@@ -10,6 +10,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 from unittest import mock
 from urllib.parse import urlsplit
 
@@ -194,4 +195,4 @@ def test_the_settings_of_the_page_are_valid_and_doctor_checks_them(
         ({"oidc_client_secret_file": tmp_path / "missing"}, "cannot be read"),
     ):
         with pytest.raises(ValueError, match=reason):
-            Settings(data=tmp_path, **{**written, **wrong})
+            Settings(data=tmp_path, **dict[str, Any](written, **wrong))

@@ -14,7 +14,8 @@ from tests.support.tiers import chromium
 @pytest.mark.chromium
 def test_the_page_fits_sends_requests_and_forgets_the_token(server: Server) -> None:
     token = server.make_project()
-    look = ["node", "browser/docs.mjs", chromium(), server.address, token, os.environ.get("MAREY_WEB_PICTURES", "")]
+    pictures = os.environ.get("MAREY_WEB_PICTURES", "")
+    look = ["node", "browser/docs.mjs", str(chromium()), server.address, token, pictures]
     done = subprocess.run(look, cwd=PAGE_SOURCES, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)

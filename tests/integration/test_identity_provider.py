@@ -253,7 +253,8 @@ def test_new_keys_of_the_provider_are_read_once(
 ) -> None:
     link(house)
     assert Person(house).finish().status_code == 200
-    provider.key, provider.listed = rsa_key("second"), [rsa_key("second")]
+    provider.key = rsa_key("second")
+    provider.listed = [rsa_key("second")]
     assert "does not list" in Person(house).finish().text  # read a moment ago
     assert provider.requests.count("/keys") == 1
     monkeypatch.setattr(identity_provider, "REFETCH_S", 0.0)

@@ -62,11 +62,12 @@ def test_a_performance_fills_its_cell_and_the_next_target_lies_beside_it(
     assert stream["index"] == 0.0
     assert stream["performer"] is None
     offset = 0
+    progress: dict[str, Any] = {}
     for start in range(0, walk.frame_count, 30):
         answer = send(owner, stream, offset=offset, poses=walk.poses[start : start + 30])
         assert answer.status_code == 200, answer.text
-        offset = answer.json()["offset"]
-    progress = answer.json()
+        progress = answer.json()
+        offset = progress["offset"]
     assert offset == walk.frame_count
     (cell,) = progress["changed"]
     assert (cell["speed_m_s"], cell["turn_rate_deg_s"], cell["deficit_s"]) == (1.5, 50.0, 0.0)
@@ -82,7 +83,7 @@ def circling(speed_m_s: float, turn_rate_deg_s: float, seconds: float) -> Floats
     """Return roots (n, 3) of a body that moves in the direction that it faces."""
     headings = math.radians(turn_rate_deg_s) * np.arange(round(seconds * RATE_HZ) + 1) / RATE_HZ
     steps = speed_m_s / RATE_HZ * np.stack((np.sin(headings), np.cos(headings)), axis=-1)
-    return np.column_stack((np.cumsum(steps, axis=0) - steps, headings))
+    return np.asarray(np.column_stack((np.cumsum(steps, axis=0) - steps, headings)), dtype=np.float64)
 
 
 def problem(answer: httpx.Response, status: int) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element
 import httpx
 import pytest
 from tests.support.evaluation_results import synthetic_result
+from tests.support.present import present
 from tests.support.rest_server import Server
 
 from marey_motion.evaluation.result_documents import records_to_tree, result_to_tree
@@ -135,16 +136,20 @@ def read_graphml(data: bytes) -> tuple[list[Any], list[Any], dict[str, Any]]:
     names = {key.get("id"): key.get("attr.name") for key in root.findall("g:key", space)}
     graph = root.find("g:graph", space)
 
-    def values(element: Element) -> dict[str, str]:
+    def values(element: Element) -> dict[Any, Any]:
         return {names[data.get("key")]: data.text for data in element.findall("g:data", space)}
 
-    nodes = {node.get("id"): values(node) for node in graph.findall("g:node", space)}
+    nodes = {node.get("id"): values(node) for node in present(graph).findall("g:node", space)}
     places = {name: place for place, name in enumerate(nodes)}
     edges = [
-        (places[edge.get("source")], places[edge.get("target")], int(values(edge)["count"]))
-        for edge in graph.findall("g:edge", space)
+        (places[edge.get("source")], places[edge.get("target")], int(present(values(edge)["count"])))
+        for edge in present(graph).findall("g:edge", space)
     ]
-    return [(one["clip"], int(one["frame"]), int(one["ticks"])) for one in nodes.values()], edges, values(graph)
+    return (
+        [(one["clip"], int(present(one["frame"])), int(present(one["ticks"]))) for one in nodes.values()],
+        edges,
+        values(present(graph)),
+    )
 
 
 def test_a_walk_graph_is_the_same_in_json_and_in_graphml(owner: httpx.Client, walked: str) -> None:

@@ -16,6 +16,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from tests.support.present import present
 from tests.support.store_fixtures import Lab
 from tests.support.tiers import examples, steps
 
@@ -61,13 +62,13 @@ class ItemsMachine(RuleBasedStateMachine):
     """State machine that makes each change in the store and in the model, and compares the results."""
 
     ids = Bundle("ids")
-    database = None
+    database: Database | None = None
     runs = 0
 
     def __init__(self) -> None:
         super().__init__()
         type(self).runs += 1
-        self.lab = Lab(self.database, f"run{self.runs}")
+        self.lab = Lab(present(self.database), f"run{self.runs}")
         self.world = World()
 
     def write(self, function: Callable[..., Any], item_id: str, *args: Any, **kwargs: Any) -> Item | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, cast
 
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.http.openapi import build_document
@@ -14,7 +14,7 @@ from marey_server.http.routes import Route, RouteTable
 @functools.cache
 def api_routes() -> tuple[Route, ...]:
     """Return all routes of the server."""
-    return tuple(RouteTable(None, RESOURCES))
+    return tuple(RouteTable(cast(Any, None), RESOURCES))
 
 
 @functools.cache

@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import NoReturn
 
 from marey_server.errors import InvalidProblem
 
@@ -33,7 +34,7 @@ def eat(_payload: bytes) -> bytes:
     return b"x" * (1 << 40)
 
 
-def burn(_payload: bytes) -> bytes:
+def burn(_payload: bytes) -> NoReturn:
     """Use the processor without end."""
     while True:
         pass

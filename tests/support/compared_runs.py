@@ -40,7 +40,7 @@ def compared_of(
     runs: Iterable[RunToCompare], curves: Mapping[int, Mapping[str, Curve]] | None = None, **wanted: Any
 ) -> RunComparison:
     """Return the comparison of runs; `curves` has the curves of runs by their number."""
-    order = Compared(**{"sort": "created_at", "limit": 100, "curves": True, **wanted})
+    order = Compared(**dict[str, Any](sort="created_at", limit=100, curves=True) | wanted)
     files = {f"curves-{number}": own for number, own in (curves or {}).items()}
     return compare_read("train", list(runs), files, order, complete=True)
 

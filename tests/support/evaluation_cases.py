@@ -30,7 +30,7 @@ def record_of(
     *,
     positions: NDArray[np.float64] | None = None,
     headings: NDArray[np.float64] | None = None,
-    **given: NDArray[np.generic],
+    **given: Any,
 ) -> TrialRecord:
     """Return a record that follows the reference exactly on one clip, except for the given values."""
     ticks = asked.tick_count

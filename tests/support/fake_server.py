@@ -13,6 +13,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from socket import socket
 from typing import Any
 
+from tests.support.present import present
+
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 
 ATTEMPT = re.compile(r"/api/v1/jobs/(\w+)/attempts/(\d+)/(\w+)")
@@ -163,7 +165,7 @@ def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
-        def log_message(self, *_: object) -> None:
+        def log_message(self, format: str, *_: object) -> None:  # noqa: A002
             pass
 
         def reply(self, status: int, body: bytes = b"", media_type: str = "application/json") -> None:
@@ -195,7 +197,7 @@ def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
                 return self.reply(200, json.dumps({"leases": leases}).encode())
             if PARTS.fullmatch(self.path):
                 return self.reply(200, server.read(json.loads(body)["parts"]), "application/msgpack; arrays=blocks")
-            job, _fence, request = ATTEMPT.fullmatch(self.path).groups()
+            job, _fence, request = present(ATTEMPT.fullmatch(self.path)).groups()
             if job in server.lost:
                 return self.problem(409, "lease-lost")
             if job in server.silent:
@@ -244,12 +246,12 @@ def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
                     for n, result in enumerate(server.results[found[1]])
                 ]
                 return self.reply(200, json.dumps({"items": results}).encode())
-            data = server.blobs.get(BLOB.fullmatch(self.path)[1])
+            data = server.blobs.get(present(BLOB.fullmatch(self.path))[1])
             return self.problem(404, "not-found") if data is None else self.reply(200, data)
 
         def do_PUT(self) -> None:
             data = self.body()
-            digest = BLOB.fullmatch(self.path)[1]
+            digest = present(BLOB.fullmatch(self.path))[1]
             assert digest == f"sha256:{hashlib.sha256(data).hexdigest()}"
             server.blobs[digest] = data
             self.reply(204)

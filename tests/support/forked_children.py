@@ -156,8 +156,8 @@ class ChildForker:
 def fork_children() -> None:
     """Let a forker fork the children of this process and its programs from now on."""
     forker = ChildForker()
-    child_process.start_module = forker.start  # type: ignore[assignment]
-    programs.start_program = forker.start_program  # type: ignore[assignment]
+    child_process.start_module = forker.start  # pyrefly: ignore[bad-assignment]  # does what a `Child` does here
+    programs.start_program = forker.start_program  # pyrefly: ignore[bad-assignment]  # a program is used like a `Process`
 
 
 def take_name(arguments: Sequence[str]) -> None:

@@ -6,9 +6,10 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from sqlalchemy import update
+from tests.support.present import present
 from tests.support.rest_server import SCRIPTS_AT, People
 from tests.support.who_may import PEOPLE
 
@@ -22,7 +23,7 @@ from marey_versions.tree.building import build
 from marey_versions.tree.chunks import ChunksInMemory
 
 CANARY = "canary-5e0f2b"
-ROUTES = tuple(RouteTable(None, RESOURCES))
+ROUTES = tuple(RouteTable(cast(Any, None), RESOURCES))
 UNKNOWN_LINK = "mareystudy_aaaaaaaaaaaa_" + "b" * 64
 UNKNOWN_CODE = "mareyinvite_aaaaaaaaaaaa_" + "b" * 64
 INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64
@@ -278,7 +279,7 @@ def _tokens_of_users(people: People) -> dict[str, str | None]:
     tokens["invented"] = INVENTED
     administrator = people.client(tokens["administrator"])
     assert administrator.delete("/users/disabled", headers={"If-Match": "*"}).is_success
-    prefix = tokens["expired"].split("_")[1]
+    prefix = present(tokens["expired"]).split("_")[1]
     end = update(token).where(token.c.prefix == prefix)
     # A token that expired long ago would be deleted while tests compare the tables.
     people.database.write(SYSTEM, lambda tx: tx.execute(end.values(expires_us=tx.now_us - 1)))

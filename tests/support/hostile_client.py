@@ -245,6 +245,7 @@ def some(every: list[Shot], count: int, seed: int) -> list[Shot]:
 async def fire(address: str, shot: Shot) -> Outcome:
     """Send an attacking request, and return its outcome."""
     start = time.monotonic()
+    head = ""
     try:
         async with asyncio.timeout(HANGS_S):
             for _ in range(2 if shot.manner is Manner.TWICE else 1):

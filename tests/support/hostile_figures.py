@@ -166,7 +166,7 @@ def measure_crowd(url: str, house: House, cost: ProcessCost, seconds: float, nic
     companions = companions_of(house)
     several = [house]
     for number in range(20 - len(PEOPLE)):
-        tokens = {"stranger": house.people.make_user(f"stranger{number}")}
+        tokens: dict[str, str | None] = {"stranger": house.people.make_user(f"stranger{number}")}
         several.append(House(house.people, tokens, house.variables))
     hostile = [
         shot

@@ -104,9 +104,10 @@ class JudgedRetargeting:
 
     def places(self, standard: str) -> tuple[Floats, Floats]:
         """Compute the positions (F, 3) of a standard joint in source and result."""
-        return tuple(
+        source, target = (
             kinematics.global_positions(clip)[:, actor.joint(standard)].astype(np.float64) for actor, clip in self._both
-        )  # type: ignore[return-value]
+        )
+        return source, target
 
     def off_deg(self, start: str, end: str) -> float:
         """Compute the greatest angle between the directions of a bone in source and result."""
@@ -130,10 +131,11 @@ class JudgedRetargeting:
         """Mean speeds on the ground of ankles and toes in source and result, while those of the source touch it."""
         still = self._touching[1:] & self._touching[:-1]
         rate = self.source.clip.frame_rate_hz
-        return tuple(
+        source, target = (
             float((np.linalg.norm(np.diff(points[..., ::2], axis=0), axis=-1) * rate)[still].mean())
             for points in (self._foot_points(*one) for one in self._both)
-        )  # type: ignore[return-value]
+        )
+        return source, target
 
     @property
     def knee_speeds_deg_s(self) -> tuple[float, float]:

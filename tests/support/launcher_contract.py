@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import psutil
 import pytest
 from tests.support.attached_worker import python_path
+from tests.support.present import present
 from tests.support.server_process import QUICK_LEASES, ServerProcess
 
 from marey_client import Marey
@@ -81,7 +82,7 @@ class Engine:
 
     def end_of(self, name: str) -> WorkerEnd:
         """Return why a worker ended, as soon as the launcher knows it."""
-        return self.until(lambda: self.do(self.launcher.why_ended(name)))
+        return present(self.until(lambda: self.do(self.launcher.why_ended(name))))
 
     def submit(self, how: str, folder: Path) -> Job:
         """Submit a job for workers of this launcher that waits until the file `go` exists in `folder`."""
@@ -153,7 +154,7 @@ class LauncherContract:
         for number in range(2):
             (tmp_path / str(number) / "go").touch()
         for job in jobs:
-            assert engine.marey.jobs.wait(job.id).result["waited"]
+            assert present(engine.marey.jobs.wait(job.id).result)["waited"]
 
     def test_a_worker_that_is_stopped_returns_its_job(self, engine: Engine, tmp_path: Path) -> None:
         (name,) = engine.start(1, key="k2")

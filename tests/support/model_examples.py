@@ -15,9 +15,10 @@ def walks(count: int = 12, *, names: Sequence[str] | None = None, frames: int = 
     """Return walks of equal duration and increasing speed, played at varying speed."""
     random = np.random.default_rng(seed)
     speeds = np.linspace(0.9, 1.7, count)
-    clips = []
+    clips, skeletons = [], []
     for index, speed in enumerate(speeds):
         clip = generate_gait(float(speed), float(random.normal(0.0, 0.25)), frames / 60.0)
+        skeletons.append(clip.skeleton)
         slopes = np.exp(0.35 * random.normal() + 0.3 * random.normal() * np.sin(np.linspace(0.0, np.pi, frames - 1)))
         times = np.concatenate(([0.0], np.cumsum(slopes)))
         times *= round(times[-1]) / times[-1]
@@ -34,4 +35,4 @@ def walks(count: int = 12, *, names: Sequence[str] | None = None, frames: int = 
             )
         )
     keyframes = {"left foot down": frames // 3, "right foot down": 2 * frames // 3}
-    return AlignedSet(clip.skeleton, 60.0, tuple(clips), "walk000", keyframes)
+    return AlignedSet(skeletons[-1], 60.0, tuple(clips), "walk000", keyframes)

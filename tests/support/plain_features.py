@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
+from tests.support.present import present
 
 from marey_motion.clip import Clip
 from marey_motion.matching.body import MatchingBody
@@ -36,7 +37,7 @@ def joints_in_the_world(clip: Clip) -> np.ndarray:
                 continue
             offset = np.array(skeleton.offsets[joint])
             if joint in clip.translated_joints:
-                offset = clip.translations[frame, clip.translated_joints.index(joint)].astype(float)
+                offset = present(clip.translations)[frame, clip.translated_joints.index(joint)].astype(float)
             places[frame, joint] = places[frame, parent] + turned[parent].apply(offset)
             turned.append(turned[parent] * local)
     return places
@@ -56,8 +57,8 @@ def plain_rows(clip: Clip, body: MatchingBody) -> PlainRows:
         facing[frame] = forward[[0, 2]] / np.hypot(forward[0], forward[2])
     odd = frames if frames % 2 else frames - 1
     if odd >= 5:
-        ground = savgol_filter(ground, min(31, odd), 3, axis=0)
-        facing = savgol_filter(facing, min(61, odd), 3, axis=0)
+        ground = np.asarray(savgol_filter(ground, min(31, odd), 3, axis=0), dtype=np.float64)
+        facing = np.asarray(savgol_filter(facing, min(61, odd), 3, axis=0), dtype=np.float64)
     headings = np.unwrap(np.arctan2(facing[:, 0], facing[:, 1]))
     velocities = _velocities(places)
     into_root = [Rotation.from_euler("y", -heading) for heading in headings]

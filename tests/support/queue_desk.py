@@ -194,7 +194,7 @@ class Desk:
 
     def claim_many(self, count: int = 256, kinds: tuple[str, ...] = tuple(KINDS), **fields: Any) -> list[Lease]:
         """Claim up to `count` jobs, as the worker `w` or the given one, and return their leases."""
-        request = ClaimRequest(**{"worker": "w", "kinds": kinds, "max": count, **fields})
+        request = ClaimRequest(**dict[str, Any](worker="w", kinds=kinds, max=count) | fields)
         return self.database.write(self.user, queue.claim, request, self.policy)
 
     def claim(self, **fields: Any) -> Lease:

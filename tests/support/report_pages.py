@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from html.parser import HTMLParser
+from typing import Any
 
 VOID = {"br", "hr", "img", "meta", "col"}
 HOSTILE = (
@@ -31,19 +32,19 @@ class Page(HTMLParser):
         self.close()
         assert not self.opened
 
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str]]) -> None:
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
         self.tags[tag] += 1
         if tag not in VOID:
             self.opened.append(tag)
-        for name, value in attributes:
+        for name, value in attrs:
             self.attributes.add(name)
             if name == "id":
                 self.ids[value] += 1
             if name in ("href", "src", "action", "data", "xlink:href"):
                 self.links.append(value)
 
-    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str]]) -> None:
-        self.handle_starttag(tag, attributes)
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
+        self.handle_starttag(tag, attrs)
         if tag not in VOID:
             self.opened.pop()
 

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -57,12 +58,12 @@ class S3Server:
         assert self._process is not None
         return self._process.pid
 
-    def bucket(self, prefix: str, **changes: object) -> Bucket:
+    def bucket(self, prefix: str, **changes: Any) -> Bucket:
         """Return the settings of a bucket on this server; tests use one bucket with different prefixes."""
         settings = Bucket(
             "marey", endpoint=self.endpoint, prefix=prefix, key_id=KEY_ID, secret_key=SECRET_KEY, timeout_s=20
         )
-        return replace(settings, **changes)  # type: ignore[arg-type]
+        return replace(settings, **changes)
 
     def start(self, bucket: Bucket | None = None) -> None:
         """Start the process, wait until it stores objects in `bucket`, and create the bucket unless it exists."""

@@ -9,7 +9,7 @@ import httpx
 from marey_client.marey import Marey
 from marey_client.retries import Retries
 
-Answer = httpx.Response | Exception | Callable[[httpx.Request], httpx.Response]
+Answer = httpx.Response | Exception | Callable[[httpx.Request], Any]
 """A response, an error to raise, or a function that answers the request."""
 
 
@@ -55,5 +55,8 @@ class ScriptedServer:
         """Return a client of this server whose waits take no time."""
         retries = Retries(sleep=self.waited.append, random_unit=lambda: 0.0)
         return Marey(
-            "http://server.test/", "marey_secret", http=httpx.MockTransport(self), **{"retries": retries, **options}
+            "http://server.test/",
+            "marey_secret",
+            http=httpx.MockTransport(self),
+            **dict[str, Any](retries=retries) | options,
         )

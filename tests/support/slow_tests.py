@@ -11,6 +11,7 @@ import functools
 import time
 from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -72,8 +73,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node: object) -> None:
-    config: pytest.Config = node.config  # type: ignore[attr-defined]
+def pytest_testnodedown(node: Any) -> None:
+    config: pytest.Config = node.config
     for name, seconds in getattr(node, "workeroutput", {}).get("taken", {}).items():
         _add(config.stash[_TAKEN], name, seconds)
 

@@ -9,6 +9,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from tests.support.present import present
+
 from marey_schemas.encoding.digests import digest_of
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
@@ -88,7 +90,7 @@ class StoreWriter:
         process.kill()
         assert status in (0, -signal.SIGKILL), f"{work} with the fault {fault!r} ended with {status}"
         process.close()
-        return status
+        return present(status)
 
 
 def _do(

@@ -6,7 +6,7 @@ import contextlib
 import selectors
 import socket
 import threading
-from typing import Self
+from typing import Self, cast
 
 
 class TcpProxy:
@@ -89,7 +89,7 @@ class TcpProxy:
             while not self._stopping.is_set():
                 for key, _ in selector.select(0.2):
                     peer, dropping = key.data
-                    data = key.fileobj.recv(65536)  # type: ignore[union-attr]
+                    data = cast(socket.socket, key.fileobj).recv(65536)
                     if not data:
                         return
                     if key.fileobj is client:

@@ -15,12 +15,14 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
 from hatch_build import SOURCES as PAGE_SOURCES
 from hatch_build import pages_are_current
 from tests.support.database_fixtures import BACKENDS
+from tests.support.present import present
 from tests.support.slow_tests import function_of, slow_tests
 
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
@@ -189,17 +191,17 @@ ON_DATABASES = pytest.StashKey[Counter[str]]()
 
 def examples(count: int) -> int:
     """Return how many examples a property test draws in the running tier; `count` is the number in the tier `test`."""
-    return max(1, count * hypothesis.settings.default.max_examples // EXAMPLES)
+    return max(1, count * present(hypothesis.settings.default).max_examples // EXAMPLES)
 
 
 def steps(count: int) -> int:
     """Return how many steps a state machine takes in the running tier; `count` is the number in the tier `test`."""
-    return count * hypothesis.settings.default.stateful_step_count // STEPS
+    return count * present(hypothesis.settings.default).stateful_step_count // STEPS
 
 
 def is_soak() -> bool:
     """Return whether this is the tier `soak`, in which tests run their long forms."""
-    return hypothesis.settings.default.max_examples > EXAMPLES
+    return present(hypothesis.settings.default).max_examples > EXAMPLES
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -346,9 +348,9 @@ def pytest_report_header() -> str:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node: object) -> None:
+def pytest_testnodedown(node: Any) -> None:
     """Keep the counts of only one worker process, because each process has collected all tests."""
-    config: pytest.Config = node.config  # type: ignore[attr-defined]
+    config: pytest.Config = node.config
     config.stash[LEFT_OUT] = Counter(getattr(node, "workeroutput", {}).get("left_out", {}))
 
 

@@ -12,7 +12,6 @@ from typing import Any, cast
 
 from marey_client.bridges.version import DescribedClip, VersionToExport
 from marey_client.handles.versions import DatasetHandle
-from marey_client.transport import Transport
 from marey_motion import documents
 from marey_motion.clip import Clip
 from marey_schemas.datasets.commits import Commit, Entry
@@ -47,7 +46,7 @@ class VersionInMemory(VersionToExport):
             Entry(path=path, kind=Kind.CLIP, parts={"motion": digest(path)}, tags=(), item=f"clip{place}", revision=1)
             for place, path in enumerate(sorted(motions))
         )
-        dataset = DatasetHandle(cast(Transport, None), "/projects/lab/datasets/gaits")
+        dataset = DatasetHandle(cast(Any, None), "/projects/lab/datasets/gaits")
         return cls(dataset, commit, "v1", "", clips, {}, motions=motions, records=records or {})
 
     def described(self, pool: ThreadPoolExecutor) -> Iterator[list[DescribedClip]]:

@@ -110,7 +110,7 @@ def open_receiver() -> Iterator[Open]:
                 self.end_headers()
                 self.wfile.write(receiver.answer)
 
-            def log_message(self, *_args: Any) -> None:
+            def log_message(self, format: str, *_args: Any) -> None:  # noqa: A002
                 pass
 
         server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)

@@ -169,7 +169,7 @@ def _objects(value: Any) -> Iterator[Mapping[str, Any]]:
         if isinstance(one, dict):
             yield one
         members: Iterable[Any] = one.values() if isinstance(one, dict) else one
-        waiting.extend(member for member in members if isinstance(member, dict | list))
+        waiting.extend(member for member in members if isinstance(member, (dict, list)))
 
 
 def _reference(found: Mapping[str, Any]) -> RevisionKey | None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from marey_schemas.items import PartPlace
 from marey_schemas.kinds import Kind
@@ -200,5 +200,5 @@ def unpack(data: bytes) -> Any:
     try:
         name, fields = msgpack.unpackb(data, strict_map_key=True)
         return _FORMS[name].validate_python(fields)
-    except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError, ValidationError) as error:
+    except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError) as error:
         raise BadMessage(f"{len(data)} bytes from another process cannot be read as a message: {error}") from error

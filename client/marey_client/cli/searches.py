@@ -162,7 +162,7 @@ def search(
     SearchRequest.model_validate(asked)
     with connect(context) as marey:
         found = model_at(marey, place)
-        answer = found.search(**{**asked, "motion": False})
+        answer = found.search(**(asked | {"motion": False}))
         written = None if out is None else found.save_search(out, format=format, **asked)
     if as_json:
         file = None if written is None else str(written)

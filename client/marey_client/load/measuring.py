@@ -72,7 +72,7 @@ def load_test(marey: Marey, plan: LoadPlan, on_run: OnRun) -> Iterator[RateFigur
             replicates = []
             for number in range(plan.replicates):
                 what = f"{rate:g}/s, run {number + 1} of {plan.replicates}"
-                tick = _ticking(use, lambda seconds, what=what: on_run(what, seconds, plan.seconds))  # type: ignore[misc]
+                tick = _ticking(use, lambda seconds, what=what: on_run(what, seconds, plan.seconds))
                 seed = plan.seed + place * MOST_REPLICATES + number
                 replicates.append(_run(scratch, plan, rate, plan.seconds, seed, tick))
             completed = sum(one.completed for one in replicates)

@@ -125,7 +125,7 @@ class OfferedLoad:
         with connection(self._scratch.url, self._scratch.token) as caller:
             while not self._stop.is_set():
                 claim = {**wanted, "claim_id": secrets.token_hex(16)}
-                reply = self._timed("claim", lambda claim=claim: caller.post("/leases", claim))  # type: ignore[misc]
+                reply = self._timed("claim", lambda claim=claim: caller.post("/leases", claim))
                 if not self._accepted("claim", reply):
                     self._stop.wait(PAUSE_AFTER_ERROR_S)
                     continue

@@ -63,7 +63,7 @@ class PosedSkeleton:
         """Return the hierarchy of some joints, which include the parents of each."""
         new = {old: place for place, old in enumerate(places)} | {-1: -1}
         kept = [self.hierarchy.joints[place] for place in places]
-        return SkeletonHierarchy(joints=tuple(Joint(**{**dict(joint), "parent": new[joint.parent]}) for joint in kept))
+        return SkeletonHierarchy(joints=tuple(Joint(**(dict(joint) | {"parent": new[joint.parent]})) for joint in kept))
 
 
 _RIGS: WeakKeyDictionary[Transport, dict[tuple[str, str, int], PosedSkeleton]] = WeakKeyDictionary()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -54,8 +54,8 @@ class MotionWindows:
         stride = frames if stride is None else stride
         if frames < 1 or stride < 1:
             raise BadArgument(f"frames and stride must be at least 1, not {frames} and {stride}")
-        if content not in Content.__args__:  # type: ignore[attr-defined]
-            raise BadArgument(f"content: {content!r} is none of {', '.join(Content.__args__)}")  # type: ignore[attr-defined]
+        if content not in get_args(Content):
+            raise BadArgument(f"content: {content!r} is none of {', '.join(get_args(Content))}")
         self.frames, self.content, self.joints, self.seed = frames, content, joints, seed
         clips = tuple(clips)
         _require_one("frame rate", {clip.path: clip.frame_rate_hz for clip in clips}, "choose clips of one frame rate")

@@ -6,7 +6,7 @@ Every request uses the newest joint mapping of each skeleton.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeAlias, Unpack
+from typing import Any, TypeAlias, Unpack, cast
 
 from marey_client.arguments import checked
 from marey_client.errors import NoAnnotations
@@ -228,7 +228,7 @@ def plan_model(
     `NoAnnotations` if no clip has an annotation in the layer.
     """
     files = [one for one in takes if isinstance(one, LocalFile)] if isinstance(takes, Sequence) else []
-    known = _of_files(project, files, options, notice) if files else _of_clips(project, takes, layer)  # type: ignore[arg-type]
+    known = _of_files(project, files, options, notice) if files else _of_clips(project, cast(Clips, takes), layer)
     return checked(ModelPlan, {"name": name, "into": name, **known, **choices})
 
 

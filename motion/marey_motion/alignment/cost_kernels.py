@@ -11,7 +11,7 @@ from marey_motion.kernels import compiled
 
 
 @compiled
-def _products(points, others, real, imaginary, heights):  # type: ignore[no-untyped-def]
+def _products(points, others, real, imaginary, heights):
     """Compare the points of one frame (P, 3) with each of m frames, `others` (P, 3, m).
 
     h = x + i·z is the horizontal position of a point in the one frame, and h' its position in one of the m frames.
@@ -32,7 +32,7 @@ def _products(points, others, real, imaginary, heights):  # type: ignore[no-unty
 
 
 @compiled
-def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-untyped-def]
+def turned(rows, columns, energies, other_energies, costs):
     """Fill `costs` (n, m) with the cost of each pair of frames after the best rotation about the vertical.
 
     rows (n, P, 3) and columns (P, 3, m) are the points of the two motions, centred in each frame; `energies` (n,) and
@@ -48,7 +48,7 @@ def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-u
 
 
 @compiled
-def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
+def turned_windows(a, b, window, costs):
     """Fill `costs` (n, m) like `turned`, but with one rotation and shift for all `window` frames of a window.
 
     `a` and `b` are the motions, as `cost.CostPoints`.
@@ -74,7 +74,7 @@ def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
+def _slide(history, row, window, sums):
     """Sum each of c matrices over windows of frames, along the diagonals, and write the sums to `sums` (c, m).
 
     The sums extend over `window` rows, the last of which is `row`. `history` (window, c, m + window - 1) is a ring
@@ -90,7 +90,7 @@ def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _squares(points, others, row):  # type: ignore[no-untyped-def]
+def _squares(points, others, row):
     row[:] = 0.0
     for p in range(points.shape[0]):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
@@ -101,7 +101,7 @@ def _squares(points, others, row):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def plain(rows, columns, costs):  # type: ignore[no-untyped-def]
+def plain(rows, columns, costs):
     """Fill `costs` (n, m) with sums of squared distances of the points `rows` (n, P, 3) from `columns` (P, 3, m).
 
     The points contain the square roots of their weights as factors, see `cost.CostPoints`.
@@ -111,7 +111,7 @@ def plain(rows, columns, costs):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def plain_windows(rows, columns, window, costs):  # type: ignore[no-untyped-def]
+def plain_windows(rows, columns, window, costs):
     """Fill `costs` (n, m) like `plain`, averaged over the `window` frames of each window."""
     n, m = costs.shape
     sums = np.zeros((1, m))

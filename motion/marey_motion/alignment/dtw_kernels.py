@@ -12,7 +12,7 @@ LANES = 4
 
 
 @compiled
-def align(costs, path):  # type: ignore[no-untyped-def]
+def align(costs, path):
     """Fill the first rows of `path` with the cheapest path through `costs` (n, m), last cell first.
 
     Returns the total cost of the path and its number of cells.
@@ -33,7 +33,7 @@ def align(costs, path):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
+def _cheapest(both, first, second):
     """Find the least of three totals, and the number of the step that it belongs to.
 
     Step 0 advances both motions, step 1 the first motion alone, and step 2 the second motion alone. The code has no
@@ -45,7 +45,7 @@ def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untyped-def]
+def _cells(costs, before, totals, steps, start, stop):
     """Fill columns [start, stop) of one row of `totals` and `steps`, from the row `before` of totals.
 
     Column j of `costs` is column j + 1 of the totals.
@@ -56,7 +56,7 @@ def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untype
 
 
 @compiled
-def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
+def _four_rows(costs, totals, steps):
     """Fill four rows of `totals` and `steps` at once, as `_cells` does.
 
     Each row is computed one column behind the row above it, so that four cells, one of each row, are computed in
@@ -81,7 +81,7 @@ def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _walk_back(steps, path):  # type: ignore[no-untyped-def]
+def _walk_back(steps, path):
     """Trace the path back from the last cell; fill `path`, last cell first, and return the number of its cells.
 
     `steps` (n, m) contains, for each cell, the number of the step that leads to it, as in `_cheapest`.
@@ -100,7 +100,7 @@ def _walk_back(steps, path):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def total(costs):  # type: ignore[no-untyped-def]
+def total(costs):
     """Compute the total cost of the cheapest path through `costs` (n, m) in O(m) memory."""
     n, m = costs.shape
     totals = np.empty(m)
@@ -115,7 +115,7 @@ def total(costs):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
+def align_limited(costs, max_run, path):
     """Fill `path` like `align`, with at most `max_run` consecutive steps in one motion alone.
 
     Returns the total cost, infinite if there is no such path, and the number of cells.
@@ -132,7 +132,7 @@ def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def align_limited_cyclic(costs, max_run, path):  # type: ignore[no-untyped-def]
+def align_limited_cyclic(costs, max_run, path):
     """Fill `path` like `align_limited`, with columns shifted so that the mean cost of the cells is least.
 
     Column `shift` becomes the first; the path counts columns from it. Returns the total cost, infinite if no shift has
@@ -152,7 +152,7 @@ def align_limited_cyclic(costs, max_run, path):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
+def total_limited(costs, max_run):
     """Compute the total cost of the cheapest path with limited runs in O(max_run·m) memory; infinite if none exists."""
     n, m = costs.shape
     not_first, not_second = np.empty((2, m)), np.empty((2, m))
@@ -164,7 +164,7 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
+def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):
     """Compute the least totals of paths with limited runs to the cells of row `i`: `not_first` and `not_second` (m,).
 
     `not_first[j]` is the least total of the paths to cell j whose last step does not advance the first motion alone;
@@ -203,7 +203,7 @@ def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first
 
 
 @compiled
-def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ignore[no-untyped-def]
+def _walk_back_limited(costs, max_run, not_first, not_second, path):
     """Trace the path back, one run of equal steps at a time; fill `path`, last cell first; return the number of cells.
 
     `not_first` and `not_second` (n, m) are the totals of `_limited_row` for all rows.
@@ -241,7 +241,7 @@ def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ig
 
 
 @compiled
-def _distances_of_frame(points, others, row):  # type: ignore[no-untyped-def]
+def _distances_of_frame(points, others, row):
     """Fill `row` (m,) with the mean distance between `points` (P, 3) and each frame of `others` (P, 3, m)."""
     count = points.shape[0]
     row[:] = 0.0
@@ -255,14 +255,14 @@ def _distances_of_frame(points, others, row):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def distances(a, b, out):  # type: ignore[no-untyped-def]
+def distances(a, b, out):
     """Fill `out` (n, m) with the mean distance between the points of a (n, P, 3) and b (P, 3, m)."""
     for i in range(a.shape[0]):
         _distances_of_frame(a[i], b, out[i])
 
 
 @compiled
-def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
+def total_within(a, b, rest, limit):
     """Compute the least total of a path through the distances of a (n, P, 3) and b (P, 3, m); infinite above `limit`.
 
     rest[i] is a lower bound of the cost that a path adds after row i. Every path crosses every row, so the computation
@@ -287,7 +287,7 @@ def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
+def box_costs(a, low, high, out):
     """Write to out (n,), for each frame of a (n, P, 3), the mean distance of its points from the nearest of B boxes.
 
     low and high (P, 3, B) are the corners of the boxes.
@@ -310,7 +310,7 @@ def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def range_bounds(points, starts, stops, low, high, one, others, limit, out):  # type: ignore[no-untyped-def]
+def range_bounds(points, starts, stops, low, high, one, others, limit, out):
     """Fill `out` (K,) with lower bounds of the costs of aligning range `one` with K other ranges of frames.
 
     points (N, P, 3); range r is [starts[r], stops[r]) and has the bounding box low[r], high[r] (P, 3). Costs are
@@ -331,7 +331,7 @@ def range_bounds(points, starts, stops, low, high, one, others, limit, out):  # 
 
 
 @compiled
-def _mean_distance(a, b):  # type: ignore[no-untyped-def]
+def _mean_distance(a, b):
     total = 0.0
     for p in range(a.shape[0]):
         total += np.sqrt((a[p, 0] - b[p, 0]) ** 2 + (a[p, 1] - b[p, 1]) ** 2 + (a[p, 2] - b[p, 2]) ** 2)
@@ -339,7 +339,7 @@ def _mean_distance(a, b):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _cost_from_box(points, start, stop, low, high, most):  # type: ignore[no-untyped-def]
+def _cost_from_box(points, start, stop, low, high, most):
     """Sum the mean distances of the points from a bounding box over frames; stop when the sum exceeds `most`."""
     total = 0.0
     for i in range(start, stop):

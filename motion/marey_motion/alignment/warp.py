@@ -60,7 +60,7 @@ def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
     runs = np.concatenate(([0], np.cumsum((side == 0) | ((before != 0) & (before != side)))))
     lengths = np.bincount(runs)
     middles = np.stack([np.bincount(runs, weights=frames) / lengths for frames in path.T], axis=1)
-    knots = np.concatenate((path[:1], middles[1:-1], path[-1:]))
+    knots = np.concatenate((path[:1], middles[1:-1], path[-1:]), dtype=np.float64)
     return knots[:, 0], knots[:, 1]
 
 
@@ -130,7 +130,7 @@ def warped(motion: Motion, times: ArrayLike) -> Motion:
     made = motion.at_frames(frames)
     (between,) = np.nonzero(places != frames)
     if len(between):
-        before, share = frames[between], (places - frames)[between]
+        before, share = frames[between], places[between] - frames[between].astype(np.float64)
         turned = quaternions.slerp(motion.rotations[before], motion.rotations[before + 1], share[:, None])
         made.rotations[between] = turned
         made.root_translations[between] = _between(motion.root_translations, before, share)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +119,7 @@ def path_change(
     return PathChange(joint=joint, moved=moved, **_exceeding(distances, course, threshold_cm))
 
 
-def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, object]:
+def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, Any]:
     """Summarise changes (n,) in matched frames, as fields of a `JointChange` or `PathChange`.
 
     The fields are mean and maximum of the changes, the frame of the maximum, and the ranges above the threshold.

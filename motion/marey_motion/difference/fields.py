@@ -75,7 +75,7 @@ def _changed_members(before: Mapping[str, Any], after: Mapping[str, Any], pointe
 
 def _is_nothing(value: Any) -> bool:
     """Return whether a value is null, an empty list or an empty object, all of which count as absent values."""
-    return value is None or (isinstance(value, Mapping | list | tuple) and not value)
+    return value is None or (isinstance(value, (Mapping, list, tuple)) and not value)
 
 
 def _changed_entries(before: Sequence[Any], after: Sequence[Any], pointer: str) -> Iterator[ChangedValue]:
@@ -93,7 +93,7 @@ def _changed_entries(before: Sequence[Any], after: Sequence[Any], pointer: str) 
 
 
 def _is_list(value: Any) -> bool:
-    return isinstance(value, list | tuple)
+    return isinstance(value, (list, tuple))
 
 
 def _equal(before: Any, after: Any) -> bool:

@@ -202,8 +202,8 @@ def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Flo
     padded = np.concatenate((np.zeros((3, values.shape[1])), points, np.zeros((3, values.shape[1]))))
     start = window.start - first + 3
     size = window.stop - window.start
-    spread: Floats = sum(WEIGHTS[i] * padded[start + i - 1 : start + i - 1 + size] for i in range(3))
-    return spread
+    parts = (WEIGHTS[i] * padded[start + i - 1 : start + i - 1 + size] for i in range(3))
+    return sum(parts, np.zeros((size, values.shape[1])))
 
 
 def _energy(count: int, window: Window, swing: float) -> Floats:

@@ -135,7 +135,7 @@ def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Se
     reach = len(weights) // 2
     before = _reflected(rotations[0], rotations[reach:0:-1])
     after = _reflected(rotations[-1], rotations[-2 : -reach - 2 : -1])
-    means = _averaged(np.concatenate((before, rotations, after)), weights)
+    means: Floats = _averaged(np.concatenate((before, rotations, after)), weights)
     lengths = np.sqrt(np.einsum("fjc,fjc->fj", means, means))
     if lengths.size and lengths.min() < LEAST_LENGTH:
         frame, joint = np.unravel_index(int(np.argmin(lengths)), lengths.shape)

@@ -206,7 +206,7 @@ def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn
     -------
     float    0 to 1
     """
-    sizes: Floats = np.unique(np.round(np.abs(turn_edges), EDGE_DECIMALS))
+    sizes = np.asarray(np.unique(np.round(np.abs(turn_edges), EDGE_DECIMALS)), dtype=np.float64)
     bounds = sizes if turn_edges[0] > 0.0 or turn_edges[-1] < 0.0 else np.concatenate(([0.0], sizes[sizes > 0.0]))
     sides = [
         cell_counts(speeds[side], speed_edges, np.abs(turn_rates_deg_s[side]), bounds)

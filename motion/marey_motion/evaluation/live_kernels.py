@@ -15,7 +15,7 @@ RECEIVED, SMOOTHED = 0, 1
 
 
 @compiled
-def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
+def _estimate(take, smoother, frame, column):
     """Smooth one column of `take.raw` at a frame, with the matrix `smoother` (see `live_windows.smoother`)."""
     width = smoother.shape[0]
     first = max(min(frame - width // 2, take.counters[RECEIVED] - width), 0)
@@ -26,7 +26,7 @@ def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
+def _add_step(take, place, left, ahead, length):
     """Replace the oldest step in the ring buffer, which is at `place`, and update the sums of the steps.
 
     `left` and `ahead` are the parts of the step relative to the facing direction; `length` is its length.
@@ -45,7 +45,7 @@ def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _move_to(take, x, z, heading):  # type: ignore[no-untyped-def]
+def _move_to(take, x, z, heading):
     """Append a smoothed root to the ring buffers, together with the step that leads to it."""
     frame, span = take.counters[SMOOTHED], take.steps.shape[0]
     if frame > 0:
@@ -61,7 +61,7 @@ def _move_to(take, x, z, heading):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def]
+def _smooth(take, filters, frame, shortest_mean):
     """Compute the smoothed position and heading of the root at a frame, and store them as the current ones.
 
     If the smoothed facing direction is shorter than `shortest_mean`, the direction of the frame itself is used.
@@ -77,7 +77,7 @@ def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def
 
 
 @compiled
-def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
+def newest_window(take, duration_s, window):
     """Write to `window` the speed, turn rate, forward and strafe velocity of the newest `duration_s` seconds of `take`.
 
     Returns whether the take is long enough.
@@ -93,7 +93,7 @@ def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
+def receive(take, filters, frames, duration_s, shortest_mean, windows):
     """Process raw frames (n, 4), with columns as in `LiveTake.raw`.
 
     The windows that the frames complete are written to `windows`; the number of these windows is returned. `duration_s`
@@ -116,7 +116,7 @@ def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type:
 
 
 @compiled
-def finish(take, filters, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
+def finish(take, filters, duration_s, shortest_mean, windows):
     """Smooth the last frames of a take; write the windows that these frames complete, and return the number of windows.
 
     The parameters are as in `receive`.

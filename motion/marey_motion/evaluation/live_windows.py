@@ -97,7 +97,7 @@ class LiveWindows:
         window = np.empty(4)
         if not live_kernels.newest_window(self._take, self._duration_s, window):
             return None
-        return Windows(*window)
+        return Windows._make(window)
 
     def receive(self, frames: Floats) -> Windows:
         """Add the next frames of the take.

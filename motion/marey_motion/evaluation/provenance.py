@@ -138,7 +138,7 @@ def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
         for name, member in value.items():
             yield from _flat(f"{prefix}.{name}" if prefix else name, member)
     else:
-        yield prefix, ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
+        yield prefix, ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else value
 
 
 def _rows_digest(database: MatchingDatabase, clip: DatabaseClip) -> str:
@@ -170,7 +170,7 @@ def _canonical(value: Any) -> Any:
         return _canonical(asdict(value))
     if isinstance(value, Mapping):
         return {key: _canonical(member) for key, member in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_canonical(item) for item in value]
     if isinstance(value, int | float) and not isinstance(value, bool):
         return float(value) + 0.0

@@ -255,7 +255,7 @@ def sum_by_source(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> 
             ticks=sum(usage[index].ticks for index in own),
             share=sum(usage[index].share for index in own),
             entries=sum(usage[index].entries for index in own),
-            popularity=np.sum([usage[index].popularity for index in own], axis=0, dtype=np.int64),
+            popularity=np.asarray(np.sum([usage[index].popularity for index in own], axis=0, dtype=np.int64)),
         )
         for uid, own in sorted(families.items())
     )

@@ -141,7 +141,7 @@ def clips_from_tree(tree: Mapping[str, Any]) -> tuple[DatabaseClip, ...]:
     -------
     tuple of DatabaseClip    the clips
     """
-    return tuple(DatabaseClip(**{**clip, "tags": tuple(clip["tags"])}) for clip in tree["clips"])
+    return tuple(DatabaseClip(**(dict(clip) | {"tags": tuple(clip["tags"])})) for clip in tree["clips"])
 
 
 def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> EvaluationResult:
@@ -154,7 +154,7 @@ def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> Evaluati
         suite=tree["suite"],
         usage=_usage(tree["usage"], clips),
         switches=tree["switches"],
-        coverage=Coverage(**{**tree["coverage"], "too_short": tuple(tree["coverage"]["too_short"])}),
+        coverage=Coverage(**(dict(tree["coverage"]) | {"too_short": tuple(tree["coverage"]["too_short"])})),
         records=tuple(records),
         baseline=None if tree["baseline"] is None else _result(tree["baseline"], ()),
         notes=tuple(tree["notes"]),
@@ -280,6 +280,6 @@ def _plain(value: Any) -> Any:
     """Convert tuples to lists, and mappings to dictionaries."""
     if isinstance(value, Mapping):
         return {key: _plain(member) for key, member in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     return value

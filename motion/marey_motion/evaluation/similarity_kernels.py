@@ -8,7 +8,7 @@ from marey_motion.kernels import compiled
 
 
 @compiled
-def nearest_of_others(queries, query_groups, points, groups, found):  # type: ignore[no-untyped-def]
+def nearest_of_others(queries, query_groups, points, groups, found):
     """Fill `found` (Q,) with the distance of each query (Q, P, 3) from the nearest of N poses (N, P, 3).
 
     The distance of two poses is the sum over their P points. A query is compared only with poses whose `groups` (N,)

@@ -99,7 +99,7 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
 
 
 @compiled
-def _scan(text, called, first_columns, values, seen, long_tokens, state):  # type: ignore[no-untyped-def]
+def _scan(text, called, first_columns, values, seen, long_tokens, state):
     end = text.size
     bones = first_columns.size - 1
     moving = np.sum(first_columns[1:] > first_columns[:-1])
@@ -139,7 +139,7 @@ def _scan(text, called, first_columns, values, seen, long_tokens, state):  # typ
 
 
 @compiled
-def _next_word(text, state):  # type: ignore[no-untyped-def]
+def _next_word(text, state):
     """Skip to the next word and return its position; the position and the line number in `state` are updated."""
     i = state[_POSITION]
     while i < text.size and text[i] <= 32:
@@ -151,7 +151,7 @@ def _next_word(text, state):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _is_frame_number(text, start, stop):  # type: ignore[no-untyped-def]
+def _is_frame_number(text, start, stop):
     for i in range(start, stop):
         if not 48 <= text[i] <= 57:
             return False
@@ -159,7 +159,7 @@ def _is_frame_number(text, start, stop):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _begin_frame(text, start, stop, state):  # type: ignore[no-untyped-def]
+def _begin_frame(text, start, stop, state):
     number = np.int64(0)
     for i in range(start, stop):
         number = number * 10 + np.uint8(text[i] - 48)
@@ -172,7 +172,7 @@ def _begin_frame(text, start, stop, state):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _bone_called(word, called, expected):  # type: ignore[no-untyped-def]
+def _bone_called(word, called, expected):
     """Return the index of the bone with the name `word`, or -1.
 
     Most files list the bones in the order of the skeleton, so `expected` is compared first. The other bones are found
@@ -195,7 +195,7 @@ def _bone_called(word, called, expected):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _compare(word, names, name_ends, bone):  # type: ignore[no-untyped-def]
+def _compare(word, names, name_ends, bone):
     """Return a number below, equal to or above 0 if `word` is before, equal to or after the name of a bone."""
     first = name_ends[bone - 1] if bone > 0 else 0
     length = name_ends[bone] - first
@@ -206,7 +206,7 @@ def _compare(word, names, name_ends, bone):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _read_bone(text, i, first_columns, values, long_tokens, state):  # type: ignore[no-untyped-def]
+def _read_bone(text, i, first_columns, values, long_tokens, state):
     """Read the numbers of a bone, from position `i` to the end of the line, into `values`.
 
     Returns the position after the numbers, or -1 if a number is malformed.

@@ -328,7 +328,8 @@ class _AsfReader:
         radians = np.radians(angles) if self.degrees else np.array(angles)
         frame = np.array([1.0, 0.0, 0.0, 0.0])
         for axis, angle in zip(order, radians, strict=True):
-            frame = quaternions.multiply(quaternions.from_axis_angle(np.eye(3)[_AXES.index(axis)], angle), frame)
+            turn = quaternions.from_axis_angle(np.eye(3)[_AXES.index(axis)], angle)
+            frame = np.asarray(quaternions.multiply(turn, frame), dtype=np.float64)
         return frame
 
     def _assembled(self) -> AsfSkeleton:

@@ -231,7 +231,8 @@ class _HierarchyReader:
 
 
 def _read_motion_header(lines: TextLines, header: BvhHeader) -> None:
-    frames, frame_time = None, None
+    frames: bytes | None = None
+    frame_time: float | None = None
     while frames is None or frame_time is None:
         position, number = lines.position, lines.number
         line = next(iter(lines), None)
@@ -250,6 +251,7 @@ def _read_motion_header(lines: TextLines, header: BvhHeader) -> None:
             break
         else:
             raise lines.error(f"'Frames:' and 'Frame Time:' must follow MOTION, not {excerpt(line)!r}")
+    assert frames is not None
     header.declared_frames = int(frames)
     header.frame_time_s = frame_time
     header.data_start = lines.position

@@ -173,7 +173,7 @@ def _channel_values(clip: Clip, order: list[int], axes: NDArray[np.int64], scale
     """
     angles_deg = np.empty((clip.frame_count, len(order), 3))
     euler_from_rotations(np.ascontiguousarray(clip.rotations[:, order]), axes, angles_deg)
-    columns: list[NDArray[np.floating]] = []
+    columns: list[NDArray[np.float64]] = []
     for index, joint in enumerate(order):
         if joint == 0:
             columns.append(clip.root_translations.astype(np.float64) * scale)
@@ -204,7 +204,7 @@ def format_table(values: NDArray[np.float64]) -> bytes:
 
 
 @compiled
-def _format(values, text):  # type: ignore[no-untyped-def]
+def _format(values, text):
     """Write `values` into `text`; return the number of bytes written."""
     digits = np.empty(24, np.uint8)
     at = 0

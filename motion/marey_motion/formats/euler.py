@@ -21,7 +21,7 @@ _EXACTLY_REDUCED_DEG = 1e9
 
 
 @compiled
-def _half_angle(angle_deg):  # type: ignore[no-untyped-def]
+def _half_angle(angle_deg):
     """Compute cosine and sine of half an angle given in degrees.
 
     Angles are reduced exactly, in degrees, before the conversion to radians. The operations are the same on every
@@ -45,7 +45,7 @@ def _half_angle(angle_deg):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def rotations_from_euler(values, columns, axes, rotations):  # type: ignore[no-untyped-def]
+def rotations_from_euler(values, columns, axes, rotations):
     """Fill local rotations from channel values, with signs that do not jump between frames.
 
     Parameters
@@ -85,7 +85,7 @@ def rotations_from_euler(values, columns, axes, rotations):  # type: ignore[no-u
 
 
 @compiled
-def euler_from_rotations(rotations, axes, angles_deg):  # type: ignore[no-untyped-def]
+def euler_from_rotations(rotations, axes, angles_deg):
     """Fill Euler angles from quaternions, through rotation matrices; the inverse of `rotations_from_euler`.
 
     Of the two solutions, the one nearer to the angles of the previous frame is used, and whole turns are added so that
@@ -127,7 +127,7 @@ def euler_from_rotations(rotations, axes, angles_deg):  # type: ignore[no-untype
 
 
 @compiled
-def _fill_matrix(q, matrix):  # type: ignore[no-untyped-def]
+def _fill_matrix(q, matrix):
     w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
     scale = 2.0 / (w * w + x * x + y * y + z * z)
     matrix[0, 0] = 1.0 - scale * (y * y + z * z)
@@ -142,7 +142,7 @@ def _fill_matrix(q, matrix):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _nearest_solution(first, middle, third, last0, last1, last2):  # type: ignore[no-untyped-def]
+def _nearest_solution(first, middle, third, last0, last1, last2):
     turn = 2.0 * np.pi
     a0 = first + turn * np.rint((last0 - first) / turn)
     a1 = middle + turn * np.rint((last1 - middle) / turn)

@@ -55,7 +55,7 @@ class BadNumber(ValueError):
 
 
 @compiled
-def parse_number(text, start):  # type: ignore[no-untyped-def]
+def parse_number(text, start):
     """Read one decimal number at `text[start:]`. The text must end in a line feed, since its length is not checked.
 
     Positions are unsigned, because signed positions would need a test for negative indices at every byte.
@@ -123,7 +123,7 @@ def parse_number(text, start):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-def]
+def _scan(text, width, values, long_tokens, state):
     """Read numbers until the text ends or an array is full, and return 0; return 1 at a malformed number."""
     i, end = np.uint64(state[_POSITION]), np.uint64(text.size)
     line, count, in_line, rows = state[_LINE], state[_VALUES], state[_IN_LINE], state[_ROWS]

@@ -38,7 +38,7 @@ _BYTES_AHEAD = np.uint64(32)
 
 
 @compiled
-def _word(text, i):  # type: ignore[no-untyped-def]
+def _word(text, i):
     """Return the eight bytes from `i` on, which the compiler loads by one instruction."""
     return (
         np.uint64(text[i])
@@ -53,14 +53,14 @@ def _word(text, i):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _bytes_before(marks):  # type: ignore[no-untyped-def]
+def _bytes_before(marks):
     """Count the bytes of an 8-byte integer before the first byte whose highest bit is set; 7 if there is none."""
     first = marks & (~marks + _ONE)
     return ((((first - _ONE) & _ONES) * _ONES) >> _SEVEN_BYTES) - _ONE
 
 
 @compiled
-def _length(first, second):  # type: ignore[no-untyped-def]
+def _length(first, second):
     """Count the bytes before the first white space in two integers of 8 bytes each; 15 if there is no white space."""
     # A borrow can mark only bytes after a white space, which do not matter.
     in_first = (first - _PRINTED) & ~first & _HIGH_BITS
@@ -71,7 +71,7 @@ def _length(first, second):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _digits(word):  # type: ignore[no-untyped-def]
+def _digits(word):
     """Return the number of digits at the start of a word of eight bytes, and the integer that these digits form."""
     digits = word ^ _ZERO_DIGITS
     others = ((digits + _ABOVE_NINE) | digits) & _HIGH_BITS
@@ -86,7 +86,7 @@ def _digits(word):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def read_plain_numbers(text, values, i, count):  # type: ignore[no-untyped-def]
+def read_plain_numbers(text, values, i, count):
     """Read plain numbers separated by spaces, up to the first other byte.
 
     Reading also stops before a number that is too close to the end of the text, because bytes are read eight at a time.

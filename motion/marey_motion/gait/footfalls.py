@@ -311,7 +311,7 @@ class Footfalls:
         leaving, landing = path.at(self.leaves_s[stance]), path.at(self.strikes_s[following])
         pitches, rates = self._leaving_pitches[stance], self._leaving_pitch_rates[stance]
         rolling = -self.shape.heel_length_m * np.sin(np.maximum(pitches, 0.0)) * rates
-        moving = rolling * np.exp(1j * self.middles.headings[stance])
+        moving = np.asarray(rolling * np.exp(1j * self.middles.headings[stance]), dtype=np.complex128)
         start, start_rate = _seen_from(leaving, self._rolled(pitches, stance), moving)
         end, end_rate = _seen_from(landing, self._rolled(self._landing_pitches[following], following), 0.0 * moving)
         duration = self.strikes_s[following] - self.leaves_s[stance]

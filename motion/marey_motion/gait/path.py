@@ -256,8 +256,7 @@ def start_and_stop(
 def _moment_0(turn_rate: AnyFloats, elapsed: AnyFloats) -> Complexes:
     """Compute ∫ e^(i·turn_rate·s) ds from 0 to `elapsed`."""
     half_angle = 0.5 * turn_rate * elapsed
-    result: Complexes = elapsed * np.exp(1j * half_angle) * np.sinc(half_angle / np.pi)
-    return result
+    return np.asarray(elapsed * np.exp(1j * half_angle) * np.sinc(half_angle / np.pi), dtype=np.complex128)
 
 
 def _moment_1(turn_rate: AnyFloats, elapsed: AnyFloats) -> Complexes:

@@ -35,7 +35,7 @@ PATH_WINDOW_S = 0.5
 
 
 @compiled
-def _arc(speed, turn_rate, elapsed):  # type: ignore[no-untyped-def]
+def _arc(speed, turn_rate, elapsed):
     """Compute the movement during `elapsed` seconds at constant speed and turn rate.
 
     Returns the distances to the left and forward, in the frame at the start, and the turn in radians.
@@ -46,14 +46,14 @@ def _arc(speed, turn_rate, elapsed):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _outward(heading, left, forward):  # type: ignore[no-untyped-def]
+def _outward(heading, left, forward):
     """Convert a step of a root with `heading`, given as distances to the left and forward, to (x, z) in the world."""
     sine, cosine = np.sin(heading), np.cos(heading)
     return left * cosine + forward * sine, forward * cosine - left * sine
 
 
 @compiled
-def _wished(wish, when):  # type: ignore[no-untyped-def]
+def _wished(wish, when):
     """Compute x, z and heading of the desired path at `when` ticks.
 
     After its end, the path continues with its last speed and turn rate.
@@ -72,7 +72,7 @@ def _wished(wish, when):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
+def _progress(wish, when, x, z):
     """Find the time, in ticks, at which the desired path is nearest to (x, z).
 
     Only times near `when`, the result at the previous tick, are searched.
@@ -95,7 +95,7 @@ def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _moment(rules, wish, when, tick, x, z):  # type: ignore[no-untyped-def]
+def _moment(rules, wish, when, tick, x, z):
     """Compute the time on the desired path, in ticks, that corresponds to `tick`.
 
     If the path is followed by position, the result is the time at which the path is nearest to (x, z); only times near
@@ -105,7 +105,7 @@ def _moment(rules, wish, when, tick, x, z):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
+def moments_along(rules, wish, positions, out):
     """Fill `out` (T,) with the time on the desired path, in ticks, that corresponds to each tick of a trial.
 
     `positions` (T, 2) are the positions of the root at the ticks.
@@ -118,7 +118,7 @@ def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  # type: ignore[no-untyped-def]
+def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):
     """Fill `query` (D,) with normalised features: the pose of the database's row `row`, then the desired trajectory.
 
     The trajectory starts at tick `when`, and is seen from the root at `x`, `z` in metres with `heading` in radians. In
@@ -146,7 +146,7 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  
 
 
 @compiled
-def _distance_cost(index, points, row, other, query, first, limit):  # type: ignore[no-untyped-def]
+def _distance_cost(index, points, row, other, query, first, limit):
     """Compute the cost of row `other` as the successor of row `row`.
 
     The cost is the squared difference between the row's and the query's trajectory features (from dimension `first`
@@ -169,7 +169,7 @@ def _distance_cost(index, points, row, other, query, first, limit):  # type: ign
 
 
 @compiled
-def _nearest_by_distance(index, points, row, query, first, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+def _nearest_by_distance(index, points, row, query, first, skip_start, skip_stop):
     best_row, best_cost = -1, np.inf
     for other in range(index.rows.shape[0]):
         if index.selectable[other] and not skip_start <= other < skip_stop:
@@ -180,7 +180,7 @@ def _nearest_by_distance(index, points, row, query, first, skip_start, skip_stop
 
 
 @compiled
-def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+def _search(index, playback, rules, row, query, skip_start, skip_stop):
     if rules.by_distance:
         first = query.shape[0] - 4 * playback.horizons_s.shape[0]
         return _nearest_by_distance(index, playback.points, row, query, first, skip_start, skip_stop)
@@ -188,7 +188,7 @@ def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type:
 
 
 @compiled
-def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
+def choose(index, playback, rules, row, query):
     """Choose the row whose successor is displayed next: the displayed row `row`, or the result of a search.
 
     Returns the chosen row, its cost, and the cost of continuing from `row`, which is NaN at the end of a clip. The pose
@@ -211,7 +211,7 @@ def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
+def _first_row(index, playback, rules, wish, root, query):
     """Find the row with which a trial starts, and the cost of this row; only trajectories are compared, not poses.
 
     `root` is x, z and heading; `query` (D,) is overwritten.
@@ -223,7 +223,7 @@ def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-un
 
 
 @compiled
-def _later_row(playback, row, ticks):  # type: ignore[no-untyped-def]
+def _later_row(playback, row, ticks):
     """Find the row `ticks` after `row`, or the last row of its clip that another one follows."""
     for _ in range(ticks):
         if playback.successors[playback.successors[row]] < 0:
@@ -233,7 +233,7 @@ def _later_row(playback, row, ticks):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
+def _jumped(wish, before, when):
     """Return whether the desired velocity or direction jumped between the times `before` and `when`, in ticks."""
     last = wish.speeds.shape[0] - 1
     a, b = min(int(before), last), min(int(when), last)
@@ -243,7 +243,7 @@ def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-def]
+def _advance(playback, rules, row, offsets, root):
     """Move `root` (x, z, heading) by one tick: by the step that follows `row`, and by an offset of the root's velocity.
 
     The offset is caused by switches to other rows, and decays. `offsets` (2, 3) contains the offset (left, forward,
@@ -262,7 +262,7 @@ def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-de
 
 
 @compiled
-def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
+def _hold(rules, wish, when, root):
     """Pull `root` (x, z, heading) towards a place on the desired path, and limit its distance from this place.
 
     The path reaches this place after `when` ticks. The limit is `rules.clamp_m`, in metres.
@@ -279,7 +279,7 @@ def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def run(index, playback, wish, rules, skipped, record):  # type: ignore[no-untyped-def]
+def run(index, playback, wish, rules, skipped, record):
     """Simulate one trial, and fill the arrays of `record` with its ticks.
 
     The trial starts `skipped` ticks after the row that the first search finds, or just before the end of its clip.

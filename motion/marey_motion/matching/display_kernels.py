@@ -18,7 +18,7 @@ SMALL = 1e-4
 
 
 @compiled
-def _exponential(x, y, z):  # type: ignore[no-untyped-def]
+def _exponential(x, y, z):
     """Compute the rotation about the axis (x, y, z) by an angle equal to the vector's length, in radians."""
     square = 0.25 * (x * x + y * y + z * z)
     if square < SMALL:
@@ -31,7 +31,7 @@ def _exponential(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
+def _turn_to(pose, column, w, x, y, z):
     """Compute the rotation vector, of at most half a turn, from a rotation of a pose to the rotation (w, x, y, z).
 
     The rotation of the pose begins at index `column` of `pose`.
@@ -51,7 +51,7 @@ def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_velocity(poses, places, successors, joints, moved, row, rate, velocities):  # type: ignore[no-untyped-def]
+def _add_velocity(poses, places, successors, joints, moved, row, rate, velocities):
     """Add `rate` times the difference between a row and the next row of its clip to `velocities` (1 + M + K, 3).
 
     `velocities` contains the velocity of the root's position, then of M translations, then of K rotations.
@@ -75,7 +75,7 @@ def _add_velocity(poses, places, successors, joints, moved, row, rate, velocitie
 
 
 @compiled
-def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ignore[no-untyped-def]
+def _show(pose, place, joints, moved, offsets, shown, shown_places):
     """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with K joints of a row's pose and M of the row's translations.
 
     `pose` and `place` are the pose and all translations of the row. `offsets` (1 + M + K, 3) of the root's position, of
@@ -92,7 +92,7 @@ def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ig
 
 
 @compiled
-def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[no-untyped-def]
+def _show_row(pose, place, joints, moved, shown, shown_places):
     """Fill `shown` and `shown_places` with joints and translations of a row, as `_show` does, but add no offsets."""
     shown[:3] = pose[:3]
     for m in range(moved.shape[0]):
@@ -102,7 +102,7 @@ def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[
 
 
 @compiled
-def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # type: ignore[no-untyped-def]
+def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):
     """Fill `offsets` (1 + M + K, 3) with the difference of the displayed pose from the pose of a row.
 
     `shown` and `shown_places` are the displayed pose and translations; `pose` and `place` are the row's own.
@@ -118,7 +118,7 @@ def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # 
 
 
 @compiled
-def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
+def _decay(decay, offsets, velocities):
     """Advance all offsets and velocities by one tick, with the matrix `decay`; return whether any offset remains."""
     left = 0.0
     for k in range(offsets.shape[0]):
@@ -131,9 +131,7 @@ def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def inertialised(  # type: ignore[no-untyped-def]
-    poses, places, successors, joints, moved, rows, cuts, decay, rate_hz, out, out_places
-):
+def inertialised(poses, places, successors, joints, moved, rows, cuts, decay, rate_hz, out, out_places):
     """Fill `out` (T, 3 + 4·K) and `out_places` (T, M, 3) with displayed poses of K joints and translations of M joints.
 
     When the display switches from one row of the database to another, an offset is added to the next poses, so that the

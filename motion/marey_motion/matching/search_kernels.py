@@ -61,7 +61,7 @@ class _Query(NamedTuple):
 
 
 @inlined
-def _cost(values, query, weights):  # type: ignore[no-untyped-def]
+def _cost(values, query, weights):
     cost = 0.0
     for d in range(query.shape[0]):
         difference = values[d] - query[d]
@@ -70,7 +70,7 @@ def _cost(values, query, weights):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def cost_of(index, row, query):  # type: ignore[no-untyped-def]
+def cost_of(index, row, query):
     """Compute the squared distance of a row, selectable or not, from the query (D,).
 
     The terms are added in the order of the dimensions.
@@ -84,7 +84,7 @@ def cost_of(index, row, query):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _prepared(index, query, weights, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+def _prepared(index, query, weights, skip_start, skip_stop):
     dimensions = index.blocks.shape[1]
     rounded = np.zeros(dimensions, np.float32)
     rounded_weights = np.zeros(dimensions, np.float32)
@@ -112,14 +112,14 @@ def _prepared(index, query, weights, skip_start, skip_stop):  # type: ignore[no-
 
 
 @inlined
-def _limit(query, best):  # type: ignore[no-untyped-def]
+def _limit(query, best):
     """Compute an upper bound of the float32 costs of all rows whose exact cost is at most `best`."""
     distance = np.sqrt(best) + query.reach
     return np.float32(distance * distance * query.margin + query.least)
 
 
 @inlined
-def _lane_of_least(sums, lanes):  # type: ignore[no-untyped-def]
+def _lane_of_least(sums, lanes):
     """Find the lane with the least sum among the lanes whose bits are set in `lanes`."""
     best = -1
     for lane in range(LANES):
@@ -129,17 +129,17 @@ def _lane_of_least(sums, lanes):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _screened_rows(index, query, block, limit):  # type: ignore[no-untyped-def]
+def _screened_rows(index, query, block, limit):
     return row_costs(index.blocks, query.rounded, query.weights, query.sums, block, limit)
 
 
 @inlined
-def _screened_boxes(boxes, query, number, sums, limit):  # type: ignore[no-untyped-def]
+def _screened_boxes(boxes, query, number, sums, limit):
     return box_costs(boxes, query.rounded, query.weights, sums, number, limit)
 
 
 @inlined
-def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[no-untyped-def]
+def _choose_row(index, query, block, lanes, row, cost, limit):
     """Compare the best row so far with rows of a block: those whose bits are set in `lanes`.
 
     `row`, `cost` and `limit` are the best row so far, its exact cost, and the bound that `_limit` computes from the
@@ -160,7 +160,7 @@ def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[n
 
 
 @inlined
-def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-untyped-def]
+def _search_group(index, query, group, row, cost, limit):
     """Compare the best row so far with the rows of a group of boxes; parameters and results as in `_choose_row`."""
     boxes = _screened_boxes(index.boxes, query, group, query.bounds, limit)
     first = index.group_blocks[group]
@@ -177,7 +177,7 @@ def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-unt
 
 
 @compiled
-def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-def]
+def _search_boxes(index, query, row, cost, limit):
     """Search the nearest group of boxes first, for a tight limit, then the remaining groups in their order.
 
     Searching all groups in the order of their distance would visit a few per cent fewer groups, but take longer.
@@ -201,7 +201,7 @@ def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-de
 
 
 @compiled
-def _search_blocks(index, query, start, stop, row, cost, limit):  # type: ignore[no-untyped-def]
+def _search_blocks(index, query, start, stop, row, cost, limit):
     """Compare the best row so far with the rows of blocks [start, stop); parameters and results as in `_choose_row`."""
     for block in range(start, stop):
         lanes = _screened_rows(index, query, block, limit)
@@ -211,7 +211,7 @@ def _search_blocks(index, query, start, stop, row, cost, limit):  # type: ignore
 
 
 @compiled
-def _nearest(index, query, weights, warm_row, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+def _nearest(index, query, weights, warm_row, skip_start, skip_stop):
     prepared = _prepared(index, query, weights, skip_start, skip_stop)
     row, cost, limit = np.int64(-1), np.inf, np.float32(np.inf)
     if warm_row >= 0:
@@ -225,7 +225,7 @@ def _nearest(index, query, weights, warm_row, skip_start, skip_stop):  # type: i
 
 
 @compiled
-def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+def nearest(index, query, warm_row, skip_start, skip_stop):
     """Find the selectable row of least cost outside [skip_start, skip_stop).
 
     Returns the row and its cost, or (-1, inf) if there is none.
@@ -237,13 +237,13 @@ def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-u
 
 
 @compiled
-def nearest_weighted(index, query, weights, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+def nearest_weighted(index, query, weights, skip_start, skip_stop):
     """Find the nearest row, as `nearest` does, with squared differences multiplied by non-negative weights (D,)."""
     return _nearest(index, query, weights, -1, skip_start, skip_stop)
 
 
 @compiled
-def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):  # type: ignore[no-untyped-def]
+def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):
     """Fill `rows` and `costs` (Q,) with the nearest row of each query (Q, D), and the cost of this row.
 
     `weights` (D,) multiply the squared differences. `warm_rows` (Q,) are rows likely to be near, or -1; `skips` (Q, 2)
@@ -254,14 +254,14 @@ def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):  # 
 
 
 @compiled
-def all_costs(index, query, weights, costs):  # type: ignore[no-untyped-def]
+def all_costs(index, query, weights, costs):
     """Fill `costs` (N,) with the cost of every row, selectable or not; `weights` (D,) are as for `nearest_weighted`."""
     for row in range(costs.shape[0]):
         costs[row] = _cost(index.rows[row], query, weights)
 
 
 @compiled
-def boxes_within(index, query, cost):  # type: ignore[no-untyped-def]
+def boxes_within(index, query, cost):
     """Count the blocks whose box is at most `cost` away from the query; any search must visit at least these blocks."""
     prepared = _prepared(index, query, np.ones(query.shape[0]), 0, 0)
     limit = _limit(prepared, cost)

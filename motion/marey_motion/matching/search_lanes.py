@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from llvmlite import ir  # type: ignore[import-untyped]
+from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
@@ -64,7 +64,7 @@ def _summed(gap: Gap, operands: int) -> Any:
         dimensions = builder.extract_value(query.shape, 0)
         first = builder.mul(number, builder.mul(dimensions, ir.Constant(number.type, operands)))
         vectors = builder.gep(builder.bitcast(blocks.data, _SIXTEEN.as_pointer()), [first])
-        running = [cgutils.alloca_once_value(builder, _ZEROS) for _ in range(DIMENSIONS_PER_STEP)]  # type: ignore[no-untyped-call]
+        running = [cgutils.alloca_once_value(builder, _ZEROS) for _ in range(DIMENSIONS_PER_STEP)]
 
         def at(base: ir.Value, scale: int, offset: int) -> ir.Value:
             size = base.type

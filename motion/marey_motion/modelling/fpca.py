@@ -60,7 +60,8 @@ class PrincipalExamples:
     @cached_property
     def directions(self) -> Floats:
         """Change of the coefficients per unit of each score, for all components; (r, n, D) float64."""
-        return np.tensordot((self.scores / (self.scores**2).sum(axis=0)).T, self.deviations, axes=1)
+        directions: Floats = np.tensordot((self.scores / (self.scores**2).sum(axis=0)).T, self.deviations, axes=1)
+        return directions
 
 
 def find_components(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 
@@ -17,7 +19,7 @@ MOST_ITERATIONS = 500
 TOLERANCE = 1e-3
 """Change of the mean log-likelihood between iterations below which the fit has converged; without unit."""
 SMALLEST_DEVIATION = 1e-9
-_NAMES = {"full": "full", "tied": "tied", "diagonal": "diag"}
+_NAMES: Mapping[CovarianceKind, Literal["full", "tied", "diag"]] = {"full": "full", "tied": "tied", "diagonal": "diag"}
 
 
 def fit_components(

@@ -8,7 +8,7 @@ from marey_motion.kernels import compiled, inverse, product, put_rotation, rotat
 
 
 @compiled
-def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
+def _load_rotations(pose, rotations, lengths):
     """Fill `rotations` (J, 4) with the unit quaternions of a pose, and `lengths` (J,) with the original lengths."""
     for joint in range(len(rotations)):
         column = 3 + 4 * joint
@@ -22,7 +22,7 @@ def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _place_joints(pose, local, parents, offsets, world, positions):  # type: ignore[no-untyped-def]
+def _place_joints(pose, local, parents, offsets, world, positions):
     """Fill rotations `world` (J, 4) and positions (J, 3) in the world, from a pose and its local rotations `local`."""
     world[0] = local[0]
     positions[0] = pose[:3]
@@ -40,7 +40,7 @@ def _place_joints(pose, local, parents, offsets, world, positions):  # type: ign
 
 
 @compiled
-def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-untyped-def]
+def mean_distances(poses, parents, offsets, targets, out):
     """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), for B motions of T poses (B, T, D).
 
     The quaternions of the poses need not have unit length. `parents` (J,) and `offsets` (J, 3) are the skeleton's.
@@ -62,7 +62,7 @@ def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-un
 
 
 @compiled
-def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type: ignore[no-untyped-def]
+def squared_error_gradient(poses, parents, offsets, targets, gradient):
     """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) in the poses.
 
     Quaternions need not have unit length: the sum is computed for the rotations that they represent. From the leaves to

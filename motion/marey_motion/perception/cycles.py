@@ -132,7 +132,7 @@ def cut_loop(motion: Motion, body: MatchingBody, period: Period) -> tuple[Motion
     heights = _mixed(places[late, 1], places[early, 1], share)
     made = canonical._replace(
         root_translations=np.stack((ground[:, 0], heights, ground[:, 1]), axis=1),
-        rotations=np.asarray(quaternions.unroll(rotations)),
+        rotations=np.asarray(quaternions.unroll(rotations), dtype=np.float64),
         translations=_mixed(canonical.translations[late], canonical.translations[early], share),
     )
     return made.sliced(0, length), LoopSeam(float(heading[-1]), ground[-1])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.optimize import minimize_scalar, nnls
+from scipy.optimize import minimize_scalar, nnls  # pyrefly: ignore[implicit-reexport]  # scipy collects its names when it runs
 
 from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MotionError

@@ -19,7 +19,7 @@ _ARCSINE = tuple(math.comb(2 * n, n) / (4.0**n * (2 * n + 1)) for n in range(17)
 
 
 @inlined
-def _add(x, scale, weight, shaping, exponent, row):  # type: ignore[no-untyped-def]
+def _add(x, scale, weight, shaping, exponent, row):
     """Add weight · F(scale · x) to a row of the map."""
     if shaping == EUCLID:
         for j in range(row.shape[0]):
@@ -36,7 +36,7 @@ def _add(x, scale, weight, shaping, exponent, row):  # type: ignore[no-untyped-d
 
 
 @inlined
-def _turns(a, b, cosines, sines):  # type: ignore[no-untyped-def]
+def _turns(a, b, cosines, sines):
     """Find the rotations about the vertical that superpose ground points b (P, 2, m) on a (P, 2)."""
     cosines[:] = 0.0
     sines[:] = 0.0
@@ -52,7 +52,7 @@ def _turns(a, b, cosines, sines):  # type: ignore[no-untyped-def]
 
 
 @contracted
-def vectors(a, b, starts, scales, weights, shape, ground, out):  # type: ignore[no-untyped-def]
+def vectors(a, b, starts, scales, weights, shape, ground, out):
     """Fill out (n, m) for vectors of three components; shape is (shaping, exponent).
 
     ground holds ground points (n, P, 2) and (P, 2, m) by which each pair of frames is superposed; without points, the
@@ -86,7 +86,7 @@ def vectors(a, b, starts, scales, weights, shape, ground, out):  # type: ignore[
 
 
 @contracted
-def rotations(a, b, starts, scales, weights, shape, measure, out):  # type: ignore[no-untyped-def]
+def rotations(a, b, starts, scales, weights, shape, measure, out):
     """Fill out (n, m) for unit quaternions, whose sign makes no difference.
 
     Angles are computed from the chord between quaternions: the arccosine of a dot product loses half of the digits of

@@ -220,7 +220,7 @@ def _vectors(clip: MeasuredClip, component: Component, metric: PerceptualMetric)
 def _centred(clip: MeasuredClip) -> Floats:
     """Take the ground points (F, P, 2) relative to their mean."""
     ground = clip.positions[..., ::2]
-    return np.asarray(ground - ground.mean(axis=1, keepdims=True))
+    return np.asarray(ground - ground.mean(axis=1, keepdims=True), dtype=np.float64)
 
 
 def _superposed(a: MeasuredClip, b: MeasuredClip, vectors: Floats) -> Floats:
@@ -229,7 +229,7 @@ def _superposed(a: MeasuredClip, b: MeasuredClip, vectors: Floats) -> Floats:
     turn = np.sum(ones * others.conj(), axis=1, keepdims=True)
     turn = np.where(np.abs(turn) > 0.0, turn / np.maximum(np.abs(turn), np.finfo(float).tiny), 1.0)
     moved = (vectors[..., ::2] @ (1.0, 1.0j)) * turn
-    return np.stack((moved.real, vectors[..., 1], moved.imag), axis=-1)
+    return np.asarray(np.stack((moved.real, vectors[..., 1], moved.imag), axis=-1), dtype=np.float64)
 
 
 def _require_size(a: MeasuredClip, b: MeasuredClip) -> None:

@@ -137,7 +137,7 @@ def increasing_spline(times: Floats, rate_hz: float) -> Floats:
     (n,) float64    strictly increasing times
     """
     from scipy.interpolate import BSpline
-    from scipy.optimize import lsq_linear
+    from scipy.optimize import lsq_linear  # pyrefly: ignore[implicit-reexport]  # scipy collects its names when it runs
 
     last = len(times) - 1
     spans = max(1, round(last / (KNOT_SPACING_S * rate_hz)))

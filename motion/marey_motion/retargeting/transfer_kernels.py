@@ -13,7 +13,7 @@ CARRIED = 2
 
 
 @compiled
-def rotations(local, parents, ways, sources, corrections, rests, target_parents, out):  # type: ignore[no-untyped-def]
+def rotations(local, parents, ways, sources, corrections, rests, target_parents, out):
     """Fill `out` (F, 4·K) with local rotations of the K target joints, continuous in sign from frame to frame.
 
     `local` (F, 4·J) are the local rotations of the source joints, `parents` (J,) the indices of their parents. The

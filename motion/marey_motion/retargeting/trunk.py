@@ -119,7 +119,12 @@ def _lines(plan: RetargetPlan) -> list[_TrunkLine]:
         way = places[plan.target_joints[end]] - places[plan.target_joints[start]]
         own = quaternions.rotate_vectors(quaternions.conjugate(plan.target.rest_global_rotations[joint]), way)
         lines.append(
-            _TrunkLine(turned, start, end, np.asarray(quaternions.rotate_vectors(plan.corrections[joint], own)))
+            _TrunkLine(
+                turned,
+                start,
+                end,
+                np.asarray(quaternions.rotate_vectors(plan.corrections[joint], own), dtype=np.float64),
+            )
         )
     return lines
 

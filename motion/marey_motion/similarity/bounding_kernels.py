@@ -28,7 +28,7 @@ _RANGE_COST, _STEP_COST = 60, 15
 
 
 @contracted
-def _add_rotation_bounds(w, u, v, z, cw, cu, cv, cz, radii, reach, factor, measure, x):  # type: ignore[no-untyped-def]
+def _add_rotation_bounds(w, u, v, z, cw, cu, cv, cz, radii, reach, factor, measure, x):
     """Add factor · lower bound of the distance from a rotation to those in n balls with centres (cw, cu, cv, cz)."""
     if measure == ANGLE:
         factor = factor * np.float32(2.0)
@@ -41,7 +41,7 @@ def _add_rotation_bounds(w, u, v, z, cw, cu, cv, cz, radii, reach, factor, measu
 
 
 @contracted
-def _add_vector_bounds(u, v, z, cu, cv, cz, radii, reach, factor, x):  # type: ignore[no-untyped-def]
+def _add_vector_bounds(u, v, z, cu, cv, cz, radii, reach, factor, x):
     """Add factor · lower bound of the distance from a vector to those in n balls with centres (cu, cv, cz)."""
     for j in range(x.shape[0]):
         du, dv, dz = u - cu[j], v - cv[j], z - cz[j]
@@ -49,7 +49,7 @@ def _add_vector_bounds(u, v, z, cu, cv, cz, radii, reach, factor, x):  # type: i
 
 
 @contracted
-def _add_shaped(x, weight, shaping, exponent, raw):  # type: ignore[no-untyped-def]
+def _add_shaped(x, weight, shaping, exponent, raw):
     """Add weight · F(x)."""
     if shaping == SIGMOID:
         for j in range(x.shape[0]):
@@ -66,14 +66,14 @@ def _add_shaped(x, weight, shaping, exponent, raw):  # type: ignore[no-untyped-d
 
 
 @contracted
-def _add_constant(constant, always, raw, total):  # type: ignore[no-untyped-def]
+def _add_constant(constant, always, raw, total):
     """Add a component and its constant."""
     for j in range(raw.shape[0]):
         total[j] += raw[j] + (constant if always or raw[j] > np.float32(0.0) else np.float32(0.0))
 
 
 @contracted
-def bounds_within(q, reaches, centres, radii, begin, end, tables, vectors, x, raw, total):  # type: ignore[no-untyped-def]
+def bounds_within(q, reaches, centres, radii, begin, end, tables, vectors, x, raw, total):
     """Fill total (n,) with lower bounds of the distances from a ball of poses to the rows in the balls [begin, end).
 
     q (width,) and reaches (41,) are centre and radii of the ball of poses; x and raw (n,) are scratch arrays.
@@ -104,7 +104,7 @@ def bounds_within(q, reaches, centres, radii, begin, end, tables, vectors, x, ra
 
 
 @contracted
-def pose_bounds(query, reaches, centres, radii, ranges, tables, vectors, out):  # type: ignore[no-untyped-def]
+def pose_bounds(query, reaches, centres, radii, ranges, tables, vectors, out):
     """Fill out (G, balls) with lower bounds of the distances from G balls of poses to the rows in balls.
 
     query (G, width) and reaches (G, 41) are centres and radii of the balls of poses. ranges (n, 2) lists half-open
@@ -123,14 +123,14 @@ def pose_bounds(query, reaches, centres, radii, ranges, tables, vectors, out):  
 
 
 @contracted
-def _add_later(bounds, later, sums):  # type: ignore[no-untyped-def]
+def _add_later(bounds, later, sums):
     """Add the bounds of the balls that are `later` balls after each."""
     for b in range(sums.shape[0] - later):
         sums[b] += bounds[b + later]
 
 
 @contracted
-def step_sums(poses, groups, steps, firsts, ball_firsts, per_ball, out):  # type: ignore[no-untyped-def]
+def step_sums(poses, groups, steps, firsts, ball_firsts, per_ball, out):
     """Fill out (S,) with lower bounds of the sums of distances of all windows that start in a step.
 
     poses (G, balls) holds bounds of single poses. Sample t belongs to group groups[t], and is steps[t] after the start.
@@ -152,7 +152,7 @@ def step_sums(poses, groups, steps, firsts, ball_firsts, per_ball, out):  # type
 
 
 @compiled
-def _covering_ranges(balls, ranges):  # type: ignore[no-untyped-def]
+def _covering_ranges(balls, ranges):
     """List half-open ranges that cover some balls, ascending, and return their number and the balls in them."""
     count, covered = 0, 0
     for place in range(balls.shape[0]):
@@ -166,7 +166,7 @@ def _covering_ranges(balls, ranges):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def narrow_steps(query, shard, bounds, places, layout, tables, limit):  # type: ignore[no-untyped-def]
+def narrow_steps(query, shard, bounds, places, layout, tables, limit):
     """Drop steps whose windows are certainly above a limit, by bounds of single samples.
 
     query holds samples (T, width), offsets (T,), groups (T,), and at last the order in which samples are used. shard

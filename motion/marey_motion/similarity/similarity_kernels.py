@@ -15,13 +15,13 @@ _TILE = 128
 
 
 @compiled
-def loosened(most, samples):  # type: ignore[no-untyped-def]
+def loosened(most, samples):
     """Compute the sum of distances up to which bounds in single precision may belong to a mean of at most `most`."""
     return (most + 1e-5) * samples / (1.0 - 1e-4)
 
 
 @inlined
-def _shaped(x, shaping, exponent):  # type: ignore[no-untyped-def]
+def _shaped(x, shaping, exponent):
     """Apply a shaping F."""
     if shaping == SIGMOID:
         return x / (x + 1.0)
@@ -33,7 +33,7 @@ def _shaped(x, shaping, exponent):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _angle(square, measure):  # type: ignore[no-untyped-def]
+def _angle(square, measure):
     """Compute the measure of an angle from the squared chord between quaternions."""
     if measure == ONE_MINUS_DOT:
         return 0.5 * square
@@ -42,7 +42,7 @@ def _angle(square, measure):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _apart(a, b, rotated, place, rotations_at, measure):  # type: ignore[no-untyped-def]
+def _apart(a, b, rotated, place, rotations_at, measure):
     """Compute the distance of one vector or rotation in two rows."""
     if rotated:
         at = rotations_at + 4 * place
@@ -61,7 +61,7 @@ def _apart(a, b, rotated, place, rotations_at, measure):  # type: ignore[no-unty
 
 
 @compiled
-def pose_distance(a, b, tables, rotations_at):  # type: ignore[no-untyped-def]
+def pose_distance(a, b, tables, rotations_at):
     """Compute the distance of two rows."""
     rotated, places, factors, weights, starts, constants, shapings, exponents, measure, always = tables
     distance = 0.0
@@ -79,7 +79,7 @@ def pose_distance(a, b, tables, rotations_at):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def group_samples(query, tables, rotations_at, most, groups, distances):  # type: ignore[no-untyped-def]
+def group_samples(query, tables, rotations_at, most, groups, distances):
     """Fill groups (T,) with numbers of groups of similar samples, and return their count, at most `most`.
 
     Each group is started by the sample that is farthest from the samples that have started a group so far. distances
@@ -99,7 +99,7 @@ def group_samples(query, tables, rotations_at, most, groups, distances):  # type
 
 
 @compiled
-def _places_of(steps, runs, length, layout, places, rows):  # type: ignore[no-untyped-def]
+def _places_of(steps, runs, length, layout, places, rows):
     """Fill places (n, 2) with the ball in which each step lies and its number in it, and rows (n, 2) with the rows at
     which windows of `length` start in it, a half-open range.
     """
@@ -116,7 +116,7 @@ def _places_of(steps, runs, length, layout, places, rows):  # type: ignore[no-un
 
 
 @compiled
-def _windows_in(left, rows, windows):  # type: ignore[no-untyped-def]
+def _windows_in(left, rows, windows):
     """List the windows (n, 2) that start in some steps: their step and first row. Return their number."""
     count = 0
     for place in left:
@@ -127,7 +127,7 @@ def _windows_in(left, rows, windows):  # type: ignore[no-untyped-def]
 
 
 @contracted
-def _still_near(query, rows, bounds, done, places, windows, layout, tables, limit):  # type: ignore[no-untyped-def]
+def _still_near(query, rows, bounds, done, places, windows, layout, tables, limit):
     """List the windows whose distance is not certainly above a limit.
 
     For one sample after the other, the bound of its ball in a window's sum is replaced by that of the very row. The
@@ -166,7 +166,7 @@ def _still_near(query, rows, bounds, done, places, windows, layout, tables, limi
 
 
 @compiled
-def step_distances(query, shard, bounds, steps, runs, layout, tables, rotations_at, most, out):  # type: ignore[no-untyped-def]
+def step_distances(query, shard, bounds, steps, runs, layout, tables, rotations_at, most, out):
     """Fill out (n, size) with the distances of the windows that start in some steps, where they are less than out.
 
     query holds samples (T, width), offsets (T,), groups (T,), the order in which the distances of samples are added,
@@ -201,7 +201,7 @@ def step_distances(query, shard, bounds, steps, runs, layout, tables, rotations_
 
 
 @compiled
-def balls(rows, starts, size, vectors, rotations, centres, radii):  # type: ignore[no-untyped-def]
+def balls(rows, starts, size, vectors, rotations, centres, radii):
     """Fill the centres (width, balls) and radii (vectors + rotations, balls) of balls of `size` rows.
 
     The run r has the rows [starts[r], starts[r + 1]); its last ball may have fewer.

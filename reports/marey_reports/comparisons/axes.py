@@ -46,7 +46,7 @@ def set_logarithmic(axis: Axis) -> None:
     """Make an axis logarithmic, with readable numbers at its ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    axis._set_axes_scale("log")  # type: ignore[attr-defined]
+    axis._set_axes_scale("log")  # pyrefly: ignore[missing-attribute]  # matplotlib has no public function for one axis
     low, high = axis.get_view_interval()
     if high / low < 50.0:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

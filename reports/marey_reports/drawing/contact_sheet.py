@@ -160,7 +160,7 @@ class _SheetCell:
 
 def _take_count(shown: int, total: int | None) -> str:
     """Return the number of takes in words, such as `8 of 24 takes`."""
-    return counted(shown, "take") if total in (None, shown) else f"{shown} of {counted(total, 'take')}"
+    return counted(shown, "take") if total is None or total == shown else f"{shown} of {counted(total, 'take')}"
 
 
 def _draw_header(axes: Axes, top: float, heading: str, takes: str) -> None:

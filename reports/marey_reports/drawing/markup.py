@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from typing import TypeAlias
 
 from markupsafe import Markup, escape
 
@@ -15,7 +16,7 @@ VOID = frozenset({"br", "hr", "img", "meta", "col"})
 _UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]")
 
 
-Content = str | Html | Iterable["Content"] | None
+Content: TypeAlias = str | Html | Iterable["Content"] | None
 
 
 def text(value: str) -> Html:

@@ -104,7 +104,7 @@ def draw_table(analysis: StudyAnalysis, names: Sequence[str]) -> Sketch:
     side = max(_LEAST_SIDE, _PER_MOTION * count)
     figure = new_figure(_LEFT + side + 1.1, _BOTTOM + side + _TOP)
     panel = add_panel(figure, Place(_LEFT, _BOTTOM, side, side), grid=False)
-    ordered = [names[each] for each in places]
+    ordered = [names[each] for each in places.tolist()]
     values = np.ma.masked_invalid(analysis.table.differences[np.ix_(places, places)])
     panel.set_facecolor("#9aa7b8")  # of pairs that were never shown together
     image = panel.imshow(values, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")

@@ -42,7 +42,7 @@ def members_of(tree: Any) -> list[tuple[str, Any]]:
                     found.append((at, member))
                 else:
                     visit(at, member)
-        elif isinstance(value, list | tuple):
+        elif isinstance(value, (list, tuple)):
             for index, member in enumerate(value):
                 if type(member) not in _LEAVES:
                     visit(f"{pointer}/{index}", member)

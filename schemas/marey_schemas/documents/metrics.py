@@ -236,7 +236,8 @@ def built_in_metric(name: str) -> MetricDocument:
     make = published_component if origin == "published" else _uniform_component
     components = tuple(make(one, shaping, 1.0 / len(measurements)) for one in measurements)
     notes = _published_notes(components) if origin == "published" else ()
-    return MetricDocument(name=name, origin=origin, components=components, notes=notes)
+    stated = "published" if origin == "published" else "uniform"
+    return MetricDocument(name=name, origin=stated, components=components, notes=notes)
 
 
 def published_component(measurement: Measurement, shaping: Shaping, share: float = 1.0) -> MetricComponent:

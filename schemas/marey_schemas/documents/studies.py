@@ -25,6 +25,12 @@ class StudyMotion(Request):
         None, description="Label in figures, such as F1. Participants do not see it, and no result depends on it."
     )
 
+    @property
+    def revision(self) -> RevisionRef:
+        """The revision of the clip; in a stored study, references to outputs of jobs are resolved."""
+        assert isinstance(self.clip, RevisionRef)
+        return self.clip
+
 
 class StudyDocument(Request):
     """Part `study` of an item of the kind `study`: the design. It contains nothing about participants."""

@@ -54,7 +54,7 @@ class ArrayDifference:
         if not isinstance(value, Mapping) or value.keys() != _MEMBERS:
             return None
         spec = ArraySpec.parse(value["dtype"], value["shape"])
-        return cls(**{**value, "dtype": spec.dtype, "shape": spec.shape})
+        return cls(**(dict(value) | {"dtype": spec.dtype, "shape": spec.shape}))
 
     @classmethod
     def between(

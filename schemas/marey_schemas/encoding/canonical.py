@@ -54,7 +54,7 @@ def detach_arrays(tree: Any, keep: Callable[[str, NDArray[Any] | EncodedArray], 
         return tree
     if isinstance(tree, Mapping):
         return {key: detach_arrays(member, keep) for key, member in tree.items()}
-    if isinstance(tree, list | tuple):
+    if isinstance(tree, (list, tuple)):
         return [detach_arrays(item, keep) for item in tree]
     if isinstance(tree, np.ndarray | EncodedArray):
         spec = ArraySpec.of(tree) if isinstance(tree, np.ndarray) else ArraySpec(tree.dtype, tree.shape)
@@ -70,7 +70,7 @@ def attach_arrays(tree: Any, load: Callable[[str], Any]) -> Any:
         if tree.keys() == {"dtype", "shape", "content"}:
             return load(tree["content"])
         return {key: attach_arrays(member, load) for key, member in tree.items()}
-    if isinstance(tree, list | tuple):
+    if isinstance(tree, (list, tuple)):
         return [attach_arrays(item, load) for item in tree]
     return tree
 
@@ -85,7 +85,7 @@ def _canonical(value: Any) -> Any:
         return float(value) if not isinstance(value, bool) and abs(value) >= 1 << 63 else value
     if isinstance(value, Mapping):
         return {_text_key(key): _canonical(member) for key, member in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_canonical(item) for item in value]
     return value
 

@@ -317,7 +317,7 @@ class _Walk:
             return self._float(value)
         if isinstance(value, Mapping):
             return self._object(value)
-        if isinstance(value, list | tuple):
+        if isinstance(value, (list, tuple)):
             return self._list(value)
         if isinstance(value, np.ndarray | EncodedArray) and self._on_array is not None:
             return self._array(self._on_array, value)

@@ -277,7 +277,7 @@ class _Reader:
             values = tuple(_value(known, token) for token in tree.children[1:])
             return Condition(field, "=", values, source)
         operator = tree.children[1]
-        if operator not in OPERATORS[known.type]:
+        if str(operator) not in OPERATORS[known.type]:
             allowed = one_of(OPERATORS[known.type])
             raise QueryError(f"the field {field!r} is a {known.type}; compare it with {allowed}", _column(operator))
         value = _value(known, tree.children[2])

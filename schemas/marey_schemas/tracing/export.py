@@ -122,8 +122,9 @@ def full_endpoint(address: str) -> str:
         parts = urlsplit(address)
         usable = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
     except ValueError:
+        parts = None
         usable = False
-    if not usable:
+    if parts is None or not usable:
         raise TracesUnusable(f"{address!r} is not an address of a collector; write it like http://127.0.0.1:4318")
     if parts.username is not None or parts.password is not None or parts.query or parts.fragment:
         raise TracesUnusable(

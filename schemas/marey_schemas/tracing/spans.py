@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from marey_schemas.tracing.context import HEADER, TraceContext, new_span_id
 from marey_schemas.tracing.declared import SpanDeclaration
@@ -90,7 +91,7 @@ def entering(scope: SpanScope | None) -> Iterator[None]:
 class ProcessScope:
     """SpanScope of the whole process, for threads without one of their own; a command sets it."""
 
-    scope: SpanScope | None = None
+    scope: ClassVar[SpanScope | None] = None
 
 
 def current_scope() -> SpanScope | None:

@@ -113,7 +113,7 @@ def _import_key(members: dict[str, Any]) -> RSAKey | ECKey | None:
         return ECKey.import_key(members)
     if len(members["e"]) > MOST_EXPONENT_DIGITS or len(members["n"]) > RSA_BITS[-1] // 6 + 4:
         return None
-    key = RSAKey.binding.import_public_key(members)  # type: ignore[arg-type]
+    key = RSAKey.binding.import_public_key(members)  # pyrefly: ignore[missing-attribute]  # typed as its parent
     return RSAKey.import_key(key) if key.key_size in RSA_BITS else None
 
 

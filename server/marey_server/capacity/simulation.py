@@ -144,9 +144,9 @@ class _Simulation:
 
     def run(self) -> SimulatedRun:
         for number, job in enumerate(self._jobs):
-            self._at(job.submitted_s, lambda number=number: self._queue(number, self._now_s))  # type: ignore[misc]
+            self._at(job.submitted_s, lambda number=number: self._queue(number, self._now_s))
         for worker in range(len(self._workers)):
-            self._at(0.0, lambda worker=worker: self._ask(worker))  # type: ignore[misc]
+            self._at(0.0, lambda worker=worker: self._ask(worker))
         while self._events:
             self._now_s, _, act = heapq.heappop(self._events)
             act()

@@ -93,7 +93,7 @@ class CallingExchange(Exchange):
             return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.departure)
         return Client(limited_address(self.client_address), known=False, is_gone=self.departure)
 
-    def log_exception(self, _type: Any, value: Any, _traceback: Any) -> None:
+    def log_exception(self, typ: Any, value: Any, tb: Any) -> None:  # noqa: ARG002
         """Log internal errors with their traceback; refusals are not logged as errors."""
         log_fault(value, self.request_id, self.request.method or "", self.template(), trace_id=self.trace_id)
 

@@ -292,7 +292,7 @@ def _declare(
 
         summary, _, description = (inspect.getdoc(method) or "").partition("\n")
         taken = body if body is None or isinstance(body, RequestBody) else RequestBody(body)
-        perform.operation = Operation(  # type: ignore[attr-defined]
+        perform.operation = Operation(  # pyrefly: ignore[missing-attribute]  # read by `Resource`
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, taken, answer,
             status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream, reserved,
             attempts, replays, in_folders, names, for_browsers,

@@ -8,8 +8,9 @@ import logging
 import re
 from dataclasses import replace
 from http.client import responses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
+from tornado.http1connection import HTTP1Connection
 from tornado.iostream import StreamClosedError
 from tornado.web import HTTPError, RequestHandler
 
@@ -94,8 +95,13 @@ class Exchange(RequestHandler):
     @property
     def services(self) -> Services:
         """The services of the process."""
-        services: Services = self.application.services  # type: ignore[attr-defined]
+        services: Services = self.application.services  # pyrefly: ignore[missing-attribute]  # `app` sets it
         return services
+
+    @property
+    def wire(self) -> HTTP1Connection:
+        """The connection of the request."""
+        return cast(HTTP1Connection, self.request.connection)
 
     @property
     def client_address(self) -> str:
@@ -122,7 +128,7 @@ class Exchange(RequestHandler):
         Closes the connection if the body is too long.
         """
         if self.received_bytes > LINGER_BYTES:
-            self.request.connection.close()  # type: ignore[union-attr]
+            self.wire.close()
 
     # -- the answer that goes -----------------------------------------------------------------------------------------
 
@@ -170,7 +176,7 @@ class Exchange(RequestHandler):
     @property
     def stream(self) -> object:
         """The stream of the request's connection, by which `Connections` identifies it."""
-        return self.request.connection.stream  # type: ignore[union-attr]
+        return self.wire.stream
 
     def is_awaited(self) -> bool:
         """Return whether the client is still connected and the server is not stopping."""
@@ -216,7 +222,7 @@ class Exchange(RequestHandler):
         if not self._headers_written:
             super().send_error(status_code, **kwargs)
             return
-        self.request.connection.close()  # type: ignore[union-attr]
+        self.wire.close()
         if not self._finished:
             self.finish()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from http import HTTPStatus
+from typing import cast
 
 from pydantic import BaseModel
 
@@ -198,7 +199,7 @@ def _request_body(body: RequestBody, models: ApiModels) -> Schema:
         assert body.fields is not None
         content["multipart/form-data"] = {"schema": form_schema(body.fields)}
     else:
-        schema = models.document() if body.content is Document else models.reading(body.content)  # type: ignore[arg-type]
+        schema = models.document() if body.content is Document else models.reading(cast(type[BaseModel], body.content))
         content |= {name: {"schema": schema} for name in MEDIA_TYPES}
     if body.alternative is not None:
         content |= {name: {"schema": models.reading(body.alternative)} for name in MEDIA_TYPES}

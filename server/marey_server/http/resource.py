@@ -90,13 +90,13 @@ class Resource(CallingExchange):
         methods = {name: getattr(cls, name) for name in _METHODS if hasattr(vars(cls).get(name), "operation")}
         cls.operations = {name.upper(): method.operation for name, method in methods.items()}
         if "get" in methods:
-            cls.head = cls.get
+            cls.head = cls.get  # pyrefly: ignore[instance-var-assign]  # Tornado declares methods as attributes
 
     def initialize(self) -> None:
         """Set up the state of one request."""
         super().initialize()
         self._received: bytearray | bytes = bytearray()
-        self._pauses = PauseLimit(self.services.settings.body_timeout_s, self.request.connection.stream.close)  # type: ignore[union-attr]
+        self._pauses = PauseLimit(self.services.settings.body_timeout_s, self.wire.stream.close)
 
     # -- for the methods of resources ---------------------------------------------------------------------------------
 
@@ -241,7 +241,7 @@ class Resource(CallingExchange):
                     self.services.disk.require()
             if body is not None and body.streamed:
                 await self.begin(**self.path_variables)
-                self.request.connection.set_body_timeout(self.services.settings.upload_timeout_s)  # type: ignore[union-attr]
+                self.wire.set_body_timeout(self.services.settings.upload_timeout_s)
                 self._pauses.start()
         except ApiProblem as error:
             self._release_memory()  # `perform` does not release it, because the method of this request never runs

@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Self
 
 import msgpack
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from marey_schemas.encoding.codecs import MSGPACK, ArrayForm, CodecError, decode_tree, encode_tree
 from marey_schemas.problems import FieldError
@@ -51,7 +51,7 @@ class Message(BaseModel):
         try:
             fields: Any = msgpack.unpackb(data)
             return cls.model_validate(fields)
-        except (ValueError, TypeError, RecursionError, msgpack.UnpackException, ValidationError) as error:
+        except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
             raise BadMessage(
                 f"{len(data)} bytes from another process cannot be read as a {cls.__name__}: {error}"
             ) from error

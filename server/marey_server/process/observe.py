@@ -43,7 +43,7 @@ _MALFORMED = (
 )
 """Beginnings of Tornado's messages about malformed requests; the rest of a message may quote what was received."""
 
-disable_created_metrics()  # type: ignore[no-untyped-call]  # times of the first count, which would double the text
+disable_created_metrics()  # times of the first count, which would double the text
 
 access_log = logging.getLogger("marey_server.access_log")
 

@@ -167,7 +167,7 @@ _LISTED = [coverage_stream.c[name] for name in ("id", "settings", "offset", "cre
 
 def _listed(row: Row[Any]) -> Tree:
     no_state: Tree = {"rig": None, "state": b"", "said": None, "answer": None}
-    return Stream(**row._mapping, **no_state).shown()
+    return Stream(**row._asdict(), **no_state).shown()
 
 
 def is_old(tx: Transaction) -> ColumnElement[bool]:

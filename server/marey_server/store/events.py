@@ -103,7 +103,7 @@ def list_events(
     return EventPage([_shown(row) for row in shown], not rows or len(shown) == rows[0].found)
 
 
-def _placed(tx: Transaction, conditions: Sequence[ColumnElement[bool]], most: int) -> Select[Any]:
+def _placed(tx: Transaction, conditions: Sequence[ColumnElement[bool]], most: int) -> Select[*tuple[Any, ...]]:
     """Select the first `most` events that meet the conditions, each with the sum of the sizes up to its own.
 
     `found` is the number of these events. The bodies are not selected, because not all of them may fit into a page.
@@ -157,7 +157,7 @@ def find_last_old(tx: Transaction, age_us: int) -> int | None:
     return _last_of_old(tx, oldest.where(number < newest_number(tx)).order_by(number), age_us)
 
 
-def _last_of_old(tx: Transaction, oldest: Select[Any], age_us: int) -> int | None:
+def _last_of_old(tx: Transaction, oldest: Select[*tuple[Any, ...]], age_us: int) -> int | None:
     rows = tx.execute(oldest.limit(DELETED_AT_ONCE)).all()
     old = list(takewhile(lambda row: row.at_us < tx.now_us - age_us, rows))
     return int(old[-1].number) if old else None

@@ -217,7 +217,7 @@ def _check_purged(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     return [StoreDefect("purge-incomplete", row.id, f"the item was purged, but has {', '.join(left)}")] if left else []
 
 
-def _head_parts(row: Row[Any]) -> Select[Any]:
+def _head_parts(row: Row[Any]) -> Select[*tuple[Any, ...]]:
     return (
         select(revision_part.c.part, revision_part.c.document_digest, document.c.body)
         .outerjoin(document, document.c.digest == revision_part.c.document_digest)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 import hmac
 import json
@@ -79,7 +78,7 @@ def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> li
     """
     try:
         data = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
-    except (ValueError, binascii.Error) as error:
+    except ValueError as error:
         raise _bad_cursor() from error
     mac, payload = data[:_MAC_BYTES], data[_MAC_BYTES:]
     if not hmac.compare_digest(mac, _mac(tx, payload)):
@@ -107,12 +106,12 @@ def _mac(tx: Transaction, payload: bytes) -> bytes:
 
 def read_page(
     tx: Transaction,
-    statement: Select[Any],
+    statement: Select[*tuple[Any, ...]],
     order: Order,
     identity: Any,
     cursor: str | None,
     limit: int,
-    parts: Sequence[Select[Any]] = (),
+    parts: Sequence[Select[*tuple[Any, ...]]] = (),
 ) -> tuple[Sequence[Row[Any]], str | None]:
     """Return at most `limit` rows of `statement` after the cursor, and the cursor of the next page.
 

@@ -168,7 +168,7 @@ def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
     return _row(row, Role.READER, row.most_running, guest=False)
 
 
-def _with_role_of(user_id: str | BindParameter[str]) -> Select[Any]:
+def _with_role_of(user_id: str | BindParameter[str]) -> Select[*tuple[Any, ...]]:
     mine = and_(member.c.project_id == project.c.id, member.c.user_id == user_id)
     shares = project.outerjoin(member, mine).outerjoin(queue_share, queue_share.c.project_id == project.c.id)
     return select(project, member.c.role, queue_share.c.most_running).select_from(shares)

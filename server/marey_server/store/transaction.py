@@ -156,7 +156,7 @@ class Transaction:
         """Whether the database is Postgres."""
         return self.connection.dialect.name == "postgresql"
 
-    def execute(self, statement: Executable, parameters: Any = None) -> CursorResult[Any]:
+    def execute(self, statement: Executable, parameters: Any = None) -> CursorResult[*tuple[Any, ...]]:
         """Run one SQL statement, and return its result."""
         self.before_statement()
         return self.connection.execute(statement, parameters)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.present import present
 
 from marey_client.errors import JobUnsuccessful, PreconditionFailed, RequestFailed
 from marey_client.jobs import Jobs
@@ -37,7 +38,7 @@ def test_walks_become_steps_of_each_foot_with_their_keyframes(lab: ProjectHandle
 
     step = next(one for one in steps if one.name == "walk 1.5 0_step_left_01")
     (source,) = lab.clips.list(path="walks/walk 1.5 0")
-    frames = step.info().source.details["frames"]
+    frames = present(step.info().source).details["frames"]
     np.testing.assert_array_equal(step.motion().poses, source.motion(frames=slice(*frames)).poses)
     (said,) = step.annotations()
     assert [keyframe.label for keyframe in said.document().keyframes] == ["passing"]

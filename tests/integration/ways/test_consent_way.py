@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.present import present
 
 from marey_client.handles.clips import ClipHandle
 from marey_client.marey import Marey
@@ -84,7 +85,7 @@ def test_the_page_finds_refuses_and_allows(run: CommandLine, project: ProjectHan
     assert not (run.folder / archive[3]).exists()
     run(*submit[: submit.index("--param")], status=1)
     (job,) = (one for one in project.jobs() if one.kind == "export")
-    assert [one["code"] for one in job.result["refused"]] == ["consent-expired"]
+    assert [one["code"] for one in present(job.result)["refused"]] == ["consent-expired"]
     assert overrides(project) == []
 
     # allowed
@@ -96,8 +97,8 @@ def test_the_page_finds_refuses_and_allows(run: CommandLine, project: ProjectHan
         assert {one.path for one in opened.versions().entries(opened.manifest.commit)} >= {"walk", "turn"}
     run(*submit)
     job = next(one for one in project.jobs() if one.params.get("allow_expired_consent"))
-    assert job.result["consent_ended"] == [clip(project, "walk").id]
-    with zipfile.ZipFile(marey.blobs.fetch_to(job.result["archive"]["blob"], run.folder / "x.zip")) as held:
+    assert present(job.result)["consent_ended"] == [clip(project, "walk").id]
+    with zipfile.ZipFile(marey.blobs.fetch_to(present(job.result)["archive"]["blob"], run.folder / "x.zip")) as held:
         assert sorted(held.namelist()) == ["raw/turn.bvh", "raw/walk.bvh"]
     reasons = [download[-1], archive[-1], submit[-1].partition("=")[2]]
     assert overrides(project) == [(reason, 1) for reason in reasons]

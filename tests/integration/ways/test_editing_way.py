@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.present import present
 
 from marey_client import Marey
 from marey_client.errors import Invalid, JobUnsuccessful, RequestFailed
@@ -156,7 +157,7 @@ def test_the_originals_stay_unless_they_are_edited_in_place(marey: Marey, lab: P
     assert (after.item.revision, after.item.summary["frames"]) == (2, 60)
     assert len(after.motion(revision=1).poses) == straight.item.summary["frames"]
     assert after.info().source is not None
-    assert after.info().source.file is not None
+    assert present(after.info().source).file is not None
 
 
 def test_where_results_should_go_must_be_clear(marey: Marey, lab: ProjectHandle) -> None:
@@ -216,7 +217,7 @@ def test_a_preview_shows_what_the_job_makes_and_stores_nothing(marey: Marey, lab
     (made,) = clips_of(lab, "clean").values()
     assert shown.motion is not None
     assert np.array_equal(shown.motion.poses, made.motion(frames=slice(20, 50)).poses)
-    assert np.array_equal(walk.preview(edit, frames=slice(20, 50)).motion.poses, shown.motion.poses)
+    assert np.array_equal(present(walk.preview(edit, frames=slice(20, 50)).motion).poses, shown.motion.poses)
     with pytest.raises(RequestFailed, match=r"commands\[0\] \(trim\)"):
         walk.preview([{"command": "trim", "start": 100_000}])
 

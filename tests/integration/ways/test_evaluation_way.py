@@ -99,14 +99,19 @@ def test_clips_of_two_skeletons_are_refused_by_name(lab: ProjectHandle, tmp_path
 def test_clips_tagged_as_loops_are_looped_and_frames_can_be_trimmed(lab: ProjectHandle) -> None:
     first, second, *_ = sorted(lab.clips.list(), key=lambda clip: clip.path)
     first.change(ItemChange(tags=("loop",)))
-    options = {**SMALL, "database": {"end_policy": "loop"}, "trims": {second.id: (30, 90)}, "baseline": False}
+    options: dict[str, Any] = {
+        **SMALL,
+        "database": {"end_policy": "loop"},
+        "trims": {second.id: (30, 90)},
+        "baseline": False,
+    }
     found = lab.evaluation(lab.evaluate("walks", **options))
     clips = {clip["clip"]: clip for clip in found.clips()}
     assert [name for name, clip in clips.items() if clip["loop"]] == [first.path]
     rate_hz = second.item.summary["frame_rate_hz"]
     assert clips[second.path]["frames"] == pytest.approx(60 * 60 / rate_hz, abs=2)
     with pytest.raises(JobUnsuccessful, match="the range of frames 30:9999 is outside the clip"):
-        lab.evaluation(lab.evaluate("walks", **{**options, "trims": {second.id: (30, 9999)}}))
+        lab.evaluation(lab.evaluate("walks", **(options | {"trims": {second.id: (30, 9999)}})))
 
 
 def test_the_normaliser_of_another_evaluation_can_be_used(lab: ProjectHandle) -> None:

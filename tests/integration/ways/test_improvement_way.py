@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.present import present
 from tests.support.server_process import ServerProcess
 
 from marey_client import Marey
@@ -115,8 +116,8 @@ def test_clips_of_another_folder_fill_the_holes_of_a_set(lab: ProjectHandle, mar
     (job,) = [one for one in lab.jobs() if one.kind == "optimise"]
     log = b"".join(marey.jobs.log(job.id))
     steps = [line for line in log.decode().splitlines() if line.startswith("step ")]
-    assert len(steps) == job.result["steps"] + 1
-    assert job.result["objective_after"] < job.result["objective_before"]
+    assert len(steps) == present(job.result)["steps"] + 1
+    assert present(job.result)["objective_after"] < present(job.result)["objective_before"]
 
 
 def test_weights_are_swept_over_tasks(lab: ProjectHandle, run: CommandLine) -> None:
@@ -148,4 +149,4 @@ def test_who_may_read_the_project_may_read_the_files_that_its_results_name(
     with Marey(server.url, token) as rita:
         assert len(rita.blobs.fetch(archive["archive"]["blob"])) == archive["archive"]["size_bytes"]
         for name in ("document", "report"):
-            rita.blobs.fetch(compared.job.result[name]["blob"])
+            rita.blobs.fetch(present(compared.job.result)[name]["blob"])

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.present import present
 
 from marey_client import Marey
 from marey_client.project import ProjectHandle
@@ -58,4 +59,4 @@ def test_the_server_submits_a_job_at_its_time_and_the_worker_runs_it(
         assert time.monotonic() < deadline, found
         time.sleep(0.5)
     lab.schedules.at("minutely").change(ScheduleChange(paused=True))
-    assert marey.jobs.wait(found.last_job, timeout_s=60).state == "succeeded"
+    assert marey.jobs.wait(present(found.last_job), timeout_s=60).state == "succeeded"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from tests.support.command_line import CommandLine
@@ -98,7 +99,7 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
     with pytest.raises(Invalid, match="no built-in metric 'published/none'"):
         lab.similar(walk, (30, 60), metric="published/none")
     with pytest.raises(NotFound):
-        lab.similar(walk, (30, 60), metric=walk)  # type: ignore[arg-type]
+        lab.similar(walk, (30, 60), metric=cast(Any, walk))
 
     # A mirrored copy of the walk: only a mirrored search sees that it is the same.
     clip = generate_gait(1.9, 0.5, 3.0)

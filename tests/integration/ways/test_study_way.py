@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -56,7 +57,7 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
 
     (study,) = lab.studies.list(collection="studies")
     design = study.design()
-    true = by_speed(lab, [one.clip.item for one in design.motions])  # type: ignore[union-attr]
+    true = by_speed(lab, [one.revision.item for one in design.motions])
     for number, code in enumerate(codes):
         Participant.begin(connect, code).answer_all(choice_by(true, 0.05, seed=number))
     assert re.search(r"finished +3\n", run(*status).stdout)
@@ -98,9 +99,9 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
     assert [one.participant for one in study.judgements()] == ["p2", "p3"]
     block = re.search(r"```python\n(.*?)```", TEXT, re.DOTALL)
     assert block
-    names: dict[str, object] = {"marey": marey}
+    names: dict[str, Any] = {"marey": marey}
     exec(block[1], names)
-    assert len(names["links"].links) == 2  # type: ignore[attr-defined]
+    assert len(names["links"].links) == 2
 
 
 def test_a_study_without_answers_cannot_be_analysed(lab: ProjectHandle, marey: Marey) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.present import present
 from tests.support.server_process import ServerProcess
 
 from marey_client import errors
@@ -84,8 +85,8 @@ def test_the_readme_told_in_a_shell(run: CommandLine, takes: Path, tmp_path: Pat
     files = sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.bvh"))
     assert files == ["raw/turns/left.bvh", "raw/walk.bvh"]
     back = read_motion((tmp_path / "out/raw/walk.bvh").read_bytes(), "walk.bvh").clip
-    assert back.frame_count == 120
-    assert back.skeleton.joint_names == game_skeleton().joint_names
+    assert present(back).frame_count == 120
+    assert present(back).skeleton.joint_names == game_skeleton().joint_names
 
     history = json.loads(run("show", "readme/studio/raw/walk", "--history", "--json").stdout)
     assert {edge["kind"] for edge in history["lineage"]["inputs"]} == {"clip", "skeleton"}
@@ -217,7 +218,7 @@ def test_poses_come_whole_and_in_slices(project: ProjectHandle, takes: Path) -> 
     (clip,) = project.clips.list()
     whole = clip.motion()
     expected = read_motion((takes / "walk.bvh").read_bytes(), "walk.bvh").clip
-    assert np.array_equal(whole.poses, expected.poses)
+    assert np.array_equal(whole.poses, present(expected).poses)
     some = clip.motion(frames=slice(10, 20), joints=whole.joints[3:5])
     assert np.array_equal(some.root_translations, whole.root_translations[10:20])
     assert np.array_equal(some.rotations, whole.rotations[10:20, 3:5])
@@ -264,7 +265,7 @@ def test_a_job_imports_what_a_request_would(project: ProjectHandle, marey: Marey
     params = ImportParams.model_validate({"files": blobs, "collection": "raw", "subject": "ada"})
     job = project.submit(JobCreate(kind="import", params=params.model_dump(mode="json", exclude_defaults=True)))
     ended = marey.jobs.wait(job.id, timeout_s=60)
-    entries = {entry["name"]: entry for entry in ended.result["entries"]}
+    entries = {entry["name"]: entry for entry in present(ended.result)["entries"]}
     assert entries["broken.bvh"]["error"]["line"] == 4
     assert entries["walk.bvh"]["frames"] == 120
     by_job = {clip.path: clip for clip in project.clips.list()}
@@ -290,7 +291,7 @@ def test_an_archive_holds_every_clip_and_is_the_same_each_time(
             cache="off",
         )
         ended = marey.jobs.wait(project.submit(wanted).id, timeout_s=60)
-        digests.append(ended.result["archive"]["blob"])
+        digests.append(present(ended.result)["archive"]["blob"])
     assert digests[0] == digests[1]
     archive = marey.blobs.fetch_to(digests[0], tmp_path / "clips.zip")
     with zipfile.ZipFile(archive) as held:
@@ -317,8 +318,8 @@ def test_a_clip_that_cannot_be_retargeted_is_a_refusal_and_the_others_are_made(
     project.clips.create("tumbling", {"motion": motion}, collection="raw")
     inputs = {"clips": CollectionInput(collection="raw"), "skeleton": ItemInput(item=studio.id)}
     ended = marey.jobs.wait(project.submit(JobCreate(kind="retarget", inputs=inputs, into="out")).id, timeout_s=60)
-    assert ended.result["clips"] == 2
-    (refusal,) = ended.result["refused"]
+    assert present(ended.result)["clips"] == 2
+    (refusal,) = present(ended.result)["refused"]
     assert refusal["name"] == "raw/tumbling"
     assert refusal["code"]
     assert sorted(clip.path for clip in project.clips.list(collection="out")) == ["out/raw/turns/left", "out/raw/walk"]
@@ -349,7 +350,7 @@ def test_results_keep_the_licence_and_say_what_was_done(project: ProjectHandle, 
     (result,) = project.clips.list(collection="out")
     info = result.info()
     assert (info.licence, info.subject) == ("CC BY-NC 4.0", "ada")
-    assert info.source.details["scale"] > 0
+    assert present(info.source).details["scale"] > 0
 
 
 def test_a_large_file_arrives_whole(marey: Marey, tmp_path: Path) -> None:
@@ -374,7 +375,7 @@ def test_an_import_that_becomes_a_job_answers_like_one_that_does_not(
     assert {entry.status for entry in again} == {"unchanged"}
     assert [entry.item for entry in first] == [entry.item for entry in again]
     assert len({entry.skeleton for entry in first}) == 1
-    assert project.clips.get(first[0].item).path == "000/take"
+    assert project.clips.get(present(first[0].item)).path == "000/take"
 
 
 def test_the_log_of_a_job_can_be_read_and_followed(
@@ -429,8 +430,8 @@ def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(
     joints = {standard: joint for standard, joint in mapping.joints.items() if standard != "left_elbow"}
     source.put_mapping(SkeletonMapping(joints=joints, axes=mapping.axes))
     after = retargeted("after")
-    assert before.info().source.details["mapped"] == after.info().source.details["mapped"] + 1
-    assert "left_elbow" in after.info().source.details["missing"]
+    assert present(before.info().source).details["mapped"] == present(after.info().source).details["mapped"] + 1
+    assert "left_elbow" in present(after.info().source).details["missing"]
     used = {(edge.role, edge.revision) for edge in after.lineage().inputs}
     assert ("rigs", 2) in used
 
@@ -491,4 +492,4 @@ def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it
     assert "did you mean left_ankle" in run("skeleton", "map", place, f"leftankle={known}", status=2).stderr
     assert project.skeletons.get(source.id).item.revision == 3
     ended = marey.jobs.wait(project.retarget(sources, studio.id, into="confirmed").id, timeout_s=60)
-    assert ended.result["clips"] == 1
+    assert present(ended.result)["clips"] == 1

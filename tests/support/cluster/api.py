@@ -6,10 +6,11 @@ import asyncio
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from tests.support.cluster.admission import Rights, admit
 from tests.support.cluster.objects import Document, Event, Objects, Refused
+from tornado.http1connection import HTTP1Connection
 from tornado.iostream import StreamClosedError
 from tornado.web import Application, RequestHandler
 
@@ -157,8 +158,7 @@ class _Handler(RequestHandler):
 
     def _answer(self, status: int, document: Document) -> None:
         if self.request.method in self.api.faults.lose:
-            assert self.request.connection is not None
-            self.request.connection.stream.close()  # type: ignore[attr-defined]
+            cast(HTTP1Connection, self.request.connection).stream.close()
             return
         self.set_status(status)
         self.finish(document)

@@ -119,7 +119,7 @@ class DispatchBench:
     def claim(self, job_id: str, **fields: Any) -> list[Lease]:
         """Claim a job as its pod does."""
         labels = self.desk.job(job_id).labels
-        request = ClaimRequest(**{"worker": "pod", "kinds": tuple(KINDS), "labels": labels, "job": job_id, **fields})
+        request = ClaimRequest(**dict[str, Any](worker="pod", kinds=tuple(KINDS), labels=labels, job=job_id) | fields)
         return self.desk.database.write(self.pod_of(job_id), queue.claim, request, self.desk.policy)
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import psutil
 from tests.support.attached_worker import python_path
@@ -91,8 +92,8 @@ class Installation:
 
     def check_store(self) -> list[str]:
         """Return what `marey db fsck` finds."""
-        given = {name.removeprefix("MAREY_").lower(): text for name, text in self.settings.items()}
-        settings = Settings(data=self.servers[0].data, database_url=self.postgres.address(), **given)  # type: ignore[arg-type]
+        given: dict[str, Any] = {name.removeprefix("MAREY_").lower(): text for name, text in self.settings.items()}
+        settings = Settings(data=self.servers[0].data, database_url=self.postgres.address(), **given)
         with closing(connect_database(settings)) as database:
             return [str(one) for one in check_store(database)]
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import psutil
 import psycopg
@@ -61,7 +62,7 @@ class PostgresProcess:
         """Start the server, and wait until it accepts connections."""
         words = [str(self._made.bin_path / "postgres"), "-D", str(self.folder), "-h", "127.0.0.1", "-p", str(self.port)]
         words += [word for name, value in _SETTINGS.items() for word in ("-c", f"{name}={value}")]
-        user = {} if self._made.system_user is None else {"user": self._made.system_user}
+        user: dict[str, Any] = {} if self._made.system_user is None else {"user": self._made.system_user}
         with open(self.folder / "log", "ab") as log:
             self._process = subprocess.Popen(
                 words,
@@ -69,7 +70,7 @@ class PostgresProcess:
                 stderr=log,
                 cwd=self.folder,
                 start_new_session=True,
-                **user,  # type: ignore[call-overload]
+                **user,
             )
         deadline = time.monotonic() + START_S
         while not self._answers():

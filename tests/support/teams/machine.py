@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from typing import Any, ClassVar, cast
 
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
@@ -58,7 +59,7 @@ class TeamsMachine(RuleBasedStateMachine):
     with more kinds of operations.
     """
 
-    only: tuple[str, ...] = ()
+    only: ClassVar[tuple[str, ...]] = ()
     """Names of the kinds of steps to take; empty: all."""
 
     def __init__(self, world: World) -> None:
@@ -256,7 +257,7 @@ def run_programs(world: World, count: int, length: int, only: tuple[str, ...] = 
 
     Machine.only = only
     run_state_machine_as_test(
-        lambda: Machine(world),  # type: ignore[arg-type]
+        cast(Any, lambda: Machine(world)),
         settings=settings(
             max_examples=count, stateful_step_count=length, deadline=None, print_blob=False, report_multiple_bugs=False,
             suppress_health_check=list(HealthCheck), phases=[Phase.explicit, Phase.generate],

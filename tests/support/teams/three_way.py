@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
+from tests.support.present import present
 from tests.support.teams.contents import Keyframe, Labels, Parts, Segment
 
 from marey_schemas.datasets.merges import Side
@@ -179,7 +180,9 @@ def _changes(
         (None, _at(ours, key if key in added_by_us else None), _at(theirs, key))
         for key in theirs.keys() - set(their.values())
     ]
-    return sorted(found, key=lambda three: (by_path((three[2] or three[0] or three[1]).key), three[2] is not None))
+    return sorted(
+        found, key=lambda three: (by_path((present(three[2] or three[0] or three[1])).key), three[2] is not None)
+    )
 
 
 def _decide(
@@ -221,7 +224,7 @@ def _clashes(
         three = old.get(name), mine.get(name), their.get(name)
         if not _excludes(*three):
             continue
-        labels = merge_labels(*three) if all(isinstance(one, Labels) for one in three) else None  # type: ignore[arg-type]
+        labels = merge_labels(*cast(Any, three)) if all(isinstance(one, Labels) for one in three) else None
         if labels is None:
             clashing.append(name)
         else:

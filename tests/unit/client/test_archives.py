@@ -21,7 +21,6 @@ from marey_client.archives.transfers import MOST_DAYS_KEPT, MissingCommits, copy
 from marey_client.archives.writing import short_name, write_archive
 from marey_client.errors import ArchiveInUse, BadRequest, LargeCommit
 from marey_client.progress import ignore_progress
-from marey_client.transport import Transport
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.differences import DatasetDifference
 from marey_schemas.kinds import Kind
@@ -39,7 +38,7 @@ MOST_CHARACTERS = 255
 class ListedDataset:
     """Dataset without branches: each version is given as the list of its entries; the last version is the newest."""
 
-    transport = cast(Transport, None)
+    transport = cast(Any, None)
     project_url = "/projects/lab"
     name = "gaits"
     refusal = "large-difference"

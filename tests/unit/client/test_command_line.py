@@ -12,7 +12,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from subprocess import CompletedProcess
-from typing import Any
+from typing import Any, cast
 from unittest import mock
 
 import httpx
@@ -693,7 +693,7 @@ def test_where_files_go_is_called_the_same_by_every_command(command: str) -> Non
 def test_what_a_step_found_nothing_in_is_counted_as_people_count(capsys: pytest.CaptureFixture[str]) -> None:
     for empty, told in ((["raw/walk"], "in raw/walk"), (["raw/a", "raw/b"], "in 2 clips, such as raw/a")):
         job = a_job(result={"empty": empty})
-        _print_shortfalls(PipelineRun(None, {"annotate": job}))
+        _print_shortfalls(PipelineRun(cast(Any, None), {"annotate": job}))
         assert capsys.readouterr().err == f"annotate found nothing {told}\n"
 
 

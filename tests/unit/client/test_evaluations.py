@@ -89,7 +89,7 @@ def test_loops_that_are_named_and_a_normaliser_are_handed_in(script: ScriptedSer
 
 def test_a_misspelt_option_is_refused_before_anything_is_sent(script: ScriptedServer) -> None:
     with pytest.raises(ValueError, match="durations_s"):
-        script.marey().project("lab").evaluate("walks", durations_s=10)  # type: ignore[call-arg]
+        script.marey().project("lab").evaluate("walks", **dict[str, Any](durations_s=10))
     assert script.requests == []
 
 

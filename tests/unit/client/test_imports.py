@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import httpx
 import pytest
@@ -18,7 +18,7 @@ from marey_schemas.options.imports import ImportOptions
 
 
 def named(names: list[str], size: int = 100) -> list[LocalFile]:
-    return [LocalFile(name, None, size) for name in names]
+    return [LocalFile(name, cast(Any, None), size) for name in names]
 
 
 def names_of(portions: Iterator[Any]) -> list[list[str]]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import httpx
 import pytest
-import typer
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client.cli import purging
@@ -57,6 +56,6 @@ def test_an_item_in_a_purged_folder_is_not_purged_again(
     clip, other = "clip_00000000000000000000000001", "clip_00000000000000000000000002"
     done = preview([clip, other]).model_copy(update={"preview": False})
     script.answers = [answer(one) for one in (preview([clip, other]), preview([clip]), done)]
-    purging.purge(cast(typer.Context, None), ["lab/", f"lab/{clip}"], yes=True)
+    purging.purge(cast(Any, None), ["lab/", f"lab/{clip}"], yes=True)
     assert [json.loads(one.content).get("preview", False) for one in script.requests] == [True, True, False]
     assert "2 items purged for good; garbage collection can free about 20 bytes" in capsys.readouterr().err

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from lint.pins import BELOW, FOLDER, ROOT, layers_of, pins_in, split
 from packaging.requirements import Requirement
+from tests.support.present import present
 
 PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 FILES = {layer: (ROOT / FOLDER / f"{layer}.txt").read_text("utf-8") for layer in BELOW}
@@ -15,7 +16,7 @@ PINS = {layer: pins_in(text) for layer, text in FILES.items()}
 
 
 def name_of(requirement: str) -> str:
-    return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower()
+    return re.sub(r"[-_.]+", "-", present(re.match(r"[\w.-]+", requirement))[0]).lower()
 
 
 def required(extra: str) -> set[str]:

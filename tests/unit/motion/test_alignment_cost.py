@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from marey_motion.alignment.cost import frame_costs
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-from marey_schemas.options.alignment import AlignOptions, CostOptions
+from marey_schemas.options.alignment import AlignOptions, CostMethod, CostOptions
 
 POINTS = 9
 
@@ -89,7 +89,7 @@ def test_plain_costs_keep_turns_and_shifts() -> None:
 
 @pytest.mark.parametrize("method", ["turned", "plain"])
 @pytest.mark.parametrize("window", [3, 5])
-def test_a_window_compares_the_frames_around_as_one_cloud(method: str, window: int) -> None:
+def test_a_window_compares_the_frames_around_as_one_cloud(method: CostMethod, window: int) -> None:
     a, b = cloud(7, 8), cloud(6, 9)
     around = window // 2
 
@@ -126,7 +126,7 @@ def test_both_directions_cost_the_same() -> None:
     ],
 )
 def test_what_makes_no_cost_is_refused(arguments: dict[str, Any], said: str) -> None:
-    given = {"a": np.zeros((3, 4, 3)), "b": np.zeros((3, 4, 3)), **arguments}
+    given: dict[str, Any] = {"a": np.zeros((3, 4, 3)), "b": np.zeros((3, 4, 3)), **arguments}
     with pytest.raises(MotionError, match=said):
         frame_costs(**given)
 
@@ -135,6 +135,6 @@ def test_what_makes_no_cost_is_refused(arguments: dict[str, Any], said: str) -> 
     ("option", "value"),
     [("window", 4), ("window", 63), ("cost", "best"), ("rate_hz", float("nan")), ("rate_hz", 0.0), ("slope_limit", -1)],
 )
-def test_options_out_of_range_are_refused_by_name(option: str, value: object) -> None:
+def test_options_out_of_range_are_refused_by_name(option: str, value: Any) -> None:
     with pytest.raises(ValidationError, match=option):
         AlignOptions(**{option: value})

@@ -206,7 +206,7 @@ def test_the_bound_is_never_above_the_distance_and_tells_distant_motions_apart()
 def test_bounds_of_many_motions_at_once_are_those_of_one_box_about_each() -> None:
     motions = [walking_points(10 + 7 * seed, 1.0 + 0.1 * seed, 0.2 * seed, seed=seed) for seed in range(8)]
     stops = np.cumsum([len(motion) for motion in motions])
-    ranges = RangeBounds(np.concatenate(motions), stops - [len(motion) for motion in motions], stops)
+    ranges = RangeBounds(np.concatenate(motions), stops - np.array([len(motion) for motion in motions]), stops)
     for one in range(8):
         others = np.arange(one, 8)
         bounds = ranges.between(one, others)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.edited_takes import make_breathing_walk, make_walk, under_static_root
+from tests.support.present import present
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
@@ -26,7 +27,7 @@ ARM = WALK.skeleton.index_of("LeftArm")
 
 
 def joined(*clips: Clip) -> Clip:
-    moved = None if clips[0].translations is None else np.concatenate([clip.translations for clip in clips])
+    moved = None if clips[0].translations is None else np.concatenate([present(clip.translations) for clip in clips])
     return replace(clips[0], poses=np.concatenate([clip.poses for clip in clips]), translations=moved)
 
 
@@ -219,7 +220,7 @@ def test_translations_are_compared_with_offsets_where_a_clip_has_none() -> None:
     found = compare(WALK, breathing)
     assert found.translated_joints == ((), ("Spine1", "LeftArm"))
     assert {joint.joint for joint in found.translations} == {"LeftArm", "Spine1"}
-    arm = breathing.translations[:, breathing.translated_joints.index(ARM)] - WALK.skeleton.offsets[ARM]
+    arm = present(breathing.translations)[:, breathing.translated_joints.index(ARM)] - WALK.skeleton.offsets[ARM]
     (change,) = (joint for joint in found.translations if joint.joint == "LeftArm")
     assert change.largest == pytest.approx(100.0 * np.linalg.norm(arm, axis=1).max(), rel=1e-5)
 

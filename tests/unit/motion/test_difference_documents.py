@@ -102,7 +102,7 @@ def test_annotations_with_too_many_differing_segments_are_refused(monkeypatch: p
 
 
 def changed(skeleton: Skeleton, **fields: Any) -> Skeleton:
-    given = {
+    given: dict[str, Any] = {
         "joint_names": skeleton.joint_names,
         "parents": skeleton.parents,
         "offsets": skeleton.offsets,

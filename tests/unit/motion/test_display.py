@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.present import present
 
 from marey_motion import quaternions
 from marey_motion.evaluation.scenario import Trial, reference
@@ -185,7 +186,7 @@ def test_a_joint_that_moves_against_its_parent_is_blended_in_place_and_velocity(
     database = build_database([SourceClip("clip", "clip", moving)], body)
     before, after = 30, 110
 
-    shown = displayed_clip(database, jump(database, before, after), OPTIONS).translations[:, 0]
+    shown = present(displayed_clip(database, jump(database, before, after), OPTIONS).translations)[:, 0]
 
     held, cut = before + 29, after - 1
     place = places[:, 0].astype(np.float64)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from tests.support.present import present
 
 from marey_motion import quaternions
 from marey_motion.arrays import AnyFloats, Ints
@@ -206,8 +207,8 @@ def test_figures_are_centred_on_the_pelvis_and_face_their_heading() -> None:
     stances = stances_at(clip, body_of(clip.skeleton), np.array([0, 120]))
 
     assert np.abs(stances.points[:, 0, ::2]).max() < 1e-12
-    assert stances.facing[0] == pytest.approx((0.0, 1.0), abs=0.05)
-    assert stances.facing[1] == pytest.approx((1.0, 0.0), abs=0.05)
+    assert present(stances.facing)[0] == pytest.approx((0.0, 1.0), abs=0.05)
+    assert present(stances.facing)[1] == pytest.approx((1.0, 0.0), abs=0.05)
 
 
 def test_a_camera_in_front_sees_the_left_side_on_the_right_and_near_things_lower() -> None:

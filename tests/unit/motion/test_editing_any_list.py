@@ -47,7 +47,9 @@ COMMAND = st.one_of(
     named("face", heading_deg=ANGLES, frame=st.integers(0, 5)),
     named("move_to_origin", frame=st.integers(0, 5)),
     named("scale", factor=st.floats(0.1, 10.0), translations=st.booleans()),
-    st.sampled_from([("+x", "-y"), ("-y", "+z"), ("+z", "-x")]).map(lambda axes: FlipAxes(up=axes[0], forward=axes[1])),
+    st.sampled_from(
+        [FlipAxes(up="+x", forward="-y"), FlipAxes(up="-y", forward="+z"), FlipAxes(up="+z", forward="-x")]
+    ),
     named("fix_drift", shift_m=SHIFTS, turn_deg=ANGLES, frames=FRAMES, profile=st.sampled_from(["linear", "smooth"])),
     named("move_to_ground", height_m=st.none() | st.floats(-3.0, 3.0)),
     named("find_ground"),

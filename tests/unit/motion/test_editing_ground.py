@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import degrees
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,7 +76,7 @@ def test_a_foot_that_is_held_in_the_air_does_not_stand_on_the_ground() -> None:
         for joint, angle in (("LeftUpLeg", -1.2), ("LeftLeg", 1.2))
     ]
 
-    def labels(**given: object) -> set[str]:
+    def labels(**given: Any) -> set[str]:
         (made,) = edit_clip(standing, [*lift, FindContacts(**given)])
         return {one["label"] for one in made.findings[0].values["segments"]}
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import degrees
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from marey_schemas.editing.edits import AnyCommand
 BLENDS = ("inertialise", "slerp")
 
 
-def join(first: Clip, second: Clip, **given: object) -> Clip:
+def join(first: Clip, second: Clip, **given: Any) -> Clip:
     return apply_edit(first, [Concatenate(source="second", **given)], sources={"second": second})
 
 

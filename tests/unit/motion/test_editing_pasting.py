@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import degrees
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from marey_schemas.editing.commands import Paste, RotateJoint
 ARM = ["LeftArm", "LeftForeArm", "LeftHand"]
 
 
-def paste(clip: Clip, source: Clip, **given: object) -> Clip:
+def paste(clip: Clip, source: Clip, **given: Any) -> Clip:
     return apply_edit(clip, [Paste(source="other", joints=ARM, **given)], sources={"other": source})
 
 
@@ -94,7 +95,7 @@ def test_what_is_not_there_cannot_be_copied() -> None:
 
 
 @pytest.mark.parametrize("space", ["joint", "parent", "world"])
-def test_a_rotation_is_added_in_the_axes_that_are_asked_for(space: str) -> None:
+def test_a_rotation_is_added_in_the_axes_that_are_asked_for(space: Literal["joint", "parent", "world"]) -> None:
     walk = make_walk(turn_rate_rad_s=0.5)
     joint = walk.skeleton.index_of("LeftArm")
     parent = int(walk.skeleton.parents[joint])

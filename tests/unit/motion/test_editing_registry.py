@@ -52,7 +52,7 @@ def test_the_name_of_a_command_is_its_default_in_python_and_required_in_document
     schema = model.model_json_schema()
     assert "command" in schema["required"]
     (given, *_) = model.examples
-    command = model(**given)
+    command: Any = model(**given)
     assert command.model_dump(exclude_unset=True).keys() == {"command", *given}
     assert EditDocument(commands=(command,)) == edit_of(command.model_dump(mode="json", exclude_unset=True))
 

@@ -1,6 +1,7 @@
 """Removal of noise from motions."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -33,13 +34,13 @@ def noisy(clip: Clip, size: float, seed: int = 5) -> Clip:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_poses_that_stay_and_straight_paths_are_kept(method: str) -> None:
+def test_poses_that_stay_and_straight_paths_are_kept(method: Literal["savitzky_golay", "gaussian"]) -> None:
     line = still_on_a_line()
     assert same_poses(apply_edit(line, [Smooth(method=method, window_s=0.5)]), line, 1e-6)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_no_frame_is_lost_and_the_ends_stay(method: str) -> None:
+def test_no_frame_is_lost_and_the_ends_stay(method: Literal["savitzky_golay", "gaussian"]) -> None:
     walk = noisy(make_breathing_walk(), 0.02)
     smoothed = apply_edit(walk, [Smooth(method=method, window_s=0.3)])
     assert smoothed.frame_count == walk.frame_count
@@ -50,7 +51,7 @@ def test_no_frame_is_lost_and_the_ends_stay(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_noise_gets_less(method: str) -> None:
+def test_noise_gets_less(method: Literal["savitzky_golay", "gaussian"]) -> None:
     walk = make_walk()
     rough = noisy(walk, 0.03)
     smoothed = apply_edit(rough, [Smooth(method=method, window_s=0.25)])
@@ -114,7 +115,9 @@ def test_a_window_of_fewer_frames_than_the_polynomial_needs_is_refused() -> None
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("frames", [1, 2, 3, 5])
-def test_motions_shorter_than_the_window_are_smoothed_too(method: str, frames: int) -> None:
+def test_motions_shorter_than_the_window_are_smoothed_too(
+    method: Literal["savitzky_golay", "gaussian"], frames: int
+) -> None:
     few = noisy(make_walk(), 0.03).sliced(0, frames)
     smoothed = apply_edit(few, [Smooth(method=method, window_s=2.0)])
     assert smoothed.frame_count == frames
@@ -128,7 +131,9 @@ def test_an_unknown_joint_is_told_with_its_nearest_names() -> None:
 
 
 @pytest.mark.parametrize("method", ["savitzky_golay", "gaussian"])
-def test_means_over_long_windows_are_those_of_short_ones(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_means_over_long_windows_are_those_of_short_ones(
+    method: Literal["savitzky_golay", "gaussian"], monkeypatch: pytest.MonkeyPatch
+) -> None:
     clip = make_walk(turn_rate_rad_s=0.3, seconds=12.0)
     commands = [Smooth(method=method, window_s=10.0)]
     quick = apply_edit(clip, commands)

@@ -144,6 +144,6 @@ def test_stances_do_not_depend_on_flicker_shorter_than_a_swing() -> None:
         ({"longest_s": 0.1}, "longest_s"),
     ],
 )
-def test_options_that_make_no_sense_are_refused_by_name(options: dict[str, float], where: str) -> None:
+def test_options_that_make_no_sense_are_refused_by_name(options: dict[str, Any], where: str) -> None:
     with pytest.raises(ValidationError, match=where):
         StepsProposal(**options)

@@ -1,6 +1,7 @@
 """Changes of frame rate and speed, and mirroring."""
 
 from math import degrees
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -77,7 +78,7 @@ def test_a_body_that_is_not_known_is_told_only_where_it_matters() -> None:
         raise MappingError("nobody knows this body")
 
     walk = make_walk()
-    body = EditedBody(walk.skeleton, unknown)  # type: ignore[arg-type]
+    body = EditedBody(walk.skeleton, cast(Any, unknown))
     kept = apply_edit(walk, [Trim(stop=50), Smooth(), Rotate(angle_deg=degrees(1.0))], body=body)
     assert kept.frame_count == 50
     with pytest.raises(MappingError, match="nobody knows this body"):

@@ -178,7 +178,7 @@ def test_speed_is_the_length_of_the_way_not_the_distance_covered() -> None:
 
 
 def test_windows_are_a_second_long_at_any_rate() -> None:
-    positions = np.stack((np.zeros(91), np.arange(91) * 0.05), axis=1)
+    positions = np.stack((np.zeros(91), np.arange(91.0) * 0.05), axis=1)
     windows = sliding_windows(positions, np.zeros(91), 30.0)
 
     assert len(windows.speed_m_s) == 61

@@ -20,10 +20,10 @@ from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.mirroring import mirror_clip
 from marey_motion.rigs import map_joints
-from marey_schemas.options.matching import DatabaseOptions
+from marey_schemas.options.matching import DatabaseOptions, Mirroring
 
 
-def gaits(mirroring: str = "none", **clips: Any) -> MatchingDatabase:
+def gaits(mirroring: Mirroring = "none", **clips: Any) -> MatchingDatabase:
     skeleton = next(iter(clips.values())).skeleton
     body = MatchingBody.from_mapping(skeleton, map_joints(skeleton))
     sources = [SourceClip(uid, uid, clip, content=f"sha256:{uid}") for uid, clip in clips.items()]

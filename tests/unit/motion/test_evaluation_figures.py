@@ -26,6 +26,7 @@ from tests.support.drawn_evaluations import (
 )
 from tests.support.drawn_figures import is_sound, is_sound_svg, rows_of
 from tests.support.evaluation_results import SMALL, synthetic_result
+from tests.support.present import present
 from tests.support.tiers import is_soak
 
 from marey_motion.errors import MotionError
@@ -224,9 +225,9 @@ def test_one_normal_has_the_static_error_as_its_mean_and_the_sign_can_be_turned(
     for negate, sign in ((False, 1.0), (True, -1.0)):
         rows = rows_of(draw_figure("errors", result, trial=trial, options=FigureOptions(negate_errors=negate)), "fits")
         one = {row["quantity"]: row for row in rows if row["components"] == 1}
-        assert one["speed_m_s"]["mean"] == pytest.approx(sign * metrics["se_v"], abs=1e-12)
+        assert one["speed_m_s"]["mean"] == pytest.approx(sign * present(metrics["se_v"]), abs=1e-12)
         assert one["speed_m_s"]["deviation"] == pytest.approx(metrics["dse_v"], abs=1e-12)
-        assert one["turn_rate_deg_s"]["mean"] == pytest.approx(sign * metrics["se_omega_deg"], abs=1e-9)
+        assert one["turn_rate_deg_s"]["mean"] == pytest.approx(sign * present(metrics["se_omega_deg"]), abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["errors", "transition-cost"])
@@ -273,7 +274,7 @@ def test_usage_counts_the_frames_of_every_clip_and_the_transitions(result: Evalu
         result.clips[usage.clip].uid: usage.ticks for usage in result.usage
     }
     assert rows[-1]["name"] == "Transitions"
-    assert rows[-1]["frames"] == sum(each.metrics["transitions"] for each in result.trials)
+    assert rows[-1]["frames"] == sum(present(each.metrics["transitions"]) for each in result.trials)
 
 
 def test_usage_of_one_trial_is_that_of_its_record(result: EvaluationResult) -> None:

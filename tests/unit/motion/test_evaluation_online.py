@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.present import present
 
 from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
@@ -275,12 +276,12 @@ def test_the_performer_is_where_the_newest_frame_has_him_and_moves_as_the_newest
     assert at_first is None
     positions, headings = circling(2.0, 50.0, 3.0)
     online.add_roots(positions[:50], headings[:50])
-    assert online.performer.window is None
+    assert present(online.performer).window is None
     windows = online.add_roots(positions[50:], headings[50:])
     now = online.performer
-    assert (now.x_m, now.z_m) == tuple(positions[-1])
-    assert now.heading_rad == pytest.approx(headings[-1])
-    assert tuple(now.window) == tuple(column[-1] for column in windows)
+    assert (present(now).x_m, present(now).z_m) == tuple(positions[-1])
+    assert present(now).heading_rad == pytest.approx(headings[-1])
+    assert tuple(present(present(now).window)) == tuple(column[-1] for column in windows)
     online.end_take()
     assert online.performer is None
 
@@ -353,5 +354,5 @@ def test_real_performances_have_the_windows_that_are_found_afterwards(mocap: Pat
 
     file = next(iter(sorted((mocap / folder).rglob("*.bvh"))))
     clip = read_motion(file.read_bytes(), file.name).clip
-    body, online = body_of(clip), OnlineCoverage(clip.frame_rate_hz)
-    assert differences(streamed(online, clip, (17,)), afterwards(clip, body)) < TOLERANCE
+    body, online = body_of(present(clip)), OnlineCoverage(present(clip).frame_rate_hz)
+    assert differences(streamed(online, present(clip), (17,)), afterwards(present(clip), body)) < TOLERANCE

@@ -21,6 +21,7 @@ from tests.support.drawn_evaluations import (
     usual,
 )
 from tests.support.evaluation_results import synthetic_result
+from tests.support.present import present
 from tests.support.report_pages import HOSTILE, Page, is_sound
 from tests.support.tiers import is_soak
 
@@ -152,7 +153,7 @@ def test_the_suite_s_numbers_stand_beside_the_baseline_s(
 def test_the_suite_s_numbers_are_called_means_largest_and_sums_as_they_are(
     result: EvaluationResult, page: Page
 ) -> None:
-    largest = max(each.metrics["offset_max"] for each in result.trials)
+    largest = max(present(each.metrics["offset_max"]) for each in result.trials)
     assert "the maximum for the largest distance" in page.text
     assert f"largest distance {largest:.2f}" in page.text
 
@@ -373,7 +374,7 @@ def test_a_comparison_shows_what_came_went_and_changed(result: EvaluationResult)
     assert page.tags["figure"] == len(FIGURES)
     assert "Added clips (1) newcomer" in page.text
     assert "Removed clips (3)" in page.text
-    assert f"{after.suite['offset_mean'] - result.suite['offset_mean']:+.2f}" in page.text
+    assert f"{present(after.suite['offset_mean']) - present(result.suite['offset_mean']):+.2f}" in page.text
     assert "old → new" in page.text
 
 

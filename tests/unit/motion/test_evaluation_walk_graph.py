@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from tests.support.evaluation_cases import clips_of, walked_record
+from tests.support.present import present
 
 from marey_motion.evaluation.relevance import count_switches, measure_usage
 from marey_motion.evaluation.walk_graph import ClipGraph, clip_graph, graph_to_graphml, graph_to_tree, walk_graph
@@ -61,17 +62,17 @@ def test_the_tree_names_clips_and_frames_and_goes_through_json() -> None:
 def test_graphml_holds_the_same_graph() -> None:
     root = ElementTree.fromstring(graph_to_graphml(walk_graph(CLIPS, [walked_record(WALK), walked_record([30, 31])])))
     graph = root.find("g:graph", NAMESPACE)
-    nodes = {node.get("id"): node for node in graph.findall("g:node", NAMESPACE)}
-    edges = graph.findall("g:edge", NAMESPACE)
+    nodes = {node.get("id"): node for node in present(graph).findall("g:node", NAMESPACE)}
+    edges = present(graph).findall("g:edge", NAMESPACE)
     declared = {key.get("id") for key in root.findall("g:key", NAMESPACE)}
 
-    assert graph.get("edgedefault") == "directed"
+    assert present(graph).get("edgedefault") == "directed"
     assert len(nodes) == 8
     values = {data.get("key"): data.text for data in nodes["n15"].findall("g:data", NAMESPACE)}
     assert values == {"clip": "b", "name": "clip 1", "frame": "5", "ticks": "2"}
-    found = [(edge.get("source"), edge.get("target"), edge.find("g:data", NAMESPACE).text) for edge in edges]
+    found = [(edge.get("source"), edge.get("target"), present(edge.find("g:data", NAMESPACE)).text) for edge in edges]
     assert found == [("n5", "n15", "2"), ("n17", "n4", "1")]
-    walks = {data.get("key"): data.text for data in graph.findall("g:data", NAMESPACE)}
+    walks = {data.get("key"): data.text for data in present(graph).findall("g:data", NAMESPACE)}
     assert walks == {"walk0": "n3:3 n15:3 n4:2 n15:1", "walk1": "n30:2"}
     assert declared == {data.get("key") for data in root.iter(f"{{{NAMESPACE['g']}}}data")}
 

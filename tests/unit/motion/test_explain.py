@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.present import present
 from tests.support.synthetic_databases import arc_track, index_of, random_tracks, synthetic_database
 
 from marey_motion.errors import MotionError
@@ -53,7 +54,7 @@ def test_every_decision_of_a_trial_is_explained_as_it_was_made(options: dict[str
         if tick > 0:
             switched = record.status[tick + 1] == Status.REPLACING
             assert explanation.reason == ("switched" if switched else "continued")
-            np.testing.assert_allclose(explanation.going_on.cost, record.continuing_cost[tick], rtol=1e-12)
+            np.testing.assert_allclose(present(explanation.going_on).cost, record.continuing_cost[tick], rtol=1e-12)
             if switched:
                 assert explanation.candidates[0].row == explanation.chosen
                 np.testing.assert_allclose(explanation.candidates[0].cost, record.match_cost[tick], rtol=1e-12)
@@ -74,7 +75,7 @@ def test_candidates_are_the_cheapest_rows_in_order_with_what_each_group_costs() 
 
 
 def test_going_on_costs_its_trajectory_only() -> None:
-    groups = explained(played(), 60).going_on.groups
+    groups = present(explained(played(), 60).going_on).groups
 
     assert all(cost == 0.0 for name, cost in groups.items() if not name.startswith("trajectory"))
     assert groups["trajectory_positions"] > 0.0
@@ -84,7 +85,7 @@ def test_by_pose_distance_the_metres_are_a_group_of_their_own() -> None:
     explanation = explained(played(selection="pose_distance"), 60)
 
     assert list(explanation.candidates[0].groups) == ["pose_distance", "trajectory_positions", "trajectory_directions"]
-    assert explanation.going_on.groups["pose_distance"] == 0.0
+    assert present(explanation.going_on).groups["pose_distance"] == 0.0
 
 
 def test_the_start_is_explained_by_the_trajectory_alone() -> None:

@@ -118,7 +118,7 @@ def test_skeletons_are_converted_once_for_equal_joints_tips_units_and_axes() -> 
     bent = ARM.replace("OFFSET 0 10 0", "OFFSET 3 10 0")
 
     def skeleton_of(hierarchy: str = bent, **options: Any) -> Skeleton:
-        given = ImportOptions(**{"unit": "cm", "up_axis": "y", **options})
+        given = ImportOptions(**dict[str, Any](unit="cm", up_axis="y") | options)
         return read_motion(bvh(hierarchy=hierarchy), "arm.bvh", options=given).skeleton
 
     first = skeleton_of()

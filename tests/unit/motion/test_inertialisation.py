@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import solve_ivp  # pyrefly: ignore[implicit-reexport]  # scipy collects its names when it runs
 
 from marey_motion.arrays import Floats
 from marey_motion.matching.inertialisation import decay_matrix

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.support.present import present
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats
@@ -30,7 +31,7 @@ def reference(clip: Clip) -> tuple[Floats, Floats]:
             local = Rotation.from_quat(clip.rotations[frame, joint].astype(float), scalar_first=True)
             offset = skeleton.offsets[joint].copy()
             if joint in clip.translated_joints:
-                offset = clip.translations[frame, clip.translated_joints.index(joint)].astype(float)
+                offset = present(clip.translations)[frame, clip.translated_joints.index(joint)].astype(float)
             if parent < 0:
                 positions[frame, joint] = clip.root_translations[frame]
                 turns.append(local)
@@ -190,7 +191,7 @@ def test_positions_of_real_motion_agree_with_the_reference(mocap: Path) -> None:
     from marey_motion.formats import read_motion
 
     path = mocap / "cmu-bvh" / "01_01.bvh"
-    clip = read_motion(path.read_bytes(), path.name).clip.sliced(0, 40)
+    clip = present(read_motion(path.read_bytes(), path.name).clip).sliced(0, 40)
     positions, _ = reference(clip)
     np.testing.assert_allclose(kinematics.global_positions(clip), positions[:, : clip.skeleton.joint_count], atol=1e-5)
 

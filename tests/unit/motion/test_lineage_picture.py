@@ -26,7 +26,7 @@ COMMIT = "sha256:" + "5b130f77dd83" + 52 * "0"
 
 
 def revision(path: str, distance: int, **members: Any) -> LineageRevision:
-    given = {"kind": Kind.CLIP, "revision": 1, "newest": 1, **members}
+    given: dict[str, Any] = {"kind": Kind.CLIP, "revision": 1, "newest": 1, **members}
     return LineageRevision(item=path, path=path, distance=distance, created_at=TIME, **given)
 
 

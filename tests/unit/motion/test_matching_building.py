@@ -19,7 +19,7 @@ from marey_motion.mirroring import mirror_clip
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
-from marey_schemas.options.matching import DatabaseOptions
+from marey_schemas.options.matching import DatabaseOptions, EndPolicy
 
 DEFAULTS = DatabaseOptions()
 BODY = MatchingBody.from_mapping(studio_skeleton(), map_joints(studio_skeleton()))
@@ -217,7 +217,7 @@ class TestMirroring:
 
 class TestFrames:
     @pytest.mark.parametrize(("policy", "left_out"), [("clamp", 20), ("trim", 60), ("loop", 20)])
-    def test_the_end_of_a_clip_cannot_be_chosen(self, policy: str, left_out: int) -> None:
+    def test_the_end_of_a_clip_cannot_be_chosen(self, policy: EndPolicy, left_out: int) -> None:
         selectable = built(WALK, DatabaseOptions(end_policy=policy)).selectable
         assert np.array_equal(selectable, np.arange(180) < 180 - left_out)
 
@@ -331,7 +331,7 @@ class TestRefusals:
 
 
 def test_progress_tells_of_every_clip() -> None:
-    told: list[tuple[int, int, str]] = []
+    told: list[tuple[Any, ...]] = []
     clips = [SourceClip("b", "second", WALK), SourceClip("a", "first", WALK)]
     build_database(clips, BODY, DatabaseOptions(mirroring="add"), progress=lambda *news: told.append(news))
     assert told == [(1, 2, "first"), (2, 2, "second")]

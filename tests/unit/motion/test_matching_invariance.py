@@ -20,7 +20,7 @@ from tests.support.synthetic_databases import (
 )
 
 from marey_motion.evaluation.scenario import Trial
-from marey_schemas.options.matching import ControllerOptions
+from marey_schemas.options.matching import ControllerOptions, Selection
 
 # Data that is the scenario
 
@@ -122,7 +122,7 @@ def test_the_mirrored_dataset_mirrors_the_result() -> None:
 
 
 @pytest.mark.parametrize("selection", ["features", "pose_distance"])
-def test_removing_rows_that_are_never_shown_changes_no_bit(selection: str) -> None:
+def test_removing_rows_that_are_never_shown_changes_no_bit(selection: Selection) -> None:
     tracks = random_tracks(20, seed=2)
     database = synthetic_database(tracks)
     options = ControllerOptions(selection=selection)

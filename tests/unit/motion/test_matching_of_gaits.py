@@ -21,7 +21,7 @@ from marey_motion.matching.normaliser import Normaliser
 from marey_motion.matching.record import Status, TrialRecord
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.rigs import map_joints
-from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
+from marey_schemas.options.matching import ControllerOptions, DatabaseOptions, Follow
 
 FOLLOWS = ("time", "path", "open_loop")
 EXACT = ControllerOptions(root_inertialisation=False, reselect_window_s=0.0)
@@ -175,7 +175,7 @@ def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not() ->
 
 @pytest.mark.parametrize("follow", FOLLOWS)
 def test_the_mirrored_dataset_mirrors_the_result(
-    takes: list[SourceClip], dataset: MatchingDatabase, follow: str
+    takes: list[SourceClip], dataset: MatchingDatabase, follow: Follow
 ) -> None:
     mirrored = database_of(takes, DatabaseOptions(mirroring="only"))
     options = ControllerOptions(follow=follow)
@@ -199,7 +199,7 @@ def places(database: MatchingDatabase, record: TrialRecord) -> list[tuple[str, i
 
 @pytest.mark.parametrize("follow", FOLLOWS)
 def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(
-    takes: list[SourceClip], follow: str
+    takes: list[SourceClip], follow: Follow
 ) -> None:
     """Trials have no straight approach, which the left and the right trial would begin in the same row."""
     closed = database_of(takes, DatabaseOptions(mirroring="add"))

@@ -37,16 +37,20 @@ def same_motion(a: Clip, b: Clip) -> bool:
     return bool(turned.max() < 1e-5) and np.allclose(global_positions(a), global_positions(b), atol=1e-5)
 
 
+def floats(values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    return np.asarray(values, dtype=np.float64)
+
+
 def with_rest_pose(skeleton: Skeleton, turns: NDArray[np.float64]) -> Skeleton:
     """Return the skeleton with other local axes: the frame of each joint is rotated by `turns` (J, 4)."""
     parents = np.concatenate(([[1.0, 0.0, 0.0, 0.0]], turns[skeleton.parents[1:]]))
     offsets = quaternions.rotate_vectors(quaternions.conjugate(parents), skeleton.offsets)
     rest = quaternions.multiply(quaternions.multiply(quaternions.conjugate(parents), skeleton.rest_rotations), turns)
     sites = tuple(
-        EndSite(s.joint, np.asarray(quaternions.rotate_vectors(quaternions.conjugate(turns[s.joint]), s.offset)))
+        EndSite(s.joint, floats(quaternions.rotate_vectors(quaternions.conjugate(turns[s.joint]), s.offset)))
         for s in skeleton.end_sites
     )
-    return replace(skeleton, offsets=np.asarray(offsets), rest_rotations=np.asarray(rest), end_sites=sites)
+    return replace(skeleton, offsets=floats(offsets), rest_rotations=floats(rest), end_sites=sites)
 
 
 def random_turns(count: int, seed: int) -> NDArray[np.float64]:
@@ -73,7 +77,7 @@ def raised_arm() -> Skeleton:
         if joint not in tops and tops & set(plain.path_to_root(joint)):
             offsets[joint] = quaternions.rotate_vectors(quarter, offsets[joint])
     sites = tuple(
-        EndSite(s.joint, np.asarray(quaternions.rotate_vectors(quarter, s.offset)))
+        EndSite(s.joint, floats(quaternions.rotate_vectors(quarter, s.offset)))
         if tops & set(plain.path_to_root(s.joint))
         else s
         for s in plain.end_sites

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from tests.support.modelling_examples import bending_chains, chain, walks
+from tests.support.present import present
 
 from marey_motion.errors import MotionError
 from marey_motion.modelling.primitive_documents import (
@@ -49,7 +50,7 @@ def test_the_report_of_a_training_is_part_of_the_document(trained: TrainedPrimit
     assert len(written["examples"]) == len(trained.report.examples)
     assert len(written["candidates"]) == len(trained.report.candidates)
     each = written["reconstruction"]["left_out_each_cm"]
-    assert np.array_equal(each, trained.report.reconstruction.left_out_each_cm)
+    assert np.array_equal(each, present(present(trained.report.reconstruction).left_out_each_cm))
     assert "training" not in primitive_to_tree(trained.primitive, SKELETON)
 
 

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 from tests.support.modelling_examples import bending_chains, chain, unit_poses, walks
+from tests.support.present import present
 from tests.support.tiers import examples
 
 from marey_motion import quaternions
@@ -226,7 +227,7 @@ def test_optimised_weights_bring_joints_nearer_than_those_they_start_from() -> N
     coefficients = basis.fit(aligned.poses)
     ones, root_max = np.ones(coefficients.shape[2]), root_max_weights(aligned.poses)
     weights, keep = optimised_weights(aligned.skeleton, basis, coefficients, (root_max, ones), Keep(0.9))
-    problem = _Problem(aligned.skeleton, basis, coefficients, keep.count, "coefficients")
+    problem = _Problem(aligned.skeleton, basis, coefficients, present(keep.count), "coefficients")
     before, after = (
         [problem.value_and_gradient(_logarithms(one))[0] for one in many] for many in ((ones, root_max), (weights,))
     )

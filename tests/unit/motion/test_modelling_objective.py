@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 from pydantic import ValidationError
+from tests.support.present import present
 from tests.support.search_primitives import FRAMES, sliding, standard_joints, walking
 
 from marey_motion import quaternions
@@ -80,7 +80,7 @@ def plain_error(primitive: MotionPrimitive, joints: dict[str, int], latents: Flo
         case LookDirectionConstraint():
             axis = np.asarray(constraint.axis) / np.linalg.norm(constraint.axis)
             pointing = quaternions.rotate_vectors(rotations[:, joints[constraint.joint]], axis)
-            direction: ArrayLike = constraint.direction
+            direction: Any = constraint.direction
             if constraint.direction is None:
                 direction = np.asarray(constraint.point_m) - positions[:, joints[constraint.joint]]
             return angle_between(pointing, np.broadcast_to(direction, pointing.shape))
@@ -282,7 +282,7 @@ def test_what_the_model_has_not_is_refused_by_the_place_of_the_constraint(constr
     primitive, _ = walking()
     with pytest.raises(MotionError, match=message) as caught:
         build_objective(primitive, [RootPositionConstraint(at=0, target_m=(0.0, 0.0)), constraint], standard_joints())
-    assert caught.value.where.startswith("constraints[1]")
+    assert present(caught.value.where).startswith("constraints[1]")
 
 
 def test_a_heading_needs_hips_and_shoulders() -> None:

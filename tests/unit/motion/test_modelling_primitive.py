@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.present import present
 from tests.support.search_primitives import standard_joints, walking
 
 from marey_motion.arrays import Floats
@@ -51,6 +52,6 @@ def test_a_time_that_no_motion_of_the_model_reaches_is_refused() -> None:
     with pytest.raises(InvalidConstraint, match="last"):
         build_objective(
             primitive,
-            [KeyframeTimeConstraint(at="end", seconds=3.0 * primitive.duration_range_s[1])],
+            [KeyframeTimeConstraint(at="end", seconds=3.0 * present(primitive.duration_range_s)[1])],
             standard_joints(),
         )

@@ -34,7 +34,7 @@ pytestmark = DRAWN_MODELS
 def rendered(
     trained: TrainedPrimitive, subject: ModelSubject, figures: Mapping[str, DrawnFigure] | None = None, **options: Any
 ) -> str:
-    return render_model_report(trained, subject, figures or {}, **{"title": "Walk", "origin": ORIGIN, **options})
+    return render_model_report(trained, subject, figures or {}, **dict[str, Any](title="Walk", origin=ORIGIN) | options)
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.model_examples import walks
+from tests.support.present import present
 
 from marey_motion.alignment.aligned import AlignedSet, Recording
 from marey_motion.kinematics import forward_kinematics
@@ -26,7 +27,7 @@ def aligned() -> AlignedSet:
 
 @pytest.fixture(scope="module")
 def check(aligned: AlignedSet) -> SearchCheck:
-    return check_search(aligned, standard_joints(aligned), OPTIONS, seed=1)
+    return present(check_search(aligned, standard_joints(aligned), OPTIONS, seed=1))
 
 
 def test_every_fifth_example_but_never_the_reference_is_looked_for(aligned: AlignedSet, check: SearchCheck) -> None:
@@ -43,8 +44,8 @@ def test_refining_comes_nearer_than_the_samples_of_the_tree(check: SearchCheck) 
 
 def test_the_same_seed_finds_the_same(aligned: AlignedSet, check: SearchCheck) -> None:
     again = check_search(aligned, standard_joints(aligned), OPTIONS, seed=1)
-    assert np.array_equal(again.searched_cm, check.searched_cm)
-    assert np.array_equal(again.refined_cm, check.refined_cm)
+    assert np.array_equal(present(again).searched_cm, check.searched_cm)
+    assert np.array_equal(present(again).refined_cm, check.refined_cm)
 
 
 def test_places_where_the_other_examples_never_go_are_missed(aligned: AlignedSet) -> None:
@@ -53,7 +54,9 @@ def test_places_where_the_other_examples_never_go_are_missed(aligned: AlignedSet
     away = odd.motion._replace(root_translations=np.add(odd.motion.root_translations, (5.0, 0.0, 0.0)))
     clips = (aligned.clips[0], replace(odd, motion=away), *aligned.clips[2:])
     missed = check_search(replace(aligned, clips=clips), standard_joints(aligned), OPTIONS, seed=1)
-    of_odd = [error for uid, error in zip(missed.examples, missed.refined_cm, strict=True) if uid == odd.uid]
+    of_odd = [
+        error for uid, error in zip(present(missed).examples, present(missed).refined_cm, strict=True) if uid == odd.uid
+    ]
     assert min(of_odd) > 5.0
 
 

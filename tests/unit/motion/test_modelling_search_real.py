@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from tests.support.present import present
 
 from marey_motion.alignment.aligned import AlignedClip
 from marey_motion.alignment.aligning import SourceExample, align_clips
@@ -33,7 +34,7 @@ HELD_OUT_EVERY = 4
 def test_places_that_unseen_takes_reached_are_found_and_met(mocap: Path) -> None:
     files = sorted(mocap.glob("bandai-namco-2/*raise-up*right-hand*.bvh"))
     assert len(files) >= 20
-    clips = _on_one_skeleton([read_motion(file.read_bytes(), file.name).clip for file in files])
+    clips = _on_one_skeleton([present(read_motion(file.read_bytes(), file.name).clip) for file in files])
     mapping = map_joints(clips[0].skeleton)
     body = MatchingBody.from_mapping(clips[0].skeleton, mapping)
     examples = [SourceExample(file.stem, file.stem, clip) for file, clip in zip(files, clips, strict=True)]

@@ -112,7 +112,7 @@ def test_steps_end_where_they_were_asked_to() -> None:
         root = step.constraints[0]
         assert isinstance(root, RootPositionConstraint)
         place = positions[found.frame_of(number, step.primitive, "end"), [0, 2]]
-        reached = np.linalg.norm(place - root.target_m)
+        reached = np.linalg.norm(place - np.array(root.target_m, dtype=np.float64))
         np.testing.assert_allclose(reached, sequel.measured.errors[number][0], atol=5e-3)
         assert reached < 0.1
 
@@ -201,7 +201,9 @@ def test_inverse_kinematics_removes_what_is_left() -> None:
     assert set(finished.errors) == {(0, 0), (0, 1), (0, 2)}
     assert max(finished.errors.values()) < 2e-3
     wrist = finished.found.motion.positions(found.skeleton)[found.frame_of(0, step.primitive, "middle")]
-    np.testing.assert_allclose(wrist[standard_joints()["left_wrist"]], wanted[0].target_m, atol=1e-3)
+    np.testing.assert_allclose(
+        wrist[standard_joints()["left_wrist"]], np.array(wanted[0].target_m, dtype=np.float64), atol=1e-3
+    )
     pelvis = standard_joints()["pelvis"]
     before, after = (one.motion.positions(found.skeleton)[:, pelvis] for one in (found, finished.found))
     np.testing.assert_allclose(after, before, atol=1e-9)

@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.stats import multivariate_normal
 from tests.support.modelling_examples import aligned_set, bending_chains, chain, unit_poses, walks, warps
+from tests.support.present import present
 
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Recording
 from marey_motion.alignment.aligning import MIRRORED
@@ -28,7 +29,7 @@ from marey_motion.modelling.training import TrainedPrimitive, fit_examples, trai
 from marey_motion.modelling.training_warnings import warnings_of
 from marey_motion.modelling.verdict import headline_of, verdict_of
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
-from marey_schemas.options.modelling import ModelOptions
+from marey_schemas.options.modelling import ModelOptions, Scaling
 
 SCALINGS = ["jacobian", "root_max", "sfpca", "none"]
 QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
@@ -175,7 +176,7 @@ def test_signs_of_quaternions_do_not_matter() -> None:
 
 
 @pytest.mark.parametrize("scaling", SCALINGS)
-def test_training_gives_the_same_bytes_every_time_and_on_any_number_of_threads(scaling: str) -> None:
+def test_training_gives_the_same_bytes_every_time_and_on_any_number_of_threads(scaling: Scaling) -> None:
     aligned, options = walks(12, 30), ModelOptions(scaling=scaling)
     first = as_bytes(train_primitive(aligned, options, seed=3))
     assert as_bytes(train_primitive(aligned, options, seed=3)) == first
@@ -201,8 +202,8 @@ def test_what_a_left_out_example_loses_is_what_a_model_without_it_loses() -> Non
             reached = forward_kinematics(aligned.skeleton, unit_poses(basis.at_frames @ made)[frames])
             wanted = forward_kinematics(aligned.skeleton, fitted.poses[left_out, frames])
             error = 100.0 * np.linalg.norm(reached - wanted, axis=2).mean()
-            assert found.left_out_each_cm[left_out, count] == pytest.approx(error, abs=1e-6)
-    assert found.left_out_cm == pytest.approx(found.left_out_each_cm.mean(axis=0))
+            assert present(found.left_out_each_cm)[left_out, count] == pytest.approx(error, abs=1e-6)
+    assert found.left_out_cm == pytest.approx(present(found.left_out_each_cm).mean(axis=0))
 
 
 def test_all_examples_of_a_take_and_of_a_performer_are_left_out_together() -> None:
@@ -227,7 +228,7 @@ def test_all_examples_of_a_take_and_of_a_performer_are_left_out_together() -> No
     by_subject = [error_without(subjects == subjects[example], example) for example in range(12)]
     for example in range(12):
         expected = error_without(takes == takes[example], example)
-        assert found.left_out_each_cm[example, 2] == pytest.approx(expected, abs=1e-6)
+        assert present(found.left_out_each_cm)[example, 2] == pytest.approx(expected, abs=1e-6)
     assert found.left_out_subject_cm is not None
     assert found.left_out_subject_cm[2] == pytest.approx(np.mean(by_subject), abs=1e-6)
 
@@ -278,9 +279,9 @@ def test_the_diversity_of_one_sample_is_not_known() -> None:
 def test_more_components_lose_less_and_unseen_examples_lose_more() -> None:
     report = train_primitive(walks(24), ModelOptions(scaling="sfpca")).report
     errors = report.reconstruction
-    assert (np.diff(errors.training_cm) < 0.05).all()
-    assert (errors.left_out_cm >= errors.training_cm - 1e-9).all()
-    assert errors.training_cm[-1] < 0.2 * errors.training_cm[0]
+    assert (np.diff(present(errors).training_cm) < 0.05).all()
+    assert (present(present(errors).left_out_cm) >= present(errors).training_cm - 1e-9).all()
+    assert present(errors).training_cm[-1] < 0.2 * present(errors).training_cm[0]
     assert report.spatial_energy[-1] == pytest.approx(1.0)
 
 
@@ -320,12 +321,12 @@ def test_the_report_tells_of_feet_durations_and_likelihoods() -> None:
     aligned = walks(24)
     trained = train_primitive(aligned, seed=1)
     report = trained.report
-    assert report.training_feet.below_floor_share == 0.0
-    assert 0.0 < report.sample_feet.slide_m_s < 1.0
-    assert report.training_feet.slide_m_s < report.sample_feet.slide_m_s
+    assert present(report.training_feet).below_floor_share == 0.0
+    assert 0.0 < present(report.sample_feet).slide_m_s < 1.0
+    assert present(report.training_feet).slide_m_s < present(report.sample_feet).slide_m_s
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     assert report.training_durations.most_s == pytest.approx(durations.max())
-    assert report.held_out_log_likelihood < report.log_likelihood
+    assert present(report.held_out_log_likelihood) < report.log_likelihood
     assert np.mean([one.log_likelihood for one in report.examples]) == pytest.approx(report.log_likelihood)
     assert report.candidates[0].components == 1
     assert report.time_error_frames < 1.0
@@ -339,7 +340,7 @@ def test_feet_below_the_floor_are_told() -> None:
     poses = aligned.poses
     poses[..., 1] -= 0.1
     trained = train_primitive(aligned_set(aligned.skeleton, poses, aligned.time_functions))
-    assert trained.report.sample_feet.below_floor_share > 0.9
+    assert present(trained.report.sample_feet).below_floor_share > 0.9
     assert "feet-below-floor" in [warning.code for warning in trained.warnings]
 
 
@@ -425,6 +426,6 @@ def test_examples_that_make_no_model_are_refused_by_name() -> None:
         ("temporal_weight", np.inf),
     ],
 )
-def test_options_out_of_range_are_refused_by_name(name: str, value: object) -> None:
+def test_options_out_of_range_are_refused_by_name(name: str, value: Any) -> None:
     with pytest.raises(ValidationError, match=name):
         ModelOptions(**{name: value})

@@ -180,7 +180,7 @@ def test_nodes_that_make_no_tree_are_refused(sizes: list[int], children: list[in
 @pytest.mark.parametrize(
     ("field", "value"), [("samples", 0), ("branching", 1), ("leaf_size", 0), ("depth", 0), ("samples", 10**8)]
 )
-def test_options_out_of_range_are_refused_by_name(field: str, value: int) -> None:
+def test_options_out_of_range_are_refused_by_name(field: str, value: Any) -> None:
     with pytest.raises(ValidationError, match=field):
         TreeOptions(**{field: value})
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,8 +53,8 @@ def body_of(clip: Clip) -> MatchingBody:
     return MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
 
 
-def comparable(clip: Clip, **options: object) -> ComparableClip:
-    return prepare_comparison(clip, body_of(clip), METRIC, 60.0, name="clip", **options)  # type: ignore[arg-type]
+def comparable(clip: Clip, **options: Any) -> ComparableClip:
+    return prepare_comparison(clip, body_of(clip), METRIC, 60.0, name="clip", **options)
 
 
 def test_every_built_in_metric_is_one_of_its_own_and_knows_its_origin() -> None:
@@ -76,9 +77,9 @@ def test_every_built_in_metric_is_one_of_its_own_and_knows_its_origin() -> None:
         ({"frame_rate_hz": 0.0}, "frame_rate_hz"),
     ],
 )
-def test_a_metric_that_makes_no_sense_is_refused(changes: dict[str, object], message: str) -> None:
+def test_a_metric_that_makes_no_sense_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        MetricDocument(**{**dict(PAPER), **changes})
+        MetricDocument(**(dict(PAPER) | changes))
     with pytest.raises(ValueError, match="angles have no class hand"):
         MetricComponent(measurement="angles", shaping="euclid", constant=0, norm=1, weights={"hand": 1.0}, share=1)
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import nnls
+from scipy.optimize import nnls  # pyrefly: ignore[implicit-reexport]  # scipy collects its names when it runs
 from scipy.stats import spearmanr
 
 from marey_motion.arrays import Floats, Ints

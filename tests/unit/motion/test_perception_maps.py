@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import product
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -53,8 +53,8 @@ def walks() -> tuple[MeasuredClip, MeasuredClip]:
     return measured(generate_gait(1.3, 0.2, 1.2)), measured(generate_gait(2.1, -0.4, 0.9))
 
 
-def one_component(component: Component, **options: object) -> PerceptualMetric:
-    return replace(PerceptualMetric("one", (component,), (1.0,)), **options)  # type: ignore[arg-type]
+def one_component(component: Component, **options: Any) -> PerceptualMetric:
+    return replace(PerceptualMetric("one", (component,), (1.0,)), **options)
 
 
 def test_the_published_table_is_as_printed() -> None:
@@ -130,7 +130,8 @@ def test_maps_are_those_of_the_formulas(measurement: Measurement, shaping: Shapi
 
 
 def turned(points: Floats, angle: float) -> Floats:
-    return np.asarray(quaternions.rotate_vectors(quaternions.from_axis_angle((0.0, 1.0, 0.0), angle), points))
+    turn = quaternions.from_axis_angle((0.0, 1.0, 0.0), angle)
+    return np.asarray(quaternions.rotate_vectors(turn, points), dtype=np.float64)
 
 
 def squares_after_turn(angle: float, one: Floats, other: Floats) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support.judged_rigs import Actor, JudgedRetargeting, degrees_between, plan_between
+from tests.support.present import present
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import AnyFloats, Floats
@@ -446,7 +447,7 @@ def bones_followed_by_numpy(clip: Clip, joints: dict[str, int]) -> tuple[AnyFloa
 def test_bones_are_turned_to_the_bit_as_numpy_turns_them(studio: Actor) -> None:
     clip = with_moved_joints(studio, "left_elbow", "right_wrist", "left_knee", "right_ankle", "left_ankle")
     elbow, wrist = (clip.translated_joints.index(studio.joint(name)) for name in ("left_elbow", "right_wrist"))
-    translations = clip.translations.copy()
+    translations = present(clip.translations).copy()
     translations[5, elbow] = 0.0  # no length
     translations[7:11, elbow] *= -1.0
     translations[8, wrist] = -clip.skeleton.offsets[studio.joint("right_wrist")]  # half a circle
@@ -463,7 +464,7 @@ def test_bones_are_turned_to_the_bit_as_numpy_turns_them(studio: Actor) -> None:
 
 def test_a_bone_beyond_the_range_of_single_precision_does_not_turn(studio: Actor) -> None:
     clip = with_moved_joints(studio, "left_knee", "left_ankle", "left_toe")
-    translations = clip.translations.copy()
+    translations = present(clip.translations).copy()
     translations[5, :2] = 3e38  # ankle and toe are infinitely far away, so that the bone between them has no direction
     clip = replace(clip, translations=translations)
     joints = {name: studio.joint(name) for name in ("left_ankle", "left_toe")}
@@ -664,7 +665,7 @@ def test_real_soles_keep_their_height_over_the_floor(real: dict[str, Actor], fro
 
 def test_the_hip_height_of_a_rig_that_lies_folded_at_rest_is_that_of_its_legs(mocap: Path, studio: Actor) -> None:
     path = mocap / "rigs/game-engine/vis_example.bvh"  # its thighs are drawn above the pelvis at rest
-    folded = Actor(read_motion(path.read_bytes(), path.name).clip)
+    folded = Actor(present(read_motion(path.read_bytes(), path.name).clip))
     legs = [
         sum(np.linalg.norm(actor.skeleton.offsets[actor.joint(f"left_{joint}")]) for joint in ("knee", "ankle"))
         for actor in (folded, studio)

@@ -110,7 +110,7 @@ def test_hands_and_feet_of_a_cartwheel_are_kept_on_the_floor(mocap: Path) -> Non
     source, target = Actor.of(mocap, CARTWHEEL), Actor.of(mocap, RIGS["game"])
     plan = plan_between(source, target)
 
-    def made(**options: bool) -> tuple[float, dict[str, Any]]:
+    def made(**options: Any) -> tuple[float, dict[str, Any]]:
         result = retarget_with_checks(source.clip, plan, RetargetOptions(**options))
         lowest = kinematics.global_positions(result.clip, end_sites=True)[..., 1].min()
         return float(lowest), {check.code: check.values for check in result.checks}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.support.present import present
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import AnyFloats, Floats
@@ -268,9 +269,9 @@ def test_in_a_real_walk_bones_point_down_and_hinges_point_left_on_every_rig(moca
 
     path = mocap / file
     clip = read_motion(path.read_bytes(), path.name).clip
-    skeleton, mapping = clip.skeleton, map_joints(clip.skeleton)
+    skeleton, mapping = present(clip).skeleton, map_joints(present(clip).skeleton)
     axes = guess_axes(skeleton, mapping, clip)
-    positions, rotations = kinematics.global_positions(clip), kinematics.global_rotations(clip)
+    positions, rotations = kinematics.global_positions(present(clip)), kinematics.global_rotations(present(clip))
     hips = mapping.indices(skeleton, ("left_hip", "right_hip"))
     left = positions[:, hips[0]] - positions[:, hips[1]]
     left /= np.linalg.norm(left, axis=1, keepdims=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ from marey_motion.similarity.shard_search import SearchedShard
 from marey_motion.similarity.shards import Shard, presence, write_shard
 from marey_motion.similarity.similarity_kernels import pose_distance as pose_distance_kernel
 from marey_motion.similarity.weighing import metric_tables
-from marey_schemas.documents.metrics import built_in_metric
+from marey_schemas.documents.metrics import AngleMeasure, built_in_metric
 
 ALL = (1 << len(JOINTS)) - 1
 
@@ -178,7 +179,7 @@ def random_metric(rng: np.random.Generator, name: str) -> PerceptualMetric:
         weights[str(rng.choice(list(weights)))] = 1.0
         parts.append(replace(part, weights=weights, constant=float(rng.choice([0.0, 0.3]))))
     angle = rng.choice(["half_angle", "angle", "one_minus_dot"])
-    return replace(metric, components=tuple(parts), angle=str(angle))  # type: ignore[arg-type]
+    return replace(metric, components=tuple(parts), angle=cast(AngleMeasure, str(angle)))
 
 
 UGLY: dict[str, Callable[[np.random.Generator], list[np.ndarray]]] = {
@@ -254,7 +255,7 @@ def test_searches_of_real_clips_find_all_of_the_ten_nearest(tmp_path: Path, moca
     last = len(runs[2]) - 1 - int(offsets[-1])
     for start, shaping in ((0, "sigmoid"), (last, "euclid")):  # windows at both ends of a walk
         example = Example(PoseFeatures(runs[2][start + offsets], features[2].present), offsets)
-        metric = published_metric(shaping)  # type: ignore[arg-type]
+        metric = published_metric(shaping)
         found = search_windows([shard], example, metric, 10)
         expected = by_brute_force(runs, example, metric, 10)
         assert found[0][1:4] == (2, start, 0.0)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
+from typing import Any
 
 import pytest
 
@@ -15,8 +16,8 @@ from marey_schemas.queue.jobs import InputSpec
 from marey_schemas.queue.kind_declaration import KindDeclaration
 
 
-def declare(**fields: object) -> KindDeclaration:
-    stated: dict[str, object] = {
+def declare(**fields: Any) -> KindDeclaration:
+    stated: dict[str, Any] = {
         "name": "tidy",
         "description": "Tidies up.",
         "params": RetargetParams,
@@ -24,7 +25,7 @@ def declare(**fields: object) -> KindDeclaration:
         "version": 1,
         "outputs": {},
     }
-    return KindDeclaration(**{**stated, **fields})  # type: ignore[arg-type]
+    return KindDeclaration(**(stated | fields))
 
 
 TIDY = declare()
@@ -77,7 +78,7 @@ def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
 def test_other_distributions_add_kinds(installed: list[EntryPoint]) -> None:
     installed.append(entry(f"{__name__}:TIDY"))
     sys.modules[__name__] = sys.modules.get(__name__) or __import__("types").ModuleType(__name__)
-    sys.modules[__name__].TIDY = TIDY  # type: ignore[attr-defined]
+    vars(sys.modules[__name__])["TIDY"] = TIDY
     assert find_kind("tidy") is TIDY
 
 

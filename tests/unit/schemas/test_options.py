@@ -2,6 +2,7 @@
 
 import importlib
 import pkgutil
+from typing import Any
 
 import pytest
 from pydantic import BaseModel, ValidationError
@@ -65,6 +66,6 @@ def test_every_parameter_of_a_job_has_a_description(kind: KindDeclaration) -> No
 @pytest.mark.parametrize(
     "proposal", [StepsProposal(), VelocityMinimaProposal(joints=("Head",)), WristContactProposal()]
 )
-def test_a_proposal_that_was_made_in_python_is_understood_by_the_server(proposal: Options) -> None:
+def test_a_proposal_that_was_made_in_python_is_understood_by_the_server(proposal: Any) -> None:
     params = AnnotateParams(proposal=proposal)
     assert AnnotateParams.model_validate(params.model_dump(mode="json", exclude_unset=True)) == params

@@ -48,5 +48,5 @@ def test_objects_of_loaded_modules_are_not_searched_for_garbage() -> None:
 
 def test_an_import_that_fails_leaves_the_garbage_collector_on() -> None:
     with pytest.raises(ImportError), loading_modules():
-        import marey_no_such_module  # type: ignore[import-not-found]  # noqa: F401
+        import marey_no_such_module  # noqa: F401  # pyrefly: ignore[missing-import]  # it is missing
     assert gc.isenabled()

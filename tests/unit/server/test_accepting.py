@@ -125,9 +125,10 @@ def test_a_client_that_takes_nothing_is_cut_off_and_one_that_takes_a_little_is_n
         taken = 0
         while taken < 4 * LEAST_TAKEN_BYTES:
             taken += len(await sender.sock_recv(moving, LEAST_TAKEN_BYTES))
-        still, moved = server.streams
-        still.taken_bytes = 0  # type: ignore[attr-defined]
-        await until(lambda: moved.taken_bytes >= LEAST_TAKEN_BYTES)  # type: ignore[attr-defined]
+        streams: Any = server.streams
+        still, moved = streams
+        still.taken_bytes = 0
+        await until(lambda: moved.taken_bytes >= LEAST_TAKEN_BYTES)
         connections.close_slow(time.monotonic() + TIMEOUT_S)
         assert (still.closed(), moved.closed(), len(connections)) == (True, False, 1)
         connections.close_slow(time.monotonic() + 3 * TIMEOUT_S)
@@ -140,7 +141,7 @@ def test_an_idle_connection_makes_room_for_a_new_one() -> None:
     async def work(connections: Connections, server: Kept, connect: Callable[[], Awaitable[socket.socket]]) -> None:
         for number in range(5):
             await connect()
-            await until(lambda number=number: len(server.streams) > number)  # type: ignore[misc]
+            await until(lambda number=number: len(server.streams) > number)
         assert [stream.closed() for stream in server.streams] == [True, False, False, False, False]
         assert len(connections) == 4
 
@@ -163,7 +164,7 @@ def test_addresses_of_one_network_share_the_connections_of_one_address() -> None
     async def work(connections: Connections, server: Kept, connect: Callable[[], Awaitable[socket.socket]]) -> None:
         for number in range(3):
             await connect()
-            await until(lambda number=number: len(server.streams) > number)  # type: ignore[misc]
+            await until(lambda number=number: len(server.streams) > number)
         assert [stream.closed() for stream in server.streams] == [True, False, False]
         assert len(connections) == 2
 

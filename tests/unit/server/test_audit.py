@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import sqlalchemy
+import sqlalchemy.event
 from alembic import command
 from sqlalchemy import func, insert, select
 from tests.support.database_fixtures import AdjustableClock

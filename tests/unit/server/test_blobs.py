@@ -54,7 +54,8 @@ def test_a_document_shares_what_it_names_with_the_readers_of_its_project(lab: La
 
 def test_nobody_gets_bytes_by_naming_their_digest(lab: Lab) -> None:
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
-    for body in ({"figures": [{"blob": DIGEST}]}, {"blob": DIGEST}):
+    bodies: tuple[dict[str, Any], ...] = ({"figures": [{"blob": DIGEST}]}, {"blob": DIGEST})
+    for body in bodies:
         with pytest.raises(ConflictProblem) as refused:
             study(lab, lab.owner, **body)
         assert refused.value.context == {"missing": [DIGEST]}

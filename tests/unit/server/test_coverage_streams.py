@@ -138,12 +138,11 @@ def test_lists_show_the_newest_first_without_what_is_only_needed_to_go_on(lab: L
 
 
 def test_a_project_has_so_many_streams_and_no_more(lab: Lab) -> None:
-    for _ in range(MOST_STREAMS):
-        last = lab.write(coverage_streams.create_stream, "lab", NEW)
+    made = [lab.write(coverage_streams.create_stream, "lab", NEW) for _ in range(MOST_STREAMS)]
     with pytest.raises(ConflictProblem) as refused:
         lab.write(coverage_streams.create_stream, "lab", NEW)
     assert refused.value.error_code == "too-many-streams"
-    lab.write(coverage_streams.delete_stream, "lab", last.id)
+    lab.write(coverage_streams.delete_stream, "lab", made[-1].id)
     lab.write(coverage_streams.create_stream, "lab", NEW)
 
 

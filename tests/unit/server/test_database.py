@@ -8,6 +8,7 @@ from typing import Any
 import psycopg
 import pytest
 import sqlalchemy
+import sqlalchemy.exc
 from sqlalchemy import Column
 from sqlalchemy.engine.default import DefaultDialect
 

@@ -7,7 +7,7 @@ import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import pytest
 from hypothesis import HealthCheck, Phase, settings
@@ -380,7 +380,7 @@ def known_items(lab: Lab) -> dict[str, str]:
 
 def run(lab: Lab, known: dict[str, str], count: int, length: int) -> None:
     run_state_machine_as_test(
-        lambda: DatasetMachine(lab, known),  # type: ignore[arg-type]
+        cast(Any, lambda: DatasetMachine(lab, known)),
         settings=settings(
             max_examples=count, stateful_step_count=length, deadline=None, print_blob=False, report_multiple_bugs=False,
             suppress_health_check=list(HealthCheck), phases=[Phase.explicit, Phase.generate],

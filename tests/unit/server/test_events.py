@@ -2,6 +2,7 @@
 
 import pytest
 from tests.support.database_fixtures import AdjustableClock
+from tests.support.present import present
 from tests.support.store_fixtures import Lab, declared
 
 from marey_schemas.access import ProjectChange, ProjectCreate
@@ -138,7 +139,7 @@ def test_a_key_stands_for_one_request_of_one_caller(lab: Lab) -> None:
     with pytest.raises(InvalidProblem) as refused:
         lab.write(once, fingerprint="other")
     assert refused.value.error_code == "idempotency-key-reused"
-    admin = Principal("user", lab.owner.user_id + "x", "o", administrator=True, scopes=lab.owner.scopes)
+    admin = Principal("user", present(lab.owner.user_id) + "x", "o", administrator=True, scopes=lab.owner.scopes)
     assert lab.write(once, who=admin) is None
     assert count(lab) == 2
 

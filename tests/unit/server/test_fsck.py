@@ -5,7 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 import sqlalchemy
+import sqlalchemy.exc
 from sqlalchemy import ScalarSelect
+from tests.support.present import present
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.encoding import blocks
@@ -59,12 +61,12 @@ def damage(lab: Lab, *statements: Any) -> None:
     with lab.database.engine.connect() as connection:
         driver = connection.connection.driver_connection
         if lab.database.is_sqlite:
-            driver.execute("PRAGMA foreign_keys = OFF")
+            present(driver).execute("PRAGMA foreign_keys = OFF")
         with connection.begin():
             for statement in statements:
                 assert connection.execute(statement).rowcount > 0
         if lab.database.is_sqlite:
-            driver.execute("PRAGMA foreign_keys = ON")
+            present(driver).execute("PRAGMA foreign_keys = ON")
 
 
 def test_a_sound_store_has_no_findings(full: FullLab) -> None:

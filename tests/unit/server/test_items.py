@@ -499,7 +499,7 @@ def test_nobody_refers_to_stored_arrays_by_their_digest(lab: Lab, rig: Item) -> 
 
 
 def test_documents_of_other_kinds_hold_anything(lab: Lab) -> None:
-    study = {"schema": "marey/document@1", "n": [1, 2.5, None, True, "é"], "big": 2**62}
+    study: dict[str, Any] = {"schema": "marey/document@1", "n": [1, 2.5, None, True, "é"], "big": 2**62}
     study["a/b~c"] = {"x": np.arange(4, dtype="<i8")}
     made = lab.write(items.create_item, "lab", Kind.CHARACTER, ItemCreate(name="s", parts={"character": study}))
     back = lab.read(items.read_part, "lab", Kind.CHARACTER, made.id, "character", arrays="decoded").tree
@@ -531,7 +531,7 @@ def test_readers_read_contributors_change_maintainers_delete(lab: Lab, rig: Item
             (can_change, write_as, items.put_part, "info", {}),
             (can_delete, delete_as, items.delete_item),
         ):
-            expected = {} if run is read_as else {"expected_rev": None}
+            expected: dict[str, Any] = {} if run is read_as else {"expected_rev": None}
             with pytest.raises(refusal) if refusal else nullcontext():
                 run(function, "lab", Kind.CLIP, clip.id, *more, **expected)
     restoring = declared("POST", "/projects/{project}/{kind}/{item}/restore")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import HealthCheck, Phase, settings
@@ -225,7 +225,7 @@ class CommittingMachine(RuleBasedStateMachine):
 
 def run(desk: Desk, count: int, length: int) -> None:
     run_state_machine_as_test(
-        lambda: CommittingMachine(desk),  # type: ignore[arg-type]
+        cast(Any, lambda: CommittingMachine(desk)),
         settings=settings(
             max_examples=count, stateful_step_count=length, deadline=None, print_blob=False, report_multiple_bugs=False,
             suppress_health_check=list(HealthCheck), phases=[Phase.explicit, Phase.generate],

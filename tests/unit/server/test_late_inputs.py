@@ -12,6 +12,7 @@ from marey_schemas.access import ProjectCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_kinds
 from marey_schemas.queue.jobs import InputSpec, JobCreate
+from marey_schemas.queue.scripts import ScriptDeclaration
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import items, projects
@@ -353,6 +354,17 @@ def test_a_kind_that_the_server_has_forgotten_fails_its_job_and_not_the_maker(
     make(desk, maker, "a")
     assert desk.state(maker) == "succeeded"
     assert failure_of(desk, job)[1] == "unknown-kind"
+
+
+def test_a_script_whose_declaration_is_not_valid_any_more_fails_its_job_and_not_the_maker(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maker = desk.submit("sum")
+    (job,) = desk.submit_many(squares_of(maker))
+    monkeypatch.setattr(late_inputs, "kind_of_job", lambda name, params: ScriptDeclaration.model_validate({}))
+    make(desk, maker, "a")
+    assert desk.state(maker) == "succeeded"
+    assert failure_of(desk, job)[1] == "invalid-params"
 
 
 @pytest.mark.parametrize(

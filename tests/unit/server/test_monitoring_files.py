@@ -28,7 +28,7 @@ def known() -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for metric in declared_metrics():
         labels = set(metric._labelnames) | OF_PROMETHEUS
-        endings = {"counter": ["_total"], "histogram": ["_bucket", "_count", "_sum"]}.get(metric._type, [""])
+        endings = {"counter": ["_total"], "histogram": ["_bucket", "_count", "_sum"]}.get(str(metric._type), [""])
         found |= {metric._name + ending: labels for ending in endings}
     return found
 

@@ -7,6 +7,7 @@ import gc
 import importlib
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -24,9 +25,9 @@ def imports_in(function: ast.FunctionDef) -> set[int]:
 
 
 @pytest.mark.parametrize("module", [annotating, importing], ids=lambda module: module.__name__.rpartition(".")[2])
-def test_threads_of_the_server_import_the_motion_library_one_at_a_time(module: object) -> None:
+def test_threads_of_the_server_import_the_motion_library_one_at_a_time(module: ModuleType) -> None:
     """Without the lock, one of two concurrent requests failed, but so rarely that it could be overlooked."""
-    tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))  # type: ignore[attr-defined]
+    tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     found = set().union(*map(imports_in, functions))
     alone = {

@@ -4,7 +4,7 @@ import base64
 import hashlib
 import json
 import re
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from jsonschema import Draft202012Validator
@@ -92,7 +92,7 @@ def test_the_page_shows_every_operation_and_asks_nobody_else() -> None:
 
 def test_no_two_resources_share_an_address() -> None:
     with pytest.raises(ValueError, match="two resources have the path"):
-        RouteTable(None, [*RESOURCES, RESOURCES[0]])
+        RouteTable(cast(Any, None), [*RESOURCES, RESOURCES[0]])
 
 
 def test_every_body_and_answer_has_a_schema() -> None:

@@ -129,7 +129,7 @@ def pod_of(desk: Desk, job_id: str) -> Principal:
 
 
 def claim(desk: Desk, caller: Principal, **fields: Any) -> list[Lease]:
-    request = ClaimRequest(**{"worker": "pod", "kinds": tuple(KINDS), "labels": YES, **fields})
+    request = ClaimRequest(**dict[str, Any](worker="pod", kinds=tuple(KINDS), labels=YES) | fields)
     return desk.database.write(caller, queue.claim, request, desk.policy)
 
 

@@ -213,7 +213,7 @@ def test_a_keeper_ends_if_it_is_cancelled_while_the_engine_answers(pool: Pool) -
             keeping.cancel()
             return await listed()
 
-        pool.launcher.list = list_and_cancel  # type: ignore[method-assign]
+        pool.launcher.list = list_and_cancel  # pyrefly: ignore[method-assign]  # of this launcher only
         ended, _ = await asyncio.wait((keeping,), timeout=5)
         keeping.cancel()
         assert ended == {keeping}

@@ -90,7 +90,7 @@ def test_every_item_knows_its_file_until_its_content_changes(imported: Mapping[s
         ("skeleton hik (171 cm)", "skeleton_model", "body_skeleton_model.json"),
         ("processed walk_aligned", "alignment", "walk_aligned_alignment.json"),
     ):
-        beside = unchanged_original(imported[key].kind, imported[key].parts, PredecessorOptions(part=part))  # type: ignore[arg-type]
+        beside = unchanged_original(imported[key].kind, imported[key].parts, PredecessorOptions(part=part))
         assert beside is not None
         assert (beside.name, beside.blob) == (name, BESIDE)
     annotation = imported["annotation walk imported"]

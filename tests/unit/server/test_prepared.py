@@ -10,6 +10,7 @@ from typing import Any
 import psycopg
 import pytest
 from sqlalchemy import bindparam, delete, exc, false, insert, select, tuple_, update
+from tests.support.present import present
 
 from marey_server import store
 from marey_server.access.principal import SYSTEM
@@ -151,7 +152,7 @@ def test_after_a_restart_of_the_database_every_resting_connection_is_made_anew(d
 @on_postgres
 def test_a_broken_connection_is_told_as_such(database: Database) -> None:
     with database.engine.connect() as connection:
-        connection.connection.driver_connection.close()
+        present(connection.connection.driver_connection).close()
         with pytest.raises(exc.DBAPIError) as failed:
             SOME.run(connection, {"kinds": ["made"]})
     assert failed.value.connection_invalidated

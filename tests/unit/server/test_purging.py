@@ -715,7 +715,9 @@ def test_chunks_are_read_once_however_many_versions_share_them(house: House, mon
         return decode_trusted(digest, data)
 
     monkeypatch.setattr(versions, "decode_trusted", counting)
-    assert house.purge(item=many[0], preview=True).refused[0].holders[0].commits == 1  # type: ignore[union-attr]
+    (holder, *_) = house.purge(item=many[0], preview=True).refused[0].holders
+    assert isinstance(holder, DatasetHolder)
+    assert holder.commits == 1
     assert len(read) == len(set(read))
 
 

@@ -187,7 +187,7 @@ def test_a_version_that_another_dataset_has_stays_and_is_not_held(gaits: Committ
 
     def copy(tx: Transaction) -> None:
         row = tx.execute(select(dataset_commit)).one()
-        tx.execute(insert(dataset_commit).values(**{**row._mapping, "dataset_id": other.id, "write_id": None}))
+        tx.execute(insert(dataset_commit).values(**(row._asdict() | {"dataset_id": other.id, "write_id": None})))
 
     gaits.write(copy)
     job = gaits.desk.submit("square", inputs={"things": ({"dataset": "gaits", "version": "main"},)})

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from tests.support.present import present
 from tests.support.queue_desk import Desk
 
 from marey_schemas.access import ProjectCreate
@@ -288,7 +289,7 @@ def test_a_failed_job_rests_longer_each_time_and_then_has_failed(desk: Desk) -> 
     for _ in range(3):
         rests.append(desk.fail(desk.claim(), detail="no luck").retry_in_s)
         assert desk.claim_many() == []
-        desk.clock.advance(rests[-1] + 1)
+        desk.clock.advance(present(rests[-1]) + 1)
     assert rests == [10, 40, 160]
     desk.fail(desk.claim(), detail="no luck")
     failure = desk.job(job).failure

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import HealthCheck, Phase, settings
@@ -385,10 +385,10 @@ def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     numbers = itertools.count(1)
     for module in (layout, retrying):
         monkeypatch.setattr(module, "new_id", lambda prefix: f"{prefix}_{next(numbers):08}")
-    desk.database.clock = clock
+    desk.database.clock = cast(Any, clock)
     desk.things(4)
     run_state_machine_as_test(
-        lambda: QueueMachine(desk, clock),  # type: ignore[arg-type]
+        cast(Any, lambda: QueueMachine(desk, clock)),
         settings=settings(
             max_examples=examples(15),
             stateful_step_count=steps(40),

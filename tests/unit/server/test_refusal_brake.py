@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
+from typing import Any
 from unittest import mock
 
 import pytest
@@ -23,11 +24,11 @@ from marey_server.process.refusal_brake import (
 )
 
 
-def in_a_loop(function: Callable[[], Awaitable[None]]) -> Callable[[], None]:
+def in_a_loop(function: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[], None]:
     """Return a synchronous test function that runs an asynchronous one in an event loop."""
 
     def run() -> None:
-        asyncio.run(function())  # type: ignore[arg-type]
+        asyncio.run(function())
 
     run.__name__ = function.__name__
     return run

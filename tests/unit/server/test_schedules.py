@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from sqlalchemy import select, update
+from tests.support.present import present
 from tests.support.queue_desk import Desk
 
 from marey_schemas.access import EndTokens, MemberChange, Role, UserChange, UserCreate
@@ -30,7 +31,7 @@ HOUR_S = 3600.0
 
 
 def us_of(*parts: int, zone: str = "UTC") -> int:
-    return int(datetime(*parts, tzinfo=ZoneInfo(zone)).timestamp()) * 1_000_000  # type: ignore[misc, arg-type]
+    return int(datetime(*parts, tzinfo=ZoneInfo(zone)).timestamp()) * 1_000_000
 
 
 @pytest.mark.parametrize(
@@ -79,7 +80,7 @@ def test_invalid_times_are_refused_with_their_place(cron: str, zone: str, pointe
 
 
 def create(desk: Desk, name: str = "hourly", **fields: Any) -> Schedule:
-    request = ScheduleCreate(name=name, **{"cron": "0 * * * *", "job": JobCreate(kind="errand"), **fields})
+    request = ScheduleCreate(name=name, **dict[str, Any](cron="0 * * * *", job=JobCreate(kind="errand")) | fields)
     return desk.database.write(desk.user, managing.create_schedule, "lab", request)
 
 
@@ -168,7 +169,7 @@ def test_a_schedule_over_a_folder_is_refused_when_its_author_has_submitted_too_m
         desk.clock.advance(HOUR_S)
         firing.submit_due(desk.database)
         shown = read(desk).problem
-        assert shown is None if problem is None else problem in shown
+        assert shown is None if problem is None else problem in present(shown)
     assert len(jobs_of(desk)) == 1 + 2  # one job with two tasks
 
 
@@ -255,14 +256,15 @@ def test_who_sets_the_job_or_resumes_the_schedule_is_its_author(desk: Desk) -> N
 
 
 def test_a_refused_job_changes_nothing(desk: Desk) -> None:
-    for fields in (
+    refused_fields: tuple[dict[str, Any], ...] = (
         {"job": JobCreate(kind="unknown")},
         {"job": JobCreate(kind="errand", params={"number": "many"})},
         {"job": JobCreate(kind="errand", after=("job_x",))},
         {"job": JobCreate(kind="square", inputs={"things": JobOutputsInput(job="job_x")})},
         {"cron": "0 3 * * 9"},
         {"timezone": "Nowhere"},
-    ):
+    )
+    for fields in refused_fields:
         with pytest.raises(InvalidProblem) as refused:
             create(desk, **fields)
         pointer = refused.value.errors[0].pointer

@@ -76,7 +76,7 @@ def test_leases_of_two_heartbeats_are_taken() -> None:
 @pytest.mark.parametrize("given", [{"audit_days": 364}, {"audit_days": 1, "events_days": 2}, {"events_days": 0}])
 def test_audit_entries_cannot_end_before_other_events(given: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=r"audit_days\n.* at least events_days"):
-        Settings(**{"audit_days": 9, **given})
+        Settings(**dict[str, Any](audit_days=9) | given)
 
 
 def test_audit_entries_may_be_kept_longer_or_for_ever() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from tests.support.database_fixtures import AdjustableClock
+from tests.support.present import present
 from tests.support.store_fixtures import Lab, declared
 from tests.support.tiers import steps
 
@@ -131,10 +132,10 @@ def test_every_motion_is_shown_equally_often_and_a_timeout_is_not_counted(lab: L
     first = lab.database.write(who, trials.open_trial).trial
     clock.advance(SECONDS + 0.1)
     second = lab.database.write(who, trials.open_trial)
-    assert (second.trial.number, second.remaining) == (first.number + 1, 9)
-    assert second.trial.clips != first.clips, "a new random set"
+    assert (present(second.trial).number, second.remaining) == (present(first).number + 1, 9)
+    assert present(second.trial).clips != present(first).clips, "a new random set"
     while (step := lab.database.write(who, trials.open_trial)).trial is not None:
-        lab.database.write(who, trials.answer_trial, step.trial.number, TrialAnswer(chosen=(0, 1)))
+        lab.database.write(who, trials.answer_trial, present(step.trial).number, TrialAnswer(chosen=(0, 1)))
     one = judged(lab, study)
     planned = Counter(motion for trial in one.trials if trial.index or trial.number == 1 for motion in trial.shown)
     assert set(planned.values()) == {6}

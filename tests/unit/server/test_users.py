@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import sqlalchemy
 from tests.support.database_fixtures import AdjustableClock
+from tests.support.present import present
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.access import NewToken, TokenCreate, UserChange, UserCreate
@@ -50,7 +51,7 @@ def test_a_password_that_was_changed_while_it_was_checked_signs_nobody_in(databa
     change = UserChange(password="battery staple")
     database.write(chief, users.change_user, "ann", change, expected_rev=None, password_hash=new)
     with pytest.raises(UnauthenticatedProblem):
-        database.read(ANONYMOUS, users.authenticated, "ann", verified)
+        database.read(ANONYMOUS, users.authenticated, "ann", present(verified))
 
 
 def sign_up(database: Database, chief: Principal, name: str, password: str | None = None) -> Principal:
@@ -64,7 +65,7 @@ def check(database: Database, name: str, password: str) -> Principal:
     stored = database.read(ANONYMOUS, users.stored_hash, name)
     if not passwords.password_matches(password, stored):
         raise users.wrong_password()
-    return database.read(ANONYMOUS, users.authenticated, name, stored)
+    return database.read(ANONYMOUS, users.authenticated, name, present(stored))
 
 
 def test_the_first_administrator_is_made_once(database: Database, chief: Principal) -> None:
@@ -196,7 +197,7 @@ def test_a_token_that_would_outlive_its_creator_is_refused_with_the_latest_date(
         ForbiddenProblem, match=f"ends on {held.expires_at:%Y-%m-%d at %H:%M} UTC, in {words}"
     ) as refused:
         make_token(database, caller, expires_in_s=None)
-    assert refused.value.context["latest"] == held.expires_at.isoformat()
+    assert refused.value.context["latest"] == present(held.expires_at).isoformat()
 
 
 def test_a_chain_of_tokens_never_widens(database: Database, chief: Principal) -> None:

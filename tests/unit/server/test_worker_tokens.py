@@ -4,6 +4,7 @@ import stat
 from pathlib import Path
 
 import pytest
+from tests.support.present import present
 
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import UnauthenticatedProblem
@@ -58,5 +59,5 @@ def test_other_labels_or_an_unusable_file_lead_to_a_new_token(database: Database
 def test_a_revoked_token_is_replaced(database: Database, file: Path) -> None:
     first = keep(database, file)
     admin = database.read(SYSTEM, users.administrator_principal)
-    database.write(admin, tokens.revoke_token, holder(database, first).token_id)
+    database.write(admin, tokens.revoke_token, present(holder(database, first).token_id))
     assert keep(database, file) != first

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, cast
 
 import pytest
 from hypothesis import example, given, settings
@@ -64,7 +65,7 @@ def merge(
     resolutions: Mapping[str, Side] | Sequence[tuple[str, Side] | tuple[str, Side, str | None]] = (),
 ) -> tuple[State, MergedEntries]:
     pairs = list(resolutions.items()) if isinstance(resolutions, Mapping) else resolutions
-    choices = [Choice(*one) for one in pairs]
+    choices = [Choice(*cast(Any, one)) for one in pairs]
     merged = merge_entries(compared(base, ours), compared(base, theirs), choices)
     result: dict[str, Value | None] = {**ours, **merged.changes}
     return {key: value for key, value in result.items() if value is not None}, merged

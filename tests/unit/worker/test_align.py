@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support.alignment_examples import walk, warped_walks
+from tests.support.present import present
 from tests.support.project_in_memory import ProjectInMemory, add_clip
 
 from marey_motion import documents
@@ -102,12 +103,12 @@ def test_every_clip_becomes_an_aligned_one_with_the_way_back(project: Project) -
         assert output.collection == "walks"
         assert output.tags == ("walk",)
         assert len(motion.poses) == len(info.time_function) == 60
-        assert info.clip.item == row["item"]
-        assert info.reference.item == "clip_a"
+        assert present(info.clip).item == row["item"]
+        assert present(info.reference).item == "clip_a"
         assert info.set == result["set"]
         assert info.cost == row["cost"]
-        assert info.options.reference == "clip_a"
-        assert {source.item for source in output.sources["clips"]} == {info.clip.item, "clip_a"}
+        assert present(info.options).reference == "clip_a"
+        assert {source.item for source in output.sources["clips"]} == {present(info.clip).item, "clip_a"}
 
 
 def test_what_is_staged_makes_up_the_aligned_set_again(project: Project) -> None:
@@ -195,7 +196,7 @@ def test_mirrored_twins_are_named_after_their_clips(project: Project) -> None:
     assert sorted(output.item_name for output in project.staged) == sorted(
         name + end for name in NAMES for end in ("", " mirrored")
     )
-    assert infos(project)["b mirrored"].clip.mirrored
+    assert present(infos(project)["b mirrored"].clip).mirrored
 
 
 def test_weights_may_go_by_standard_names(project: Project) -> None:

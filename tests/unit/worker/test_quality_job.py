@@ -5,7 +5,7 @@ import io
 from dataclasses import replace
 from math import radians
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -141,7 +141,7 @@ def test_results_under_other_conditions_are_not_compared_and_the_command_is_told
             id = "job_1"
             result = {"conditions": conditions.model_dump(mode="json"), "totals": totals}  # noqa: RUF012
 
-        return Quality(None, Ended())  # type: ignore[arg-type]
+        return Quality(cast(Any, None), cast(Any, Ended()))
 
     with pytest.raises(
         NotComparable, match=r"rate_hz is 60\.0 and 30\.0.*`marey quality … --rate-hz 60\.0 --floor zero"

@@ -9,6 +9,7 @@ import psutil
 import pytest
 from tests.support.attached_worker import StartWorker
 from tests.support.fake_server import FakeServer
+from tests.support.present import present
 
 from marey_client.credentials import write_private
 from marey_schemas.encoding.digests import digest_of
@@ -335,7 +336,7 @@ def test_on_sigterm_an_idle_worker_exits_with_success(server: FakeServer, start_
 def test_a_worker_stops_when_whoever_started_it_has_gone(server: FakeServer, start_worker: StartWorker) -> None:
     worker = start_worker()
     server.ended(server.submit("add", {"a": 1, "b": 1}))
-    worker.process.stdin.close()
+    present(worker.process.stdin).close()
     assert worker.process.wait(30) == 0
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tarfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO, NamedTuple
 
@@ -256,7 +256,7 @@ def _manifest(data: bytes) -> Manifest:
 
 
 def _facets(member: ArchiveMember, tree: Any) -> dict[str, dict[str, float]]:
-    by_content = tree.items() if isinstance(tree, dict) else [("", None)]
+    by_content: Iterable[tuple[str, Any]] = tree.items() if isinstance(tree, dict) else [("", None)]
     for content, values in by_content:
         named: dict[str, Any] = values if isinstance(values, dict) and is_digest(content) else {"": None}
         numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in named.values())

@@ -87,7 +87,7 @@ def _judgements(study: StudyDocument, people: Sequence[JudgingParticipant]) -> J
 def _measured(context: Context, study: StudyDocument) -> tuple[list[PairDifferences], list[str]]:
     """Measure all pairs of motions; without an exception, return why this is impossible."""
     try:
-        clips = [_measure(context, one.clip) for one in study.motions]  # type: ignore[arg-type]
+        clips = [_measure(context, one.revision) for one in study.motions]
         counts = np.array([clip.frame_count for clip in clips])
         if (cells := int(counts.sum()) ** 2 // 2) > MOST_TABLE_CELLS:
             raise MotionError(f"the motion maps of all pairs have {cells:,} cells; use shorter motions")

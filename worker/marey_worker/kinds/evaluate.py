@@ -88,13 +88,14 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
         result = assemble(database, options, trials, records, replicates=replicates, baseline=baseline)
         if (metric := read_metric(context, params.metric)) is not None:
             result = replace(result, perceived=PerceivedRows(database, metric).transitions(result.switches))
+    headline = headline_of(result)
     evaluation = {
         **result_to_tree(result),
         "normaliser": database.normaliser.as_tree(),
         "clip_set": wanted_clips(context, params).as_tree(),
         "verdict": verdict(result),
         "regions": [region.model_dump() for region in region_verdicts(result)],
-        "headline": headline_of(result),
+        "headline": headline,
     }
     parts = {"evaluation": evaluation, "records": records_to_tree(trials, records)}
     if params.report:
@@ -106,7 +107,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     context.publish_facets(facets_of(result, context.inputs["clips"]))
     simulating_s = round(sum(one["seconds"] for one in results), 4)
     perceived = {} if result.perceived is None else {"perceived": asdict(result.perceived)}
-    return {"verdict": evaluation["verdict"], **evaluation["headline"], **perceived, "simulating_s": simulating_s}
+    return {"verdict": evaluation["verdict"], **headline, **perceived, "simulating_s": simulating_s}
 
 
 def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:

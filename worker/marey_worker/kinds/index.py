@@ -211,7 +211,7 @@ class _Writer:
         listed.write_text(clips.model_dump_json(), "utf-8")
         write_shard(poses, self._runs)
         self._entries.append(
-            IndexShard(clips=self._sent(listed), poses=self._sent(poses), rows=sum(clips.rows))
+            IndexShard(clips=self._sent(listed), poses=self._sent(poses), rows=int(sum(clips.rows)))
         )  # fmt: skip
         self._runs, self._facts = [], []
 

@@ -75,9 +75,9 @@ def _row(row: SweepRow) -> dict[str, Any]:
 
 def _row_of(tree: Mapping[str, Any]) -> SweepRow:
     weights = FeatureWeights.model_construct(**tree["weights"])
-    return SweepRow(**{**tree, "weights": weights, "confirming": tuple(tree["confirming"])})
+    return SweepRow(**(dict(tree) | {"weights": weights, "confirming": tuple(tree["confirming"])}))
 
 
 def _influence(influence: Influence) -> dict[str, Any]:
     tree, confirmed = asdict(influence), influence.confirmed
-    return tree if confirmed is None else {**tree, "confirmed": {**tree["confirmed"], "verdict": confirmed.verdict}}
+    return tree if confirmed is None else {**tree, "confirmed": {**asdict(confirmed), "verdict": confirmed.verdict}}

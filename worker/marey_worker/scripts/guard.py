@@ -78,7 +78,7 @@ def main() -> None:
     result = int(sys.argv[1])
     os.set_inheritable(result, False)
     given = json.load(sys.stdin)
-    order = GuardedCommand(**{**given, "argv": tuple(given["argv"])})
+    order = GuardedCommand(**(given | {"argv": tuple(given["argv"])}))
     die_with_parent()
     _take_precedence()
     adopt_orphans()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -188,10 +188,10 @@ def _sorted(items: Sequence[ItemHandle], column: str, *, reverse: bool) -> list[
     """Sort items by a column; items without a value come last in either order."""
     if column == "name":
         return list(reversed(items)) if reverse else list(items)
-    values = {one.id: _value(one.item, column) for one in items}
+    values: dict[str, Any] = {one.id: _value(one.item, column) for one in items}
     with_value = [one for one in items if values[one.id] not in (None, "")]
     without = [one for one in items if values[one.id] in (None, "")]
-    return [*sorted(with_value, key=lambda one: values[one.id], reverse=reverse), *without]  # type: ignore[arg-type, return-value]
+    return [*sorted(with_value, key=lambda one: values[one.id], reverse=reverse), *without]
 
 
 def _show_deleted(

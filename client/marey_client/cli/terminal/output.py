@@ -102,6 +102,6 @@ def _plain(value: Any) -> Any:
         return model.model_dump(mode="json", by_alias=True)
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     return value

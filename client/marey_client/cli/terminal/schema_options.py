@@ -189,14 +189,14 @@ class _Option:
     def _type(self) -> Any:
         if self._form == "choice":
             values = self._schema.get("enum") or [self._schema["const"]]
-            return Literal[tuple(values)] | None
+            return Literal[tuple(values)] | None  # pyrefly: ignore[invalid-literal]  # the choices come from a schema
         plain = {"integer": int, "number": float, "boolean": bool, "texts": list[str], "assignments": list[str]}
         return plain.get(self._form, str) | None
 
     @property
     def _metavar(self) -> str | None:
         if self._form == "choices":
-            return ",".join(self._schema["items"]["enum"])
+            return ",".join(map(str, self._schema["items"]["enum"]))
         written = {"texts": "TEXT", "numbers": "NUMBERS", "assignments": "NAME=NUMBER", "number or none": "NUMBER"}
         return written.get(self._form)
 
@@ -241,7 +241,7 @@ def _expanded(function: Callable[..., Any], groups: Mapping[str, OptionsOf]) -> 
         else:
             parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
     run.__name__, run.__doc__ = function.__name__, function.__doc__
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature(parameters)  # pyrefly: ignore[missing-attribute]  # read by `inspect`
     run.__annotations__ = {one.name: one.annotation for one in parameters}
     return run
 

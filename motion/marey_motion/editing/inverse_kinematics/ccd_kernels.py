@@ -42,7 +42,7 @@ STAYING = 1e-9
 
 
 @compiled
-def _pair_up(targets, frame, k, body, place, tips, turns, matrix):  # type: ignore[no-untyped-def]
+def _pair_up(targets, frame, k, body, place, tips, turns, matrix):
     """Fill `matrix` (3, 3) with the sum Σ w·b·aᵀ over the pairs of vectors (a, b) that the targets define for joint k.
 
     Joint k rotates the vector a, and the target is reached when a coincides with b. The weight w is the squared scale
@@ -84,14 +84,14 @@ def _pair_up(targets, frame, k, body, place, tips, turns, matrix):  # type: igno
 
 
 @compiled
-def _add_pair(matrix, weight, a, b):  # type: ignore[no-untyped-def]
+def _add_pair(matrix, weight, a, b):
     for i in range(3):
         for j in range(3):
             matrix[i, j] += weight * b[i] * a[j]
 
 
 @compiled
-def _davenport(matrix, form):  # type: ignore[no-untyped-def]
+def _davenport(matrix, form):
     """Fill `form` with Davenport's matrix (4, 4) of the sum `matrix` from `_pair_up`.
 
     The eigenvector of the largest eigenvalue of `form` is the best rotation, as a quaternion (q-method).
@@ -106,7 +106,7 @@ def _davenport(matrix, form):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _form_value(form, q):  # type: ignore[no-untyped-def]
+def _form_value(form, q):
     value = 0.0
     for i in range(4):
         for j in range(4):
@@ -115,7 +115,7 @@ def _form_value(form, q):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _largest_eigenvector(form, vectors):  # type: ignore[no-untyped-def]
+def _largest_eigenvector(form, vectors):
     """Compute the unit eigenvector of the largest eigenvalue of `form` (4, 4) by Jacobi's method, in place."""
     vectors[:] = 0.0
     for i in range(4):
@@ -141,7 +141,7 @@ def _largest_eigenvector(form, vectors):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _annihilate(form, vectors, p, q):  # type: ignore[no-untyped-def]
+def _annihilate(form, vectors, p, q):
     slope = (form[q, q] - form[p, p]) / (2.0 * form[p, q])
     tangent = (1.0 if slope >= 0.0 else -1.0) / (abs(slope) + math.sqrt(slope * slope + 1.0))
     cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
@@ -158,7 +158,7 @@ def _annihilate(form, vectors, p, q):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _best_turn(pairs, start, end, matrix, form, vectors):  # type: ignore[no-untyped-def]
+def _best_turn(pairs, start, end, matrix, form, vectors):
     """Compute the smallest world rotation that turns the vectors of `_pair_up` as close as possible to their targets.
 
     `pairs`, `start`, `end` and `matrix` are the results of `_pair_up`; `form` and `vectors` (4, 4) are overwritten.
@@ -175,7 +175,7 @@ def _best_turn(pairs, start, end, matrix, form, vectors):  # type: ignore[no-unt
 
 
 @compiled
-def _hinge_turn(limit, spin, local, flexible, matrix):  # type: ignore[no-untyped-def]
+def _hinge_turn(limit, spin, local, flexible, matrix):
     """Compute the local rotation of a hinge after turning it by a share `flexible` of the way to its best angle.
 
     `limit` is the joint's row of `JointChains.limits`, `spin` its rotation in the world, `local` its local rotation,
@@ -205,7 +205,7 @@ def _hinge_turn(limit, spin, local, flexible, matrix):  # type: ignore[no-untype
 
 
 @compiled
-def _turned_joint(body, k, spin, local, pairs, start, end, work):  # type: ignore[no-untyped-def]
+def _turned_joint(body, k, spin, local, pairs, start, end, work):
     """Compute the new local rotation of joint k from the rotation `spin` in the world and the local rotation `local`.
 
     `pairs`, `start` and `end` are the results of `_pair_up`.
@@ -229,7 +229,7 @@ def _turned_joint(body, k, spin, local, pairs, start, end, work):  # type: ignor
 
 
 @compiled
-def _sweep(body, targets, frame, local, work):  # type: ignore[no-untyped-def]
+def _sweep(body, targets, frame, local, work):
     """Turn every movable joint of the pose `local` (K, 4) once, from the tips of the chains to their root."""
     for k in range(body.parents.shape[0] - 1, -1, -1):
         if not body.movable[k]:
@@ -251,9 +251,7 @@ def _sweep(body, targets, frame, local, work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _descend_frame(  # type: ignore[no-untyped-def]
-    body, targets, frame, offsets, ends, carried, local, root, best, work, before, after
-):
+def _descend_frame(body, targets, frame, offsets, ends, carried, local, root, best, work, before, after):
     """Solve one frame: change the pose `local` (K, 4) in place.
 
     `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `descend`. If `carried`, the
@@ -289,9 +287,7 @@ def _descend_frame(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def descend(  # type: ignore[no-untyped-def]
-    body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found
-):
+def descend(body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found):
     """Solve the frames `order` (n,) in this order; change `rotations` (F, K, 4) and fill the `SolverResult` `found`.
 
     `given_rotations` and `given_roots` are the poses of all frames before they were solved; `carried` is as in

@@ -22,7 +22,7 @@ from marey_motion.kernels import compiled
 
 
 @compiled
-def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-untyped-def]
+def _turned_error(kind, error, gaze, wished, turn, drift):
     """Compute the change of an angular error if the joint turns by `turn` and the target direction by `drift`.
 
     `turn` and `drift` are small rotation vectors; `gaze` and `wished` are the unit directions of the look-at axis and
@@ -39,7 +39,7 @@ def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-un
 
 
 @compiled
-def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
+def _look_change(gaze, wished, turn):
     """Compute the change of `look_error(gaze, wished)` if the gaze turns by the small rotation vector `turn`."""
     across = cross(wished, gaze)
     sine, cosine = length(across), dot(wished, gaze)
@@ -52,7 +52,7 @@ def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, column):  # type: ignore[no-untyped-def]
+def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, column):
     """Fill a column of the Jacobian: the derivatives of the error of target `c` with respect to one unknown.
 
     `tip` and `turn` are position and rotation of the target's point; `error` is the error of the target. A unit change
@@ -75,7 +75,7 @@ def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, colu
 
 
 @compiled
-def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-untyped-def]
+def fill_jacobian(body, targets, frame, work, jacobian):
     """Fill `jacobian` (3·C, 3·V + 3): the derivatives of the scaled errors of C targets.
 
     The unknowns are the displacements of the V movable joints and of the root.

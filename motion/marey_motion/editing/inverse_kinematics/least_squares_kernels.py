@@ -43,7 +43,7 @@ LIMIT_REACHED_RAD = 1e-9
 
 
 @compiled
-def _displace(body, local, root, first_local, first_root, work):  # type: ignore[no-untyped-def]
+def _displace(body, local, root, first_local, first_root, work):
     """Fill `work.displacement` (3·V + 3,), and return the weighted sum of the squared displacements.
 
     The displacements are those of the V movable joints and of the root, from the initial pose (`first_local`,
@@ -65,7 +65,7 @@ def _displace(body, local, root, first_local, first_root, work):  # type: ignore
 
 
 @compiled
-def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
+def _fill_softness(body, damping, work):
     """Fill `work.softness`, the diagonal of D⁻¹; D is the sum of the damping and the weights of the displacements."""
     columns = 0
     for k in range(body.parents.shape[0]):
@@ -80,7 +80,7 @@ def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _soften(work, vector, out):  # type: ignore[no-untyped-def]
+def _soften(work, vector, out):
     """Fill `out` with D⁻¹·vector; the components along directions that `_block` has excluded are removed.
 
     D is the matrix of `_fill_softness`.
@@ -102,7 +102,7 @@ def _soften(work, vector, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _solve_positive(matrix, right):  # type: ignore[no-untyped-def]
+def _solve_positive(matrix, right):
     """Solve matrix·x = right for a positive definite matrix (m, m), and write x into `right` (m,).
 
     The lower triangle of `matrix` is overwritten by its Cholesky factor.
@@ -125,7 +125,7 @@ def _solve_positive(matrix, right):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _fill_step(work):  # type: ignore[no-untyped-def]
+def _fill_step(work):
     """Fill `work.step` with -(JᵀJ + D)⁻¹·gradient; J is the Jacobian, D as in `_fill_softness`."""
     rows, columns = work.jacobian.shape
     _soften(work, work.gradient, work.step)
@@ -150,7 +150,7 @@ def _fill_step(work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _block(work, v, over):  # type: ignore[no-untyped-def]
+def _block(work, v, over):
     """Exclude the direction `over` from further steps of the movable joint `v`.
 
     `work.blocked` counts the excluded directions of each joint. `work.outward` contains the excluded direction if
@@ -167,7 +167,7 @@ def _block(work, v, over):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _take_step(body, local, root, work):  # type: ignore[no-untyped-def]
+def _take_step(body, local, root, work):
     """Fill the trial pose `work.trial` and `work.trial_root`: `local` (K, 4) and `root` (3,) moved by `work.step`.
 
     Joints stay within their limits. Returns whether a limit excluded a further direction for any joint (see `_block`).
@@ -200,7 +200,7 @@ def _take_step(body, local, root, work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _fill_gradient(work):  # type: ignore[no-untyped-def]
+def _fill_gradient(work):
     for n in range(work.gradient.shape[0]):
         total = work.holding[n] * work.displacement[n]
         for c in range(work.errors.shape[0]):
@@ -210,7 +210,7 @@ def _fill_gradient(work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
+def _prepare(body, targets, frame, work):
     """Fill `work.jacobian` and `work.gradient` for the pose that was measured last.
 
     Returns the mean squared length of the rows of the Jacobian.
@@ -228,7 +228,7 @@ def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
+def _try_step(body, damping, local, root, work):
     """Take a damped step from the pose `local` and `root`; fill `work.trial` and `work.trial_root` with the new pose.
 
     Joints at a limit slide along this limit.
@@ -242,9 +242,7 @@ def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _solve_frame(  # type: ignore[no-untyped-def]
-    body, targets, frame, offsets, ends, carried, local, root, work, before, after
-):
+def _solve_frame(body, targets, frame, offsets, ends, carried, local, root, work, before, after):
     """Solve one frame: change the pose `local` (K, 4) and `root` (3,) in place.
 
     `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `solve_frames`. If `carried`,
@@ -301,9 +299,7 @@ def _solve_frame(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def solve_frames(  # type: ignore[no-untyped-def]
-    body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found
-):
+def solve_frames(body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found):
     """Solve the frames `order` (n,) in this order; change `roots` (F, 3) and `rotations` (F, K, 4) in place.
 
     `given_rotations` and `given_roots` are the poses of all frames before they were solved. Where `carried` (n,) is at
@@ -330,7 +326,7 @@ def solve_frames(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def residuals_and_jacobian(body, targets, roots, rotations, work):  # type: ignore[no-untyped-def]
+def residuals_and_jacobian(body, targets, roots, rotations, work):
     """Fill `work.scaled_errors` and `work.jacobian` for the first frame of the poses `roots` and `rotations`."""
     measure(body, targets, 0, body.offsets[0], roots[0], rotations[0], work, 0.0, 0.0)
     work.displacement[:] = 0.0

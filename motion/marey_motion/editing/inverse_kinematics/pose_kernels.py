@@ -34,7 +34,7 @@ REFERENCE, TWIST_AXIS, SIDE_AXIS, TWIST_RANGE, SWING_RANGE, LIMIT_COLUMNS = 0, 4
 
 
 @compiled
-def place_joints(parents, offsets, root, local, spins, places):  # type: ignore[no-untyped-def]
+def place_joints(parents, offsets, root, local, spins, places):
     """Fill world rotations `spins` (K, 4) and positions `places` (K, 3) from local rotations (K, 4) and root (3,)."""
     put_rotation(spins, 0, rotation_at(local, 0))
     put_vector(places, 0, (root[0], root[1], root[2]))
@@ -46,7 +46,7 @@ def place_joints(parents, offsets, root, local, spins, places):  # type: ignore[
 
 
 @compiled
-def place_tips(targets, spins, places, tips, turns):  # type: ignore[no-untyped-def]
+def place_tips(targets, spins, places, tips, turns):
     """Fill `tips` (C, 3) and `turns` (C, 4) for a pose: for each target, its point's position and its joint's rotation.
 
     The point of a target is the one that the target constrains; it moves with the joint. `spins` (K, 4) and `places`
@@ -60,7 +60,7 @@ def place_tips(targets, spins, places, tips, turns):  # type: ignore[no-untyped-
 
 
 @compiled
-def look_error(gaze, wished):  # type: ignore[no-untyped-def]
+def look_error(gaze, wished):
     """Compute the rotation vector, in radians, from the unit direction `wished` to the unit direction `gaze`."""
     across = cross(wished, gaze)
     sine, cosine = length(across), dot(wished, gaze)
@@ -70,7 +70,7 @@ def look_error(gaze, wished):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
+def target_error(targets, c, frame, tip, turn):
     """Compute the error of target `c` as three numbers along the axes of the world.
 
     The error of a position is `tip` minus the target, in metres, and 0 along the axes that the target leaves free. The
@@ -90,7 +90,7 @@ def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
+def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad):
     """Fill `errors` (C, 3) with the error of each target in a pose.
 
     In the pose, the targets' points have the positions `tips` (C, 3), and their joints the rotations `turns` (C, 4).
@@ -108,7 +108,7 @@ def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad
 
 
 @compiled
-def measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
+def measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad):
     """Fill positions, rotations and errors in `work` for the pose `local` (K, 4) and `root` (3,).
 
     `frame` selects the values of the targets, and `offsets` (K, 3) are the offsets of the joints. Returns the weighted
@@ -120,13 +120,13 @@ def measure(body, targets, frame, offsets, root, local, work, tolerance_m, toler
 
 
 @compiled
-def store_residuals(errors, out):  # type: ignore[no-untyped-def]
+def store_residuals(errors, out):
     for c in range(errors.shape[0]):
         out[c] = length(vector_at(errors, c))
 
 
 @compiled
-def carry_change(body, given, solved, f, other, out):  # type: ignore[no-untyped-def]
+def carry_change(body, given, solved, f, other, out):
     """Fill `out` (K, 4) with the given pose of frame `f`, changed as the frame `other` was changed.
 
     `given` and `solved` (F, K, 4) are the local rotations before and after; joints with limits stay within them.
@@ -142,7 +142,7 @@ def carry_change(body, given, solved, f, other, out):  # type: ignore[no-untyped
 
 
 @compiled
-def nearest_in_range(angle, low, high):  # type: ignore[no-untyped-def]
+def nearest_in_range(angle, low, high):
     """Find the angle (radians, on the circle) in [low, high] that is nearest to `angle`."""
     if low <= angle <= high:
         return angle
@@ -152,7 +152,7 @@ def nearest_in_range(angle, low, high):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def within_limits(row, q):  # type: ignore[no-untyped-def]
+def within_limits(row, q):
     """Return the local rotation `q` of a joint, changed so that it is within the joint's limits.
 
     `row` (14,) is the joint's row of `JointChains.limits`.
@@ -171,7 +171,7 @@ def within_limits(row, q):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _within_ellipse(x, y, width, height):  # type: ignore[no-untyped-def]
+def _within_ellipse(x, y, width, height):
     """Move the point (x, y) towards 0 until the point is inside the ellipse with the half axes `width` and `height`."""
     if width <= 0.0:
         x = 0.0
@@ -182,7 +182,7 @@ def _within_ellipse(x, y, width, height):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def measure_frames(body, targets, tolerances, roots, rotations, work, residuals, reached):  # type: ignore[no-untyped-def]
+def measure_frames(body, targets, tolerances, roots, rotations, work, residuals, reached):
     """Fill `residuals` (F, C), the errors of the targets, and `reached` (F,), whether a frame reaches all targets.
 
     `tolerances` are the tolerance in metres and the tolerance in radians.

@@ -11,59 +11,59 @@ TINY = 1e-12
 
 
 @compiled
-def vector_at(array, row):  # type: ignore[no-untyped-def]
+def vector_at(array, row):
     return array[row, 0], array[row, 1], array[row, 2]
 
 
 @compiled
-def rotation_at(array, row):  # type: ignore[no-untyped-def]
+def rotation_at(array, row):
     return array[row, 0], array[row, 1], array[row, 2], array[row, 3]
 
 
 @compiled
-def put_vector(array, row, v):  # type: ignore[no-untyped-def]
+def put_vector(array, row, v):
     array[row, 0], array[row, 1], array[row, 2] = v
 
 
 @compiled
-def plus(a, b):  # type: ignore[no-untyped-def]
+def plus(a, b):
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @compiled
-def minus(a, b):  # type: ignore[no-untyped-def]
+def minus(a, b):
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @compiled
-def scaled(a, factor):  # type: ignore[no-untyped-def]
+def scaled(a, factor):
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
 @compiled
-def dot(a, b):  # type: ignore[no-untyped-def]
+def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled
-def cross(a, b):  # type: ignore[no-untyped-def]
+def cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @compiled
-def length(a):  # type: ignore[no-untyped-def]
+def length(a):
     return math.sqrt(dot(a, a))
 
 
 @compiled
-def direction(a):  # type: ignore[no-untyped-def]
+def direction(a):
     """Compute the unit vector along `a`; the zero vector if `a` is zero."""
     size = length(a)
     return scaled(a, 1.0 / size) if size > TINY else (0.0, 0.0, 0.0)
 
 
 @compiled
-def perpendicular(a):  # type: ignore[no-untyped-def]
+def perpendicular(a):
     """Compute a unit vector perpendicular to `a`, from the coordinate axis with the largest angle to `a`."""
     x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
     axis = (1.0, 0.0, 0.0)
@@ -75,20 +75,20 @@ def perpendicular(a):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def unit(q):  # type: ignore[no-untyped-def]
+def unit(q):
     size = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return q[0] * size, q[1] * size, q[2] * size, q[3] * size
 
 
 @compiled
-def rotated(q, v):  # type: ignore[no-untyped-def]
+def rotated(q, v):
     axis = (q[1], q[2], q[3])
     twice = scaled(cross(axis, v), 2.0)
     return plus(plus(v, scaled(twice, q[0])), cross(axis, twice))
 
 
 @compiled
-def exponential(v):  # type: ignore[no-untyped-def]
+def exponential(v):
     """Compute the rotation about the axis `v` by an angle that is the length of `v`, in radians."""
     half = 0.5 * length(v)
     share = 0.5 * math.sin(half) / half if half > 1e-8 else 0.5
@@ -96,7 +96,7 @@ def exponential(v):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def logarithm(q):  # type: ignore[no-untyped-def]
+def logarithm(q):
     """Compute the rotation vector (axis times angle, at most π) of a rotation."""
     sign = -1.0 if q[0] < 0.0 else 1.0
     v = (sign * q[1], sign * q[2], sign * q[3])
@@ -106,7 +106,7 @@ def logarithm(q):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def between(a, b):  # type: ignore[no-untyped-def]
+def between(a, b):
     """Compute the shortest rotation from unit vector `a` to unit vector `b`; the identity if one of them is zero."""
     if dot(a, a) < 0.5 or dot(b, b) < 0.5:
         return 1.0, 0.0, 0.0, 0.0
@@ -122,7 +122,7 @@ def between(a, b):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def twist_angle(q, axis):  # type: ignore[no-untyped-def]
+def twist_angle(q, axis):
     """Compute the angle, in radians from -π to π, by which the rotation `q` turns about the unit vector `axis`.
 
     `q` is decomposed into swing · twist, where the twist is a rotation about the axis.
@@ -134,7 +134,7 @@ def twist_angle(q, axis):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def about(axis, angle):  # type: ignore[no-untyped-def]
+def about(axis, angle):
     """Compute the quaternion (w, x, y, z), as a tuple, of the rotation about a unit vector by an angle in radians."""
     sine = math.sin(0.5 * angle)
     return math.cos(0.5 * angle), axis[0] * sine, axis[1] * sine, axis[2] * sine

@@ -26,7 +26,7 @@ from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 
 @compiled
-def _far_end(limb, work):  # type: ignore[no-untyped-def]
+def _far_end(limb, work):
     """Compute the point that stays in place: the tip if the limb carries its end, otherwise the joint at its end."""
     place = vector_at(work.places, limb.end)
     if limb.ending != CARRIED:
@@ -36,7 +36,7 @@ def _far_end(limb, work):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def measure_swivels(limb, body, roots, before, after, work, lines, jumps, turns):  # type: ignore[no-untyped-def]
+def measure_swivels(limb, body, roots, before, after, work, lines, jumps, turns):
     """Measure how the change of a limb swivels from frame to frame.
 
     `before` and `after` (F, K, 4) are the poses before and after the limb was turned, and `roots` (F, 3) the positions
@@ -60,7 +60,7 @@ def measure_swivels(limb, body, roots, before, after, work, lines, jumps, turns)
 
 
 @compiled
-def fill_upper_bones(limb, body, roots, rotations, work, bones):  # type: ignore[no-untyped-def]
+def fill_upper_bones(limb, body, roots, rotations, work, bones):
     """Fill `bones` (F, 3), the unit directions in the world from the first to the middle joint of a limb."""
     for f in range(rotations.shape[0]):
         offsets = body.offsets[min(f, body.offsets.shape[0] - 1)]
@@ -69,7 +69,7 @@ def fill_upper_bones(limb, body, roots, rotations, work, bones):  # type: ignore
 
 
 @compiled
-def pole_swivels(limb, body, roots, after, pole, work, angles, weights):  # type: ignore[no-untyped-def]
+def pole_swivels(limb, body, roots, after, pole, work, angles, weights):
     """Fill `angles` (F,): the swivels, in radians, that direct the middle joint of a limb to the point `pole`.
 
     `pole` (3,) is in the world, in metres. Also fills `weights` (F,), from 0 (no direction across the limb
@@ -88,7 +88,7 @@ def pole_swivels(limb, body, roots, after, pole, work, angles, weights):  # type
 
 
 @compiled
-def swivel_frames(limb, body, roots, angles, lines, rotations, work):  # type: ignore[no-untyped-def]
+def swivel_frames(limb, body, roots, angles, lines, rotations, work):
     """Turn a limb in each frame by `angles` (F,), in radians, about `lines` (F, 3); change `rotations` in place.
 
     `lines` are those of `measure_swivels`. If the limb does not carry its end, the end keeps its rotation in the world.

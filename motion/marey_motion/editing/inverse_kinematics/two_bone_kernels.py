@@ -36,7 +36,7 @@ CARRIED, HELD, GIVEN = 0, 1, 2
 
 
 @compiled
-def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
+def bend_at(distance, first, second):
     """Compute the angle, in radians, between two joined bones whose outer ends are `distance` apart; π if straight.
 
     `first` and `second` are the lengths of the bones.
@@ -47,7 +47,7 @@ def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def damped_bend(angle, wished, zone):  # type: ignore[no-untyped-def]
+def damped_bend(angle, wished, zone):
     """Damp the change of the angle between the bones, from `angle` to `wished`, near a straight or folded limb.
 
     Kovar et al. (2002), section 5.2; all angles are in radians.
@@ -63,13 +63,13 @@ def damped_bend(angle, wished, zone):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _weighed(angle, zone):  # type: ignore[no-untyped-def]
+def _weighed(angle, zone):
     into = min(1.0, max(0.0, (angle - (math.pi - zone)) / zone))
     return min(angle, math.pi - zone) + zone * (into - into**3 + 0.5 * into**4)
 
 
 @compiled
-def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
+def _bent(upper, fore, wished, hinge):
     """Compute the vector of the lower bone after the limb is bent so that the angle between its bones is `wished`.
 
     `upper` and `fore` are the vectors from the middle joint to both ends of the limb; `hinge` is the direction about
@@ -91,7 +91,7 @@ def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-def]
+def _turn_from_hinge(along, across, cosine, wished):
     """Compute the angle, about the upper bone, from a limb's hinge to the axis about which the limb is to bend.
 
     `wished` is the bend in radians. A nearly straight limb, even a little overstretched, bends about its hinge and
@@ -114,7 +114,7 @@ def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-
 
 
 @compiled
-def _reach(limb, body, offsets, root, local, target, rotation, work):  # type: ignore[no-untyped-def]
+def _reach(limb, body, offsets, root, local, target, rotation, work):
     """Turn the joints of the limb in one pose, `local` (K, 4), so that its tip reaches `target`.
 
     The other parameters are those of `reach_frames`, for one frame; `work` has arrays for intermediate results.
@@ -148,7 +148,7 @@ def _reach(limb, body, offsets, root, local, target, rotation, work):  # type: i
 
 
 @compiled
-def _turn(body, work, local, k, turn):  # type: ignore[no-untyped-def]
+def _turn(body, work, local, k, turn):
     """Rotate joint k of the pose `local` by `turn`, a rotation about world axes.
 
     `turn` was computed for the pose before any joint of the limb was turned. In that pose, `work.spins` are the
@@ -162,7 +162,7 @@ def _turn(body, work, local, k, turn):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):  # type: ignore[no-untyped-def]
+def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
     """Turn the joints of a limb in each frame so that its tip reaches a target; change `rotations` (F, K, 4) in place.
 
     `targets` (F or 1, 3) are in metres in the world, and `roots` (F, 3) are the positions of the root. If `limb.ending`
@@ -177,7 +177,7 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
 
 
 @compiled
-def undamped_reach(starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
+def undamped_reach(starts, firsts, seconds, zone):
     """Compute the greatest distances (F,), in metres, that a limb can reach without damping.
 
     `starts` (F,) are the current distances between the ends of the limb; `firsts` and `seconds` (F,) are the lengths of

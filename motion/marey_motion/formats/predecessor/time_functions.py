@@ -122,7 +122,8 @@ def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variance
     FunctionalComponents    the components
     """
     flat = directions.reshape(len(directions), mean.size)
-    projections = np.asarray(np.linalg.pinv(flat).T.reshape(directions.shape) if len(flat) else directions)
+    inverse = np.linalg.pinv(flat).T.reshape(directions.shape) if len(flat) else directions
+    projections = np.asarray(inverse, dtype=np.float64)
     total = float(variances.sum())
     energy = np.asarray(np.cumsum(variances) / total if total > 0 else np.ones(len(variances)))
     return FunctionalComponents(basis, mean, directions, projections, variances, energy)
@@ -198,7 +199,7 @@ def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Fit a linear function of scores (m, k) to values (m, n); return its mean (n,) and its slopes (k, n)."""
     columns = np.concatenate((np.ones((len(scores), 1)), scores), axis=1)
     solution = np.linalg.lstsq(columns, values, rcond=None)[0]
-    return np.asarray(solution[0]), np.asarray(solution[1:])
+    return np.asarray(solution[0], dtype=np.float64), np.asarray(solution[1:], dtype=np.float64)
 
 
 def _basis_over(steps: int) -> SplineBasis:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from marey_motion.modelling.search.constraints import joint_index
 from marey_motion.modelling.search.found_motions import FoundMotion
 from marey_motion.modelling.search.steps import Step
 from marey_motion.rigs import JointAxes, JointMapping, guess_axes
+from marey_schemas.editing.constraints import Axes
 from marey_schemas.search_constraints import (
     JointOrientationConstraint,
     JointPositionConstraint,
@@ -115,7 +117,7 @@ def _target(
     match constraint:
         case JointPositionConstraint(target_m=target):
             axes = "".join(axis for axis, value in zip("xyz", target, strict=True) if value is not None)
-            return PositionTarget(joint, tuple(value or 0.0 for value in target), axes=axes)  # type: ignore[arg-type]
+            return PositionTarget(joint, tuple(value or 0.0 for value in target), axes=cast(Axes, axes))
         case JointOrientationConstraint(rotation=rotation):
             return OrientationTarget(joint, rotation)
         case LookDirectionConstraint(point_m=None, direction=direction):
@@ -123,4 +125,5 @@ def _target(
             along = np.asarray(direction) / np.linalg.norm(np.asarray(direction))
             return LookAtTarget(joint, here + FAR_AWAY_M * along, axis=constraint.axis)
         case LookDirectionConstraint(point_m=point):
-            return LookAtTarget(joint, point, axis=constraint.axis)  # type: ignore[arg-type]
+            assert point is not None
+            return LookAtTarget(joint, point, axis=constraint.axis)

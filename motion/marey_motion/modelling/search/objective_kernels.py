@@ -24,7 +24,7 @@ _SMALL = 1e-4
 
 
 @compiled
-def _pose(chains, latent, channels, local, positions, rotations):  # type: ignore[no-untyped-def]
+def _pose(chains, latent, channels, local, positions, rotations):
     """Compute the poses of the V joints of `chains` for one latent vector, in canonical coordinates.
 
     Fills `channels` (X,) with the values of the channels for the scores in `latent`; `local` (V, 5) with the unit
@@ -55,7 +55,7 @@ def _pose(chains, latent, channels, local, positions, rotations):  # type: ignor
 
 
 @compiled
-def _items(chains, placement, positions, rotations, points, turns):  # type: ignore[no-untyped-def]
+def _items(chains, placement, positions, rotations, points, turns):
     """Convert the poses of joints to the n tracked points of `chains`, in the world.
 
     Fills `points` (n, 3), sums and differences of joint positions, and `turns` (n, 4), the rotation of one joint of
@@ -75,7 +75,7 @@ def _items(chains, placement, positions, rotations, points, turns):  # type: ign
 
 
 @compiled
-def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-def]
+def _times(clocks, latent, first, log_steps, times):
     """Fill `times` (n,) with the time, in seconds from the start of the motion, of each canonical frame of `clocks`.
 
     `log_steps` (N - 1,) is filled with the lengths of the steps between canonical frames, in frames (not with their
@@ -102,7 +102,7 @@ def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-
 
 
 @compiled
-def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
+def _angle_factors(sine, cosine):
     """Compute an angle divided by its sine, and the derivative of this ratio with respect to the cosine."""
     angle = math.atan2(sine, cosine)
     if angle < _SMALL:
@@ -112,7 +112,7 @@ def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
+def _rotation_error(turn, target, out):
     """Fill `out` (3,) with the rotation vector from the rotation `target` to the rotation `turn`.
 
     The length of the vector is the angle between the two rotations.
@@ -126,7 +126,7 @@ def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _aims(kind, row, rows, points, turns, pointing, wanted):  # type: ignore[no-untyped-def]
+def _aims(kind, row, rows, points, turns, pointing, wanted):
     """Compute where a joint's axis points, and where the constraint with index `row` wants it to point.
 
     Fills `pointing` and `wanted` with unit directions (3,). Returns the distance from the joint to the point to look
@@ -148,7 +148,7 @@ def _aims(kind, row, rows, points, turns, pointing, wanted):  # type: ignore[no-
 
 
 @compiled
-def _crossed(a, b, out):  # type: ignore[no-untyped-def]
+def _crossed(a, b, out):
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
@@ -156,7 +156,7 @@ def _crossed(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _residual(row, rows, points, turns, times, room, out):  # type: ignore[no-untyped-def]
+def _residual(row, rows, points, turns, times, room, out):
     """Fill `out` (3,) with the error of the constraint with index `row`, in metres, radians or seconds.
 
     `points` and `turns` are the tracked points and rotations, and `times` the times that `_times` computes; `room`
@@ -191,7 +191,7 @@ def _residual(row, rows, points, turns, times, room, out):  # type: ignore[no-un
 
 
 @compiled
-def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-untyped-def]
+def errors(chains, clocks, rows, placement, latents, out):
     """Fill `out` (n, m) with the errors of n latent vectors (n, L) in m constraints, in metres, radians or seconds."""
     nodes, items = chains.parents.shape[0], chains.turned.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
@@ -213,7 +213,7 @@ def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-un
 
 
 @compiled
-def costs(prices, errors, out):  # type: ignore[no-untyped-def]
+def costs(prices, errors, out):
     """Fill `out` (n,) with sums of errors (n, m) times `prices` (m,), weights of constraints divided by tolerances."""
     for n in range(out.shape[0]):
         total = 0.0
@@ -223,7 +223,7 @@ def costs(prices, errors, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def track(chains, placement, latents, out):  # type: ignore[no-untyped-def]
+def track(chains, placement, latents, out):
     """Fill `out` (n, p, 3) with the p tracked points of `chains`, in the world, for latent vectors (n, L)."""
     nodes, items = chains.parents.shape[0], chains.turned.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))

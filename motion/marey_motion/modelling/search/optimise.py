@@ -151,7 +151,7 @@ def _step(curvature: Floats, gradient: Floats) -> Floats | None:
     Returns None if the curvature is numerically singular, so that more damping is needed.
     """
     try:
-        step = np.asarray(np.linalg.solve(curvature, -gradient))
+        step = np.asarray(np.linalg.solve(curvature, -gradient), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
     return step if np.isfinite(step).all() else None

@@ -34,7 +34,7 @@ _SMALL_ANGLE = 1e-3
 
 
 @compiled
-def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-untyped-def]
+def _joint_slopes(chains, local, rotations, shifts, spins):
     """Fill `shifts` and `spins` (V, 3, k) with the derivatives of V joints' positions and rotations.
 
     They are derivatives with respect to the k spatial scores, in canonical coordinates. `objective_kernels._pose`
@@ -69,7 +69,7 @@ def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-u
 
 
 @compiled
-def track(chains, placement, moved, latent, first, points, turns, point_slopes, turn_slopes):  # type: ignore[no-untyped-def]
+def track(chains, placement, moved, latent, first, points, turns, point_slopes, turn_slopes):
     """Fill `points` (n, 3) and `turns` (n, 4) with the tracked points and rotations of one step, in the world.
 
     Fills `point_slopes` and `turn_slopes` (n, 3, W) with the derivatives of the points and of the rotations with
@@ -101,7 +101,7 @@ def track(chains, placement, moved, latent, first, points, turns, point_slopes, 
 
 
 @compiled
-def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-def]
+def _add_turned(cos, sin, sign, slopes, first, out):
     """Convert derivatives `slopes` (3, k) from canonical to world coordinates, and add them to `out` (3, W).
 
     `cos` and `sin` are the cosine and sine of the placement's heading; `sign` is a factor, 1 or -1. The columns of the
@@ -115,7 +115,7 @@ def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-
 
 
 @compiled
-def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-def]
+def keep_time(clocks, latent, first, times, slopes):
     """Fill `times` (n,) with the times of canonical frames, in seconds, and `slopes` (n, W) with their derivatives.
 
     The temporal scores of the step begin at index `first` of the stacked latent vectors `latent` (W,).
@@ -142,7 +142,7 @@ def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-
 
 
 @compiled
-def _hat(v, out):  # type: ignore[no-untyped-def]
+def _hat(v, out):
     """Fill `out` with the matrix whose product with any vector u is the cross product v × u."""
     out[0, 0], out[0, 1], out[0, 2] = 0.0, -v[2], v[1]
     out[1, 0], out[1, 1], out[1, 2] = v[2], 0.0, -v[0]
@@ -150,7 +150,7 @@ def _hat(v, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _multiply(a, b):  # type: ignore[no-untyped-def]
+def _multiply(a, b):
     out = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -160,7 +160,7 @@ def _multiply(a, b):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
+def _orientation_slope(residual, by_turn):
     """Fill `by_turn` (3, 3) with the inverse left Jacobian of the rotation vector `residual`.
 
     This is the derivative of the vector with respect to the rotation; it is finite up to half a turn.
@@ -178,7 +178,7 @@ def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[no-untyped-def]
+def _aim_slopes(pointing, wanted, distance, by_point, by_turn):
     """Fill `by_point` and `by_turn` (3, 3) with the derivatives of the error of a joint's axis.
 
     The error is the rotation vector angle / sin(angle) · (pointing × wanted). `pointing` and `wanted` are the unit
@@ -207,7 +207,7 @@ def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[
 
 
 @compiled
-def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):  # type: ignore[no-untyped-def]
+def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):
     """Fill `by_point` and `by_turn` (3, 3) with derivatives of the error `residual` of the constraint with index `row`.
 
     They are derivatives with respect to the tracked point and the tracked rotation of the constraint.
@@ -230,7 +230,7 @@ def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):  # type: 
 
 
 @compiled
-def linearise(rows, points, turns, times, point_slopes, turn_slopes, time_slopes, residuals, slopes):  # type: ignore[no-untyped-def]
+def linearise(rows, points, turns, times, point_slopes, turn_slopes, time_slopes, residuals, slopes):
     """Fill `residuals` (m, 3) with the errors of m constraints, and `slopes` (m, 3, W) with their derivatives.
 
     The derivatives are with respect to the W unknowns of the search. `rows` describes the constraints; the other arrays

@@ -14,7 +14,7 @@ MOST_ROUNDS = 25
 
 
 @compiled
-def _square_distance(a, b):  # type: ignore[no-untyped-def]
+def _square_distance(a, b):
     total = 0.0
     for d in range(a.shape[0]):
         step = a[d] - b[d]
@@ -23,7 +23,7 @@ def _square_distance(a, b):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _place_centres(features, members, randoms, nearest, centres):  # type: ignore[no-untyped-def]
+def _place_centres(features, members, randoms, nearest, centres):
     """Choose cluster centres among members by k-means++ (Arthur and Vassilvitskii 2007); return the number of centres.
 
     `members` are row numbers of `features`; `randoms` are uniform random numbers, one per centre. `centres` is filled;
@@ -52,7 +52,7 @@ def _place_centres(features, members, randoms, nearest, centres):  # type: ignor
 
 
 @compiled
-def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
+def _assign(features, members, centres, labels):
     """Fill `labels` with the index of each member's nearest centre; of equally near centres, the first is taken.
 
     Returns the number of members whose label has changed.
@@ -70,7 +70,7 @@ def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _average(features, members, labels, centres, sizes):  # type: ignore[no-untyped-def]
+def _average(features, members, labels, centres, sizes):
     """Move each of `centres` to the mean of its members, and fill `sizes` with the numbers of members.
 
     A centre without members does not move.
@@ -87,7 +87,7 @@ def _average(features, members, labels, centres, sizes):  # type: ignore[no-unty
 
 
 @compiled
-def _split(features, members, randoms, sizes, room):  # type: ignore[no-untyped-def]
+def _split(features, members, randoms, sizes, room):
     """Divide members into clusters by k-means: sort `members` by cluster in place, and fill `sizes` of the clusters.
 
     `randoms` are uniform random numbers, one per cluster; `room` has arrays for intermediate results. Returns the
@@ -121,7 +121,7 @@ def _split(features, members, randoms, sizes, room):  # type: ignore[no-untyped-
 
 
 @compiled
-def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, children):  # type: ignore[no-untyped-def]
+def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, children):
     """Split samples (n, D) recursively, level by level; return the number of nodes.
 
     `order` (n,) is permuted so that each node's members are contiguous; `starts`, `sizes` and `children` (nodes,) are
@@ -154,7 +154,7 @@ def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, c
 
 
 @compiled
-def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
+def locate(sizes, children, starts):
     """Fill `starts` with the index of the first sample of each node.
 
     The samples of a node are those of its first child, then those of its second child, and so on.
@@ -170,7 +170,7 @@ def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def average(samples, starts, sizes, means):  # type: ignore[no-untyped-def]
+def average(samples, starts, sizes, means):
     """Fill `means` (nodes, L) with the means of nodes; node i has `sizes[i]` samples, beginning at `starts[i]`."""
     means[:] = 0.0
     for node in range(sizes.shape[0]):

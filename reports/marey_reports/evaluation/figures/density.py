@@ -97,19 +97,20 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
     figure = new_figure(9.6 if two else 7.6, height + (1.75 if two else 0.75))
     bottom = 1.3 if two else 0.58
     ceiling = nice_ceiling(max(float(each.max()) for each in maps))
+    drawn = []
     for number, (subject, each) in enumerate(zip(subjects, maps, strict=True)):
         place = Place(0.68 + number * (width + gap), bottom, width, height)
         x, y = plane.labels
-        drawn = _draw_map(figure, place, subject, plane, edges, each, ceiling, (x, y if number == 0 else ""))
+        drawn.append(_draw_map(figure, place, subject, plane, edges, each, ceiling, (x, y if number == 0 else "")))
     if two:
         add_colour_bar(
-            figure, drawn, Place(0.68, 0.52, 2 * width + gap, 0.12), plane.cell_label, square_root_ticks(ceiling)
+            figure, drawn[-1], Place(0.68, 0.52, 2 * width + gap, 0.12), plane.cell_label, square_root_ticks(ceiling)
         )
         _draw_change(figure, Place(0.68 + 2 * (width + gap), bottom, width, height), plane, edges, maps)
     else:
         add_colour_bar(
             figure,
-            drawn,
+            drawn[-1],
             Place(0.68 + width + 0.15, bottom, 0.14, height),
             plane.cell_label,
             square_root_ticks(ceiling),
@@ -125,13 +126,14 @@ def _draw_many(
     bands = -(-len(subjects) // COLUMNS)
     figure = new_figure(9.6, bands * (height + beneath) + 0.95)
     ceiling = nice_ceiling(max(float(each.max()) for each in maps))
+    drawn = []
     for number, (subject, each) in enumerate(zip(subjects, maps, strict=True)):
         band, column = divmod(number, COLUMNS)
         place = Place(0.68 + column * (width + gap), 1.3 + (bands - 1 - band) * (height + beneath), width, height)
         x, y = plane.labels
-        drawn = _draw_map(figure, place, subject, plane, edges, each, ceiling, (x, y if column == 0 else ""))
+        drawn.append(_draw_map(figure, place, subject, plane, edges, each, ceiling, (x, y if column == 0 else "")))
     across = COLUMNS * width + (COLUMNS - 1) * gap
-    add_colour_bar(figure, drawn, Place(0.68, 0.52, across, 0.12), plane.cell_label, square_root_ticks(ceiling))
+    add_colour_bar(figure, drawn[-1], Place(0.68, 0.52, across, 0.12), plane.cell_label, square_root_ticks(ceiling))
     return figure
 
 

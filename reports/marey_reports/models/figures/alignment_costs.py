@@ -74,13 +74,13 @@ def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None
                           title=f"{view.role}: {shortened(names[view.clip.uid], 20)}", x="time in the reference (s)",
                           y="time in the clip (s)")  # fmt: skip
         ends = (float(view.frames[0][-1]) / rate, float(view.frames[1][-1]) / rate)
-        image = panel.imshow(view.costs_cm.T, origin="lower", extent=(0.0, ends[0], 0.0, ends[1]), aspect="auto",
+        panel.imshow(view.costs_cm.T, origin="lower", extent=(0.0, ends[0], 0.0, ends[1]), aspect="auto",
                              cmap=MORE_IS_WORSE, vmin=0.0, vmax=ceiling, interpolation="nearest")  # fmt: skip
         path_s = np.arange(aligned.frame_count) / rate
         for colour, width in ((LIGHT, 3.0), (DARK, 1.3)):
             panel.plot(path_s, view.clip.time_function / rate, color=colour, lw=width)
     place_of_bar = Place(0.75 + len(views) * (SIDE + 0.85) - 0.55, 0.65, 0.12, SIDE)
-    add_colour_bar(figure, image, place_of_bar, "distance of poses (cm)")
+    add_colour_bar(figure, figure.axes[-1].images[-1], place_of_bar, "distance of poses (cm)")
     parts = [
         f"{view.clip.name}, {view.role} ({100.0 * np.sqrt(view.clip.cost):.1f} cm along its path)" for view in views
     ]

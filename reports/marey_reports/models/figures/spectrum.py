@@ -159,7 +159,7 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
         )
         tick_whole_numbers(panel.xaxis)
         panel.set_xlim(0.5, max(each.components for each in candidates) + 0.5)
-    add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    add_keys(figure.axes[-1], loc="upper left", bbox_to_anchor=(1.02, 1.0))
     columns = (
         "components", "covariance", "held_out_log_likelihood", "bic", "aic", "log_likelihood", "smallest_weight",
         "refusal",

@@ -7,7 +7,7 @@ Authorization, and in the answer to the request that exchanges the link.
 from __future__ import annotations
 
 from functools import partial
-from typing import get_args
+from typing import cast, get_args
 
 from marey_schemas.studies.participation import (
     NewParticipation,
@@ -137,7 +137,7 @@ class ParticipationPart(Resource):
         """
         if part not in get_args(ShownPart):
             raise NotFoundProblem(f"A motion of a study has no part {part!r}.")
-        return await self.answer_with(lambda reply: reply, read_shown_part, clip, part)  # type: ignore[arg-type]
+        return await self.answer_with(lambda reply: reply, read_shown_part, clip, cast(ShownPart, part))
 
 
 RESOURCES: tuple[type[Resource], ...] = (

@@ -79,7 +79,7 @@ class Cluster:
     async def close(self) -> None:
         """Close all connections."""
         if self._api is not None:
-            await self._api.close()  # type: ignore[no-untyped-call]
+            await self._api.close()
 
     async def create_job(self, job: Manifest) -> Manifest:
         """Create a Job. Raises `ObjectExists`."""
@@ -186,11 +186,9 @@ async def _configuration(options: ClusterOptions) -> client.Configuration:
     configuration = client.Configuration()
     try:
         if options.kubeconfig is None:
-            config.load_incluster_config(  # type: ignore[no-untyped-call]
-                client_configuration=configuration
-            )
+            config.load_incluster_config(client_configuration=configuration)
         else:
-            await config.load_kube_config(  # type: ignore[no-untyped-call]
+            await config.load_kube_config(
                 str(options.kubeconfig),
                 context=options.context,
                 client_configuration=configuration,

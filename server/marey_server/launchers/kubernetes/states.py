@@ -146,7 +146,8 @@ def blocked_reason(pod: Document) -> str | None:
     found = next(unscheduled, waiting)
     if found.get("reason") in (None, "ContainerCreating", "PodInitializing"):
         return None
-    return ": ".join(filter(None, (found["reason"], found.get("message"))))
+    text: str = ": ".join(filter(None, (found["reason"], found.get("message"))))
+    return text
 
 
 def stuck_jobs(jobs: Mapping[str, Document], pods: Iterable[Document]) -> dict[str, str]:

@@ -34,7 +34,7 @@ LIFETIME_US = 600 * 1_000_000
 """Time in which a person must sign in."""
 MOST_WAITING = 10_000
 """Greatest number of sign-ins that are not complete."""
-_USER_NAME = re.compile(UserName.__metadata__[0].pattern)  # type: ignore[attr-defined]
+_USER_NAME = re.compile(UserName.__metadata__[0].pattern)
 
 
 def begin(tx: Transaction, request: BrowserSignInCreate, address: str, per_minute: int, longest_s: int) -> str:

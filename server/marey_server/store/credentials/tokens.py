@@ -308,7 +308,7 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     tx.execute(update(token).where(token.c.successor_of == token_id).values(successor_of=found.successor_of))
 
 
-def _connected_with(which: ColumnElement[bool]) -> Select[Any]:
+def _connected_with(which: ColumnElement[bool]) -> Select[*tuple[Any, ...]]:
     """Return a query for the ids of the tokens that meet `which`, and of all tokens connected with them, recursively.
 
     A token is connected with its predecessor, with its successor, and with the tokens that were created with it.

@@ -18,7 +18,7 @@ from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import sqlalchemy
 from sqlalchemy import Connection, exc, make_url
@@ -232,7 +232,7 @@ class Database:
                 raise
         self._high_water_us = high_water_us
         if self._log is not None:
-            driver: sqlite3.Connection = tx.connection.connection.driver_connection  # type: ignore[assignment]
+            driver = cast(sqlite3.Connection, tx.connection.connection.driver_connection)
             self._log.after_commit(driver)
         return answer
 

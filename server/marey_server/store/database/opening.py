@@ -22,7 +22,7 @@ def opening(url: str) -> Iterator[None]:
     """Convert errors in the `with` block, which opens the database at `url`, to `DatabaseUnusable`."""
     try:
         yield
-    except (exc.ArgumentError, exc.NoSuchModuleError, ImportError):  # of a url no driver is known for
+    except (exc.ArgumentError, ImportError):  # of a url no driver is known for
         raise DatabaseUnusable(
             "the setting `database_url` is not the URL of a supported database; write "
             "sqlite:////folder/file.db, or postgresql://user@host/name with the extra `postgres` installed"

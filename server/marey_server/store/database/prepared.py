@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from sqlalchemy import BindParameter, Connection, Delete, Dialect, Insert, Select, Update, exc
 from sqlalchemy.sql.schema import ScalarElementColumnDefault
 
 T = TypeVar("T")
 
-Statement = Select[Any] | Insert | Update | Delete
+Statement = Select[*tuple[Any, ...]] | Insert | Update | Delete
 Convert = Callable[[Any], Any]
 Parameters = Mapping[str, Any]
 
@@ -187,7 +187,7 @@ def _row_maker(statement: Any, dialect: Dialect) -> Convert | None:
     columns = statement.exported_columns
     if not columns:
         return None
-    row: Any = namedtuple("Row", columns.keys())  # type: ignore[misc]
+    row: Any = namedtuple("Row", columns.keys())  # pyrefly: ignore[bad-class-definition]  # known when it runs
     make: Convert = row._make
     converts = [
         (index, convert)
@@ -221,7 +221,7 @@ def _failure(connection: Connection, text: str, error: Exception) -> Exception:
     If the connection broke, also discard the idle connections of the pool.
     """
     dialect = connection.dialect
-    lost = dialect.is_disconnect(error, connection.connection, None)  # type: ignore[arg-type]
+    lost = dialect.is_disconnect(cast(Any, error), connection.connection, None)
     if lost:
         connection.invalidate(error)
         connection.engine.dispose()

@@ -67,7 +67,7 @@ def read_folder(tx: Transaction, project_row: ProjectRow, found: Row[Any]) -> Fo
     return FolderState(entries, items, contents)
 
 
-def _items_in(project_row: ProjectRow, path: str) -> Select[Any]:
+def _items_in(project_row: ProjectRow, path: str) -> Select[*tuple[Any, ...]]:
     return (
         select(item.c.id, item.c.kind, item.c.name, item.c.head, collection.c.path)
         .join(collection, collection.c.id == item.c.collection_id)

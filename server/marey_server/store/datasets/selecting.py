@@ -159,7 +159,9 @@ def _with_possible_content(
         yield from (entry for entry in some if entry.content in found)
 
 
-def _possible_contents(project_id: str, queries: Sequence[Query]) -> tuple[Select[Any], Select[Any]]:
+def _possible_contents(
+    project_id: str, queries: Sequence[Query]
+) -> tuple[Select[*tuple[Any, ...]], Select[*tuple[Any, ...]]]:
     """Return SQL statements for the contents of newest revisions that meet all `queries`, and of all older ones."""
     of_project = (
         select(revision.c.content)

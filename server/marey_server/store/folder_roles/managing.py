@@ -64,7 +64,7 @@ def read_folder_role(tx: Transaction, project: str, collection_id: str, user_nam
     return _shown(row)
 
 
-def _rows(project_row: ProjectRow) -> Select[Any]:
+def _rows(project_row: ProjectRow) -> Select[*tuple[Any, ...]]:
     return (
         select(folder_role, collection.c.path, user.c.name)
         .join(collection, collection.c.id == folder_role.c.collection_id)

@@ -58,7 +58,7 @@ def find_ended_with(tx: Transaction, project_id: str, contents: Sequence[str]) -
     return [_shown(row) for row in rows]
 
 
-def _ended(tx: Transaction) -> Select[Any]:
+def _ended(tx: Transaction) -> Select[*tuple[Any, ...]]:
     recorded, place = item.alias("recorded"), collection.alias("place")
     holder = case((item.c.kind == Kind.PROCESSED.value, item.c.summary["clip"].as_string()), else_=item.c.id)
     until = recorded.c.summary["consent_until"].as_string()

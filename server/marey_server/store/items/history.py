@@ -44,7 +44,7 @@ def read_revision(tx: Transaction, project_name: str, kind: Kind, item_id: str, 
     return _shown(tx, [find_revision(tx, item_id, number)])[0]
 
 
-def _revision_rows() -> Select[Any]:
+def _revision_rows() -> Select[*tuple[Any, ...]]:
     return select(revision, user.c.name.label("author")).outerjoin(user, user.c.id == revision.c.author_id)
 
 
@@ -113,7 +113,7 @@ def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[Li
         .order_by(lineage.c.role, lineage.c.position, other, number)
         .limit(MAX_EDGES)
     )
-    return tuple(LineageEdge(**row._mapping) for row in tx.execute(statement))
+    return tuple(LineageEdge(**row._asdict()) for row in tx.execute(statement))
 
 
 def _has_newer_content(item_id: Any, number: Any) -> ColumnElement[bool]:

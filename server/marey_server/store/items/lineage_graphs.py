@@ -142,7 +142,7 @@ class _LineageWalk:
         )
 
     def _described(self) -> Iterator[tuple[Place, Row[Any]]]:
-        statement: Select[Any] = (
+        statement: Select[*tuple[Any, ...]] = (
             select(
                 revision.c.item_id, revision.c.number, revision.c.job_id, revision.c.created_us, item.c.kind,
                 item.c.name, item.c.head, item.c.deleted_us, item.c.purged_us, collection.c.path,

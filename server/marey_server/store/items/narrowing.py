@@ -31,7 +31,7 @@ from marey_server.store.transaction import Transaction
 MOST_ITEMS = 1000
 """Greatest number of items that may meet a condition that is used as `Narrowing.few`."""
 
-Candidates = Callable[[Condition, str, Kind], Select[Any]]
+Candidates = Callable[[Condition, str, Kind], Select[*tuple[Any, ...]]]
 """Function that returns a query for the items of a project and kind that may meet a condition; the query uses an index.
 
 The columns of the query are the id of the item and the time of its creation, and the newest items come first. If the
@@ -109,7 +109,7 @@ def _start(condition: Condition) -> ColumnElement[bool]:
     return start == wanted[0] if len(wanted) == 1 else start.in_(wanted)
 
 
-def _with_fact(condition: Condition, project_id: str, kind: Kind) -> Select[Any]:
+def _with_fact(condition: Condition, project_id: str, kind: Kind) -> Select[*tuple[Any, ...]]:
     """Return a query for the ids and times of creation of the items whose fact has one of the values of the condition.
 
     For a single value, the index of the fact returns the newest items first. For several values, the query has no
@@ -121,16 +121,16 @@ def _with_fact(condition: Condition, project_id: str, kind: Kind) -> Select[Any]
     return select(item.c.id, item.c.created_us).where(*present, _start(condition)).order_by(item.c.created_us.desc())
 
 
-def _with_tag(condition: Condition, _: str, __: Kind) -> Select[Any]:
+def _with_tag(condition: Condition, _: str, __: Kind) -> Select[*tuple[Any, ...]]:
     wanted = item_tag.c.tag.in_([str(one) for one in condition.values])
     return select(item_tag.c.item_id, null().label("created_us")).where(wanted)
 
 
-def _with_facet(condition: Condition, _: str, __: Kind) -> Select[Any]:
+def _with_facet(condition: Condition, _: str, __: Kind) -> Select[*tuple[Any, ...]]:
     return select(item_facet.c.item_id, null().label("created_us")).where(facet_meets(condition))
 
 
-def _in_range(condition: Condition, project_id: str, kind: Kind) -> Select[Any]:
+def _in_range(condition: Condition, project_id: str, kind: Kind) -> Select[*tuple[Any, ...]]:
     """Return a query for the items whose number or time is in the range of the condition, deleted ones included.
 
     The index of an order has these numbers or times, but not the time of the deletion.

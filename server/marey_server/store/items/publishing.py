@@ -273,7 +273,7 @@ class _Publication:
         for place, part in enumerate(_required(kind)):
             held = revision_part.alias(f"part_{part}")
             at_head = and_(held.c.item_id == item.c.id, held.c.number == item.c.head, held.c.part == part)
-            wanted = {one.required[place] for one in waiting if one.required[place] is not None}
+            wanted = {digest for one in waiting if (digest := one.required[place]) is not None}
             statement = statement.join(held, at_head).where(held.c.document_digest.in_(sorted(wanted)))
             named.append(held.c.document_digest.label(f"digest_{place}"))
         rows: dict[tuple[str | None, ...], Row[Any]] = {}

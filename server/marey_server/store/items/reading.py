@@ -48,7 +48,7 @@ def read_item(tx: Transaction, project: str, kind: Kind, item_id: str) -> Item:
     return shown_items(tx, [find_item(tx, project_row, kind, item_id)])[0]
 
 
-def item_rows() -> Select[Any]:
+def item_rows() -> Select[*tuple[Any, ...]]:
     """Return a query for the rows of items, each with the path of its collection."""
     return select(item, collection.c.path).join(collection, collection.c.id == item.c.collection_id)
 

@@ -28,7 +28,7 @@ def outputs_in(tree: Any) -> Iterator[str]:
         else:
             for member in tree.values():
                 yield from outputs_in(member)
-    elif isinstance(tree, list | tuple):
+    elif isinstance(tree, (list, tuple)):
         for member in tree:
             yield from outputs_in(member)
 
@@ -80,7 +80,7 @@ def resolved(tree: Any, done: Mapping[str, Published]) -> Any:
             published = done[tree["output"]]
             return {"item": published.item, "revision": published.revision}
         return {key: resolved(member, done) for key, member in tree.items()}
-    if isinstance(tree, list | tuple):
+    if isinstance(tree, (list, tuple)):
         return [resolved(member, done) for member in tree]
     return tree
 

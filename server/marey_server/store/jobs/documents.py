@@ -17,7 +17,7 @@ from marey_server.store.tables import job, job_dependency, project, user
 from marey_server.store.transaction import Transaction, in_lists
 
 
-def select_jobs() -> Select[Any]:
+def select_jobs() -> Select[*tuple[Any, ...]]:
     """Return a SELECT of all jobs, each with the columns `project_name` and `author_name`."""
     return (
         select(job, project.c.name.label("project_name"), user.c.name.label("author_name"))
@@ -38,7 +38,7 @@ def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
     return [found[one] for one in ids]
 
 
-_UNSAID = {column.key: None if column.default is None else column.default.arg for column in job.c}  # type: ignore[attr-defined]
+_UNSAID = {column.key: getattr(column.default, "arg", None) for column in job.c}
 """Initial values of columns, for those columns that `new_row` omits."""
 
 

@@ -59,7 +59,10 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
         .where(job.c.parent_id == parent_id)
         .order_by(job.c.position)
     ).all()
-    result = {"tasks": len(rows), **combine_results(row.result for row in rows if row.result is not None)}
+    result: dict[str, Any] = {
+        "tasks": len(rows),
+        **combine_results(row.result for row in rows if row.result is not None),
+    }
     running = and_(job.c.id == parent_id, job.c.state == RUNNING)
     failed = [row for row in rows if row.state == "failed"]
     if failed and head.cancel_requested_us is None:

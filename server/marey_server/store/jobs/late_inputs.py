@@ -92,7 +92,7 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
         ) from error
     except ValidationError as error:
         detail = (
-            f"In this version of the server, these parameters of {kind.name} are not valid: "
+            f"In this version of the server, these parameters of {row.kind} are not valid: "
             f"{plain_reason(error.errors()[0]['msg'])}"
         )
         raise LateInputError("invalid-params", detail) from error

@@ -281,7 +281,12 @@ def _cache_key(one: NewJob, parts: Mapping[tuple[str, int], dict[str, str]], new
     """
     submission, kind, params = one.submission, one.submission.kind, one.submission.params
     inputs = _input_contents(kind, one.pins, parts)
-    tree = {"kind": kind.code_version, "params": params, "seed": submission.request.seed, "inputs": inputs}
+    tree: dict[str, Any] = {
+        "kind": kind.code_version,
+        "params": params,
+        "seed": submission.request.seed,
+        "inputs": inputs,
+    }
     if one.parent_id is not None and kind.fan_out is None:
         tree["task"] = (one.position, submission.task_count)
     if kind.place_counts:

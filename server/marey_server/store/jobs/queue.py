@@ -228,7 +228,7 @@ _LEASE_COLUMNS = (
 )
 
 
-def _claim_statement(*, one_job: bool) -> ReturningUpdate[Any]:
+def _claim_statement(*, one_job: bool) -> ReturningUpdate[*tuple[Any, ...]]:
     """Return the statement that picks jobs of one project and claims them."""
     pick = _pick(one_job=one_job)
     now_us = bindparam("now_us", type_=BigInteger)
@@ -375,7 +375,7 @@ def _trace(tx: Transaction, row: Row[Any]) -> JobTrace | None:
 
 
 def _delay_s(tx: Transaction, row: Row[Any]) -> float:
-    return max(0, tx.now_us - row.run_at_us) / SECOND_US  # type: ignore[no-any-return]
+    return max(0, tx.now_us - row.run_at_us) / SECOND_US
 
 
 def _lease(

@@ -173,7 +173,7 @@ MOST_PARTS = 100
 """Greatest number of pairs of a state and a kind for which the jobs are looked up one after another."""
 
 
-def _parts(project_id: str, filters: JobFilters, order: listing.Order) -> list[Select[Any]]:
+def _parts(project_id: str, filters: JobFilters, order: listing.Order) -> list[Select[*tuple[Any, ...]]]:
     """Divide a list into parts, each of which is stored in an index in the order of the list; return ids of jobs.
 
     Without this division, a list of few jobs, such as those that wait, would read all jobs of the project. Succeeded

@@ -250,7 +250,7 @@ def _latest_tries(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 
 
 def _select_in(
-    tx: Transaction, statement: Select[Any], column: ColumnElement[str], values: Iterable[str]
+    tx: Transaction, statement: Select[*tuple[Any, ...]], column: ColumnElement[str], values: Iterable[str]
 ) -> Iterator[Row[Any]]:
     """Select the rows whose `column` is among `values`, page by page, in the order of the statement.
 

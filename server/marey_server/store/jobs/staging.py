@@ -306,7 +306,7 @@ def named_blobs(tree: Any) -> Iterator[str]:
                 yield value
             else:
                 yield from named_blobs(value)
-    elif isinstance(tree, list | tuple):
+    elif isinstance(tree, (list, tuple)):
         for value in tree:
             yield from named_blobs(value)
 

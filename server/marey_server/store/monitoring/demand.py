@@ -91,11 +91,11 @@ def _count_queued(tx: Transaction, wanted: ColumnElement[bool], limit: int) -> i
     return found
 
 
-def _count_rows(tx: Transaction, rows: Select[Any], most: int) -> int:
+def _count_rows(tx: Transaction, rows: Select[*tuple[Any, ...]], most: int) -> int:
     return int(tx.execute(select(func.count()).select_from(rows.limit(most).subquery())).scalar_one())
 
 
-def _keys(project_id: str, startable: ColumnElement[bool]) -> Select[Any]:
+def _keys(project_id: str, startable: ColumnElement[bool]) -> Select[*tuple[Any, ...]]:
     """Return the concurrency keys of which one job could start now.
 
     Each step looks up the next key in the index, so the cost depends on the number of keys, not of jobs.

@@ -63,7 +63,7 @@ def _unfinished_jobs(tx: Transaction, project_id: str, items: Collection[str]) -
     return found
 
 
-def _references(items: Collection[str]) -> Select[Any]:
+def _references(items: Collection[str]) -> Select[*tuple[Any, ...]]:
     """Return a query for pairs of ids: an item of `items` (`held`), and another item that refers to it (`by`)."""
     return (
         select(document_item.c.item_id.label("held"), revision_part.c.item_id.label("by"))

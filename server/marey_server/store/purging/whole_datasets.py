@@ -13,7 +13,7 @@ from typing import Any
 
 from sqlalchemy import Row, delete, exists, func, select
 
-from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, words_of
+from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, ItemHolder, JobHolder, words_of
 from marey_server import faults
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import projects
@@ -140,9 +140,10 @@ def _answer(
     row = _find(tx, project_row, prepared.id)
     others = (dataset.c.project_id == project_row.id, dataset.c.name == row.name, dataset.c.id != row.id)
     held = holders_of(tx, prepared.citing)
+    holders = tuple(one for one in held.holders if isinstance(one, ItemHolder | JobHolder))
     return DatasetPurgeAnswer(
         preview=request.preview, dataset=row.id, name=row.name, commits=_count(tx, dataset_commit, row.id),
-        proposals=_count(tx, proposal, row.id), holders=tuple(held.holders), others=held.others,
+        proposals=_count(tx, proposal, row.id), holders=holders, others=held.others,
         freed_bytes=prepared.freed_bytes,
         same_name=tx.execute(select(func.count()).where(*others, dataset.c.deleted_us.is_not(None))).scalar_one(),
     )  # fmt: skip

@@ -83,7 +83,7 @@ def exceeded(
     )
 
 
-def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
+def _used(tx: Transaction, quota: str, user_id: str) -> Select[*tuple[Any, ...]]:
     if quota == "user_uploads":
         return select(func.count()).select_from(upload).where(*_open(user_id))
     if quota == "user_upload_bytes":

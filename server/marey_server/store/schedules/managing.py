@@ -54,8 +54,9 @@ def create_schedule(tx: Transaction, project: str, request: ScheduleCreate) -> S
     _check_job(tx, row, request.job)
     due_us = next_time_us(request.cron, request.timezone, tx.now_us)
     counting.require_place(tx, row.id, schedule)
+    schedule_id = new_id("schedule")
     values = {
-        "id": new_id("schedule"), "project_id": row.id, "name": request.name, "cron": request.cron,
+        "id": schedule_id, "project_id": row.id, "name": request.name, "cron": request.cron,
         "timezone": request.timezone, "job": request.job.model_dump(mode="json", exclude_unset=True),
         "overlapping": request.overlapping, "description": request.description,
         "due_us": None if request.paused else due_us, "created_us": tx.now_us, "updated_us": tx.now_us, "rev": 1,
@@ -64,7 +65,7 @@ def create_schedule(tx: Transaction, project: str, request: ScheduleCreate) -> S
     made = tx.execute(tx.insert_or_ignore(schedule, values).returning(schedule.c.id)).first()
     if made is None:
         raise ConflictProblem(f"The project has a schedule {request.name!r} already.", code="schedule-exists")
-    tx.audit("schedule.created", values["id"], about=request.name, project_id=row.id)
+    tx.audit("schedule.created", schedule_id, about=request.name, project_id=row.id)
     return _shown(project, _find(tx, row, request.name))
 
 
@@ -143,7 +144,7 @@ def _no_schedule(name: str) -> NotFoundProblem:
     return NotFoundProblem(f"The project has no schedule {name!r}.", code="no-schedule")
 
 
-def _rows(row: ProjectRow) -> Select[Any]:
+def _rows(row: ProjectRow) -> Select[*tuple[Any, ...]]:
     return (
         select(*schedule.c, user.c.name.label("author"))
         .select_from(schedule.outerjoin(user, user.c.id == schedule.c.author_id))

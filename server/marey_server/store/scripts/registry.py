@@ -134,7 +134,7 @@ def find_script(tx: Transaction, row: ProjectRow, name: str) -> Row[Any]:
     return found
 
 
-def _rows(row: ProjectRow) -> Select[Any]:
+def _rows(row: ProjectRow) -> Select[*tuple[Any, ...]]:
     return (
         select(*script.c, user.c.name.label("author"))
         .select_from(script.outerjoin(user, user.c.id == script.c.author_id))

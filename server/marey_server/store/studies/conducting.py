@@ -103,7 +103,7 @@ def create_links(
 
 def _require_consent(tx: Transaction, design: StudyDocument) -> None:
     """Raise `ConflictProblem` if the consent of a performer has ended, because participants would see the motion."""
-    ended = find_ended_consents(tx, (one.clip.item for one in design.motions))  # type: ignore[union-attr]
+    ended = find_ended_consents(tx, (one.revision.item for one in design.motions))
     require_consent(list(ended.values()))
 
 

@@ -36,7 +36,7 @@ from marey_server.store.transaction import Transaction
 _NO_HASH = hash_secret("")  # of no code, because secrets are not empty
 
 
-def _rows() -> Select[Any]:
+def _rows() -> Select[*tuple[Any, ...]]:
     """Return a query for participants with the name and the project of their study, and whether it still exists."""
     alive = item.c.deleted_us.is_(None) & project.c.deleted_us.is_(None)
     return (

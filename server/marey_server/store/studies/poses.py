@@ -47,7 +47,7 @@ def find_shown_part(tx: Transaction, clip: int, part: ShownPart) -> FoundPart:
 
 
 def _place_of(motion: StudyMotion) -> tuple[str, int]:
-    return motion.clip.item, motion.clip.revision  # type: ignore[union-attr]  # references to outputs were resolved
+    return motion.revision.item, motion.revision.revision
 
 
 def _gone() -> GoneProblem:

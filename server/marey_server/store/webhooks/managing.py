@@ -60,7 +60,7 @@ def no_webhook(webhook_id: str) -> NotFoundProblem:
     return NotFoundProblem(f"The project has no webhook {webhook_id!r}.", code="no-webhook")
 
 
-def _rows(project_row: ProjectRow) -> Select[Any]:
+def _rows(project_row: ProjectRow) -> Select[*tuple[Any, ...]]:
     return (
         select(*_SHOWN, user.c.name.label("creator"), _DEAD.label("dead"))
         .select_from(webhook.outerjoin(user, user.c.id == webhook.c.creator_id))

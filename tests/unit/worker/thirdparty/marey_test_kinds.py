@@ -6,7 +6,7 @@ import os
 import random
 import resource
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ def add(context: Context, params: AddParams) -> dict[str, int]:
 
 
 def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
-    return {
+    ways: dict[str, Callable[[], Any]] = {
         "raise": _raise, "refuse": _refuse, "segfault": _segfault, "exit": _exit, "eat": _eat,
         "hoard": lambda: _hoard(Path(params.folder)), "wait": lambda: _wait(Path(params.folder)),
         "fork-and-raise": _fork_and_raise,
@@ -55,7 +55,8 @@ def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
         "have-no-mapping": lambda: {
             "mapping": context.document(Kind.SKELETON, "skeleton_gone", 1, "mapping", required=False)
         },
-    }[params.how]()  # fmt: skip
+    }  # fmt: skip
+    return ways[params.how]()
 
 
 def _raise() -> None:

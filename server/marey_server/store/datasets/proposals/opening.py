@@ -76,7 +76,7 @@ def is_proposal(dataset_id: str, number: int) -> tuple[ColumnElement[bool], ...]
     return proposal.c.dataset_id == dataset_id, proposal.c.number == number
 
 
-def _rows(dataset_id: str) -> Select[Any]:
+def _rows(dataset_id: str) -> Select[*tuple[Any, ...]]:
     followed = and_(
         _SOURCE.c.dataset_id == proposal.c.dataset_id, _SOURCE.c.name == proposal.c.source, proposal.c.head.is_(None)
     )

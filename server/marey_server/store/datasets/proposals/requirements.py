@@ -17,7 +17,7 @@ from marey_server.store.tables import member, proposal_check, proposal_review, u
 from marey_server.store.transaction import Transaction
 
 
-def select_reviews(row: Row[Any]) -> Select[Any]:
+def select_reviews(row: Row[Any]) -> Select[*tuple[Any, ...]]:
     """Return the query of the reviews of a proposal, with the names of the reviewers."""
     return (
         select(proposal_review, user.c.name)

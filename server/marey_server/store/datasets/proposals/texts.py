@@ -73,6 +73,6 @@ def _require_room_in_project(tx: Transaction, project_row: ProjectRow, more: int
         )
 
 
-def _size(tx: Transaction, table: Table, text: ColumnElement[Any]) -> Select[Any]:
+def _size(tx: Transaction, table: Table, text: ColumnElement[Any]) -> Select[*tuple[Any, ...]]:
     size = func.octet_length(text) if tx.is_postgres else func.length(cast(text, LargeBinary))
     return select(func.coalesce(func.sum(size + BYTES_OF_ROW), 0)).select_from(table)

@@ -113,7 +113,7 @@ def projects_with_queued_jobs() -> CTE:
     return found.union_all(select(following).where(found.c.project_id.is_not(None)))
 
 
-def _turns_statement(restriction: Restriction) -> Select[Any]:
+def _turns_statement(restriction: Restriction) -> Select[*tuple[Any, ...]]:
     candidate = job.alias("candidate")
     source: FromClause
     if restriction.one_job:
