@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sqlalchemy
 from sqlalchemy import ScalarSelect
+from tests.support.kept_rows import made_once
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.encoding import blocks
@@ -47,7 +48,7 @@ class FullLab(Lab):
 
 @pytest.fixture
 def full(database: Database) -> FullLab:
-    return FullLab(database)
+    return made_once(FullLab, database)
 
 
 def findings(lab: Lab) -> set[str]:
