@@ -93,7 +93,7 @@ def test_a_graph_starts_from_one_revision_and_names_newer_and_deleted_ones(lab: 
         graph_of(lab, replace(second, revision=3))
 
 
-@settings(max_examples=examples(12), suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(30), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(edges=st.sets(st.tuples(st.integers(0, 9), st.integers(0, 9)).filter(lambda edge: edge[0] < edge[1])))
 def test_a_graph_holds_what_a_search_of_all_links_finds(lab: Lab, edges: Edges) -> None:
     made: list[Published] = []

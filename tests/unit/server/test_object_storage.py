@@ -177,7 +177,7 @@ def complete(lab: Lab, objects: ObjectsInMemory, data: bytes) -> bool:
     return not found or lab.read(blobs.read_blob, digest_of(data)) == data
 
 
-@settings(max_examples=examples(50), suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(150), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(plan=st.lists(st.sampled_from(STEPS), max_size=14), number=st.integers(0, 2**64))
 def test_no_object_that_a_row_names_is_deleted_in_any_order_of_steps(
     remote: Lab, objects: ObjectsInMemory, clock: AdjustableClock, plan: list[str], number: int

@@ -41,7 +41,7 @@ some_histories = st.integers(1, 12).flatmap(
 )
 
 
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(some_histories, st.data())
 def test_no_common_ancestor_follows_a_nearest_one(parents: Sequence[Sequence[int]], data: st.DataObject) -> None:
     commits = history(parents)
