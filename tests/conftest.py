@@ -14,6 +14,7 @@ from marey_schemas.processes.memory import loading_modules
 
 pytest_plugins = (
     "tests.support.database_fixtures",
+    "tests.support.shared_statements",
     "tests.support.slow_tests",
     "tests.support.tiers",
     "tests.support.store_fixtures",

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from tests.support.database_fixtures import AdjustableClock
+from tests.support.kept_rows import made_once
 from tests.support.store_fixtures import ALL_RIGHTS
 
 from marey_schemas.access import ProjectCreate, ProjectQuotaChange, UserCreate
@@ -271,6 +272,14 @@ def output(
     return StagedOutput(name=name, kind=Kind.CHARACTER, item_name=name, collection=collection, parts=parts, **fields)
 
 
+def opened_desk(database: Database) -> Desk:
+    """Return a desk whose user and project are new; the clock of the database must be an `AdjustableClock`."""
+    assert isinstance(database.clock, AdjustableClock)
+    desk = Desk(database, database.clock)
+    desk.open()
+    return desk
+
+
 @pytest.fixture
 def test_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Declare the job kinds of this module in addition to the built-in ones."""
@@ -278,8 +287,6 @@ def test_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def desk(database: Database, clock: AdjustableClock, test_kinds: None) -> Desk:
+def desk(database: Database, test_kinds: None) -> Desk:
     """A new project with a queue, on SQLite and on Postgres."""
-    opened = Desk(database, clock)
-    opened.open()
-    return opened
+    return made_once(opened_desk, database)

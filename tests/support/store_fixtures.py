@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.support.kept_rows import made_once
 
 from marey_schemas.access import MemberChange, ProjectChange, ProjectCreate, Role, UserCreate, Visibility
 from marey_schemas.items import Event, Item, ItemCreate
@@ -162,4 +163,4 @@ class Lab:
 @pytest.fixture
 def lab(database: Database) -> Lab:
     """A project with people in every role, on SQLite and on Postgres."""
-    return Lab(database)
+    return made_once(Lab, database)

@@ -7,7 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -45,20 +45,19 @@ from marey_schemas.imports import ImportEntry
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.jobs import CollectionInput, Job, JobState, Progress
 
+Done = CompletedProcess[str]
 
-def marey(
-    *arguments: Any, env: dict[str, str] | None = None, stdin: str = "", cwd: Path | None = None
-) -> CompletedProcess[str]:
+
+def marey(*arguments: str, env: dict[str, str]) -> Done:
+    """Run a command in a process of its own, and return its result."""
     command = [sys.executable, "-c", "from marey_client.cli import main; main()", *arguments]
-    return subprocess.run(
-        command, capture_output=True, text=True, input=stdin, env={**os.environ, **(env or {})}, cwd=cwd
-    )
+    return subprocess.run(command, capture_output=True, text=True, env={**os.environ, **env})
 
 
-def marey_here(arguments: list[str], env: dict[str, str], cwd: Path) -> CompletedProcess[str]:
+def marey_here(arguments: Iterable[str], env: dict[str, str], cwd: Path | None = None, stdin: str = "") -> Done:
     """Run a command in this process, because starting a process takes long; return its result."""
-    with mock.patch.dict(os.environ, env), contextlib.chdir(cwd):
-        return run_here(arguments)
+    with mock.patch.dict(os.environ, env), contextlib.chdir(cwd or Path.cwd()):
+        return run_here(list(arguments), stdin)
 
 
 NO_OPTIONS = typer.Context(typer.main.get_command(app))
@@ -212,13 +211,13 @@ def test_text_that_an_output_cannot_hold_is_escaped(nowhere: dict[str, str]) -> 
 
 
 def test_a_name_the_server_would_refuse_is_refused_before_it_is_sent(nowhere: dict[str, str]) -> None:
-    done = marey("project", "create", "Not A Name", env=nowhere)
+    done = marey_here(["project", "create", "Not A Name"], nowhere)
     assert done.returncode == 2
     assert done.stderr.startswith("marey: name: ")
 
 
 def test_a_server_that_is_not_there_is_one_line_and_exit_status_1(nowhere: dict[str, str]) -> None:
-    done = marey("project", "ls", env=nowhere)
+    done = marey_here(["project", "ls"], nowhere)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("marey: http://127.0.0.1:9 does not answer")
@@ -226,7 +225,7 @@ def test_a_server_that_is_not_there_is_one_line_and_exit_status_1(nowhere: dict[
 
 
 def test_with_v_the_whole_story_is_told_without_the_token(nowhere: dict[str, str]) -> None:
-    done = marey("project", "ls", "-v", env=nowhere)
+    done = marey_here(["project", "ls", "-v"], nowhere)
     assert done.returncode == 1
     assert "Traceback" in done.stderr
     assert "marey_very_secret" not in done.stderr
@@ -271,7 +270,7 @@ def test_a_final_slash_of_an_address_means_the_folder_even_if_a_clip_has_its_nam
 
 
 def test_a_format_that_cannot_be_written_is_refused_before_anything_is_asked(nowhere: dict[str, str]) -> None:
-    done = marey("download", "lab/raw", "--format", "gltf", env=nowhere)
+    done = marey_here(["download", "lab/raw", "--format", "gltf"], nowhere)
     assert done.returncode == 2
     assert "the formats are original, bvh, npz" in done.stderr
 
@@ -672,21 +671,21 @@ def test_a_token_in_a_variable_is_not_rotated(
 def test_without_a_terminal_nobody_is_asked_and_one_line_says_what_to_do(
     arguments: tuple[Any, ...], told: str, nowhere: dict[str, str]
 ) -> None:
-    done = marey(*arguments, env=nowhere)
+    done = marey_here(arguments, nowhere)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert told in done.stderr
 
 
 def test_a_password_may_be_piped(nowhere: dict[str, str]) -> None:
-    done = marey("login", "--name", "ada", env=nowhere, stdin="correct horse battery\n")
+    done = marey_here(["login", "--name", "ada"], nowhere, stdin="correct horse battery\n")
     assert done.returncode == 1
     assert done.stderr.startswith("marey: http://127.0.0.1:9 does not answer")
 
 
 @pytest.mark.parametrize("command", ["download", "sample", "search", "report", "evaluate", "compare"])
 def test_where_files_go_is_called_the_same_by_every_command(command: str) -> None:
-    told = marey(command, "--help").stdout
+    told = marey_here([command, "--help"], {}).stdout
     assert all(name in told for name in ("--out", "--output", "-o"))
 
 
@@ -706,7 +705,7 @@ def test_completion_is_offered_for_the_shell_that_starts_the_command(nowhere: di
 
 
 def test_version_is_told() -> None:
-    done = marey("--version")
+    done = marey_here(["--version"], {})
     assert done.stdout.startswith("marey ")
 
 

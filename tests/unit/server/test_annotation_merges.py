@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from sqlalchemy import func, select, update
 from tests.support.committing_desk import CommittingDesk
-from tests.support.queue_desk import Desk
+from tests.support.kept_rows import made_once
+from tests.support.queue_desk import Desk, opened_desk
 from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_schemas.datasets.checkouts import CheckoutRequest
@@ -25,6 +26,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import datasets, fsck, items
+from marey_server.store.database.connections import Database
 from marey_server.store.datasets import merging
 from marey_server.store.documents import load_body
 from marey_server.store.items.drafts import Draft
@@ -109,10 +111,14 @@ class LabellingDesk(CommittingDesk):
         return list(fsck.check_store(self.desk.database))
 
 
+def labelling_desk(database: Database) -> LabellingDesk:
+    return LabellingDesk(opened_desk(database))
+
+
 @pytest.fixture
-def labelling(desk: Desk) -> LabellingDesk:
+def labelling(database: Database, test_kinds: None) -> LabellingDesk:
     """A project with one labelled clip, on SQLite and on Postgres."""
-    return LabellingDesk(desk)
+    return made_once(labelling_desk, database)
 
 
 def test_labels_of_different_ranges_are_merged(labelling: LabellingDesk) -> None:

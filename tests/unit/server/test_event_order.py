@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 import sqlalchemy
 from alembic import command
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import insert, select
 from tests.support.store_fixtures import Lab
+from tests.support.tiers import examples
 
 from marey_server.access.principal import SYSTEM
 from marey_server.store import events, projects
@@ -80,6 +81,7 @@ TURNS = st.lists(st.sampled_from(["ann", "ben", "cleo", "numbers", "numbers", "f
 
 def test_a_follower_gets_every_event_once_however_transactions_overlap(lab: Lab) -> None:
     @given(TURNS)
+    @settings(max_examples=examples(30))
     def check(turns: list[str]) -> None:
         overlap = Overlap(lab)
         for name in turns:

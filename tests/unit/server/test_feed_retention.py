@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.interleaving import Step, interleave
 from tests.support.store_fixtures import Lab, declared
+from tests.support.tiers import examples
 
 from marey_schemas.webhooks import WebhookCreate
 from marey_server.access.principal import SYSTEM
@@ -164,6 +165,7 @@ def test_followers_and_webhooks_know_of_every_event_or_how_far_they_were_deleted
     monkeypatch.setattr(events, "DELETED_AT_ONCE", 3)
 
     @given(TURNS)
+    @settings(max_examples=examples(30))
     def check(turns: list[str]) -> None:
         world = World(lab, clock)
         for turn in turns:

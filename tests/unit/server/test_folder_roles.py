@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 from sqlalchemy import func, select
-from tests.support.queue_desk import Desk
+from tests.support.kept_rows import made_once
+from tests.support.queue_desk import Desk, opened_desk
 from tests.support.store_fixtures import Lab, declared, requiring, skeleton_tree
 
 from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, MemberChange, ProjectCreate, Role, UserCreate
@@ -32,6 +33,7 @@ from marey_server.errors import (
     UnauthenticatedProblem,
 )
 from marey_server.store import collections, datasets, items, members, projects, purging, users
+from marey_server.store.database.connections import Database
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.folder_roles import managing, rights
 from marey_server.store.items import Draft, ItemFilters
@@ -336,9 +338,13 @@ class Studio:
         self.desk.complete(lease)
 
 
+def opened_studio(database: Database) -> Studio:
+    return Studio(opened_desk(database))
+
+
 @pytest.fixture
-def studio(desk: Desk) -> Studio:
-    return Studio(desk)
+def studio(database: Database, test_kinds: None) -> Studio:
+    return made_once(opened_studio, database)
 
 
 def test_a_reader_runs_jobs_that_write_to_the_readers_folder(studio: Studio) -> None:

@@ -7,6 +7,7 @@ import pytest
 import sqlalchemy
 import sqlalchemy.exc
 from sqlalchemy import ScalarSelect
+from tests.support.kept_rows import made_once
 from tests.support.present import present
 from tests.support.store_fixtures import Lab
 
@@ -49,7 +50,7 @@ class FullLab(Lab):
 
 @pytest.fixture
 def full(database: Database) -> FullLab:
-    return FullLab(database)
+    return made_once(FullLab, database)
 
 
 def findings(lab: Lab) -> set[str]:

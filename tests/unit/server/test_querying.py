@@ -12,8 +12,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import event, update
+from tests.support.kept_rows import made_once
 from tests.support.store_fixtures import Lab, motion_tree, skeleton_tree
-from tests.support.tiers import examples
+from tests.support.tiers import examples, is_soak
 
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
@@ -86,7 +87,7 @@ class QueriedLab(Lab):
 
 @pytest.fixture
 def queried(database: Database) -> QueriedLab:
-    return QueriedLab(database)
+    return made_once(QueriedLab, database)
 
 
 def values_of(lab: QueriedLab, clip: Item, field: str) -> list[Any]:
@@ -201,11 +202,12 @@ queries = st.recursive(
 @example("subject = 02 and not action ~ walk and tag = night", 1000)
 @example("frames > 4.5 and frames <= 1e14 and not frames < -1e14", 1000)
 @example("frames in (4.5, 5, 1e14) or not frames >= 5.5", 1000)
+@example("frames < 4.5 and not frames > 5", 1000)
 @example("shoot_day = 2025-03-01T10:00", 1000)
 @example("shoot_day = 2025-03-01T10:00", 0)
 @example("shoot_day in (2025-02-28, 2025-03-01T10:00)", 1000)
 @example("action in (walk, Übung) and subject in (02, 2)", 3)
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(150))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(50))
 def test_sql_selects_what_the_conditions_say(queried: QueriedLab, text: str, few: int) -> None:
     query = parse(text)
     expected = {clip.id for clip in queried.clips if selects(queried, query, clip)}
@@ -241,6 +243,8 @@ def test_fields_of_times_compare_with_the_time_of_the_item(queried: QueriedLab) 
 
 ODD = ("text", 10**400, {"a": "b"})
 """Values that a document of a model may put into its summary."""
+CONVERTED = ("rate", "duration", "joints", "shoot_day", "consent_until")
+"""Fields whose values in the summary the database converts to numbers or days; a value may be impossible to convert."""
 
 
 @pytest.mark.parametrize("value", ODD, ids=str)
@@ -250,13 +254,20 @@ def test_odd_values_in_a_summary_break_no_query(queried: QueriedLab, value: obje
     with queried.database.engine.begin() as connection:
         changed = update(item_table).where(item_table.c.id == odd.id).values(summary=dict.fromkeys(names, value))
         connection.execute(changed)
-    for name, field in FIELDS.items():
-        pool = {"text": "walk", "number": "1", "date": "2025-02-28"}[field.type]
-        for operator in OPERATORS[field.type]:
-            condition = {"has": f"has {name}", "in": f"{name} in ({pool})"}.get(operator, f"{name} {operator} {pool}")
-            for text in (condition, f"not {condition}"):
-                items_found = queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query=text), limit=100).items
-                assert len(items_found) <= len(queried.clips)
+    for number, (name, operator) in enumerate(operated_fields()):
+        if name not in CONVERTED and number % len(ODD) != ODD.index(value) and not is_soak():
+            continue  # one of the odd values is enough
+        pool = {"text": "walk", "number": "1", "date": "2025-02-28"}[FIELDS[name].type]
+        condition = {"has": f"has {name}", "in": f"{name} in ({pool})"}.get(operator, f"{name} {operator} {pool}")
+        for text in (condition, f"not {condition}"):
+            items_found = queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query=text), limit=100).items
+            assert len(items_found) <= len(queried.clips)
+
+
+def operated_fields() -> list[tuple[str, str]]:
+    """Return all pairs of a field and an operator; pairs with the same operator follow each other."""
+    pairs = [(name, operator) for name, field in FIELDS.items() for operator in OPERATORS[field.type]]
+    return sorted(pairs, key=lambda pair: (pair[1], pair[0]))
 
 
 def test_a_query_that_cannot_be_read_is_refused_with_its_place(queried: QueriedLab) -> None:

@@ -17,11 +17,19 @@ from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem, NotFoundProblem
 from marey_server.store import blobs, events, garbage, items, members, users
 from marey_server.store.items.drafts import Draft
-from marey_server.store.jobs import reading, retrying
+from marey_server.store.jobs import reading, result_cache, retrying
 from marey_server.store.jobs.reaper import share_waiting
-from marey_server.store.jobs.result_cache import SHARED_AT_ONCE
 from marey_server.store.tables import staged_output
 from marey_server.store.transaction import Transaction
+
+AT_ONCE = 4
+"""Greatest number of jobs that get a shared result in one transaction, with the fixture `few_at_once`."""
+
+
+@pytest.fixture
+def few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let few jobs be as many as get a shared result in one transaction."""
+    monkeypatch.setattr(result_cache, "SHARED_AT_ONCE", AT_ONCE)
 
 
 def fail_for_good(desk: Desk, job: str | None = None) -> None:
@@ -503,9 +511,10 @@ def test_who_waited_for_a_job_that_failed_does_the_whole_alone(desk: Desk) -> No
     assert (lease.job, lease.position, lease.size) == (joined, None, None)
 
 
+@pytest.mark.usefixtures("few_at_once")
 def test_a_task_whose_source_was_gathered_away_before_its_turn_is_done_again(desk: Desk) -> None:
     gate = desk.submit()
-    surveys = [a_survey(desk, tasks=2, after=[gate], into=f"place{n}") for n in range(66)]
+    surveys = [a_survey(desk, tasks=2, after=[gate], into=f"place{n}") for n in range(AT_ONCE + 2)]
     desk.complete(desk.claim(job=gate))
     leases = desk.claim_many()
     assert len(leases) == 2  # the tasks of all others wait for these
@@ -651,12 +660,13 @@ def test_a_result_whose_documents_are_gone_is_computed_again(desk: Desk) -> None
     assert desk.state(desk.submit("sum")) == "queued"
 
 
+@pytest.mark.usefixtures("few_at_once")
 def test_more_shared_results_than_fit_one_transaction_are_served_bit_by_bit(desk: Desk) -> None:
     desk.submit("sum")
-    joined = desk.submit_many(*(JobCreate(kind="sum", into=f"place{n}") for n in range(100)))
+    joined = desk.submit_many(*(JobCreate(kind="sum", into=f"place{n}") for n in range(2 * AT_ONCE + 1)))
     desk.complete(desk.claim())
     states = [desk.state(job) for job in joined]
-    assert 0 < states.count("succeeded") < 100
+    assert states.count("succeeded") == AT_ONCE
     while desk.database.write(SYSTEM, share_waiting):
         pass
     assert {desk.state(job) for job in joined} == {"succeeded"}
@@ -687,12 +697,13 @@ def test_a_job_that_cannot_have_a_shared_result_stops_neither_its_source_nor_oth
     assert desk.state(misplaced) == "succeeded"
 
 
+@pytest.mark.usefixtures("few_at_once")
 def test_a_job_that_cannot_have_a_result_that_is_there_is_computed_and_those_behind_it_get_theirs(desk: Desk) -> None:
     desk.submit("sum")
     lease = desk.claim()
     desk.stage(lease, "total", collection="deep" * 5)
     desk.complete(lease)
-    places = [*(f"place{n}" for n in range(SHARED_AT_ONCE)), LONG_PATH, "last"]
+    places = [*(f"place{n}" for n in range(AT_ONCE)), LONG_PATH, "last"]
     reading = desk.submit_many(*(JobCreate(kind="sum", into=place) for place in places))
     assert [desk.state(job) for job in reading[-3:]] == ["succeeded", "waiting", "waiting"]
     assert desk.database.write(SYSTEM, share_waiting) == 1

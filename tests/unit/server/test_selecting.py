@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
+from tests.support.kept_rows import made_once
 from tests.support.tiers import examples
 from tests.unit.server.test_querying import QueriedLab, queries
 
@@ -17,9 +18,8 @@ from marey_server.store.database.connections import Database
 from marey_server.store.datasets import selecting
 
 
-@pytest.fixture
-def versioned(database: Database) -> QueriedLab:
-    """A project with a version of all its clips; afterwards, some of the clips were changed, and one was deleted."""
+def versioned_lab(database: Database) -> QueriedLab:
+    """Return a project with a version of all its clips; later, some of the clips were changed, and one was deleted."""
     lab = QueriedLab(database)
     lab.write(datasets.create_dataset, "lab", DatasetCreate(name="gaits"))
     puts = tuple(PutEntry(path=f"all/{clip.name}", item=clip.id) for clip in lab.clips)
@@ -30,6 +30,11 @@ def versioned(database: Database) -> QueriedLab:
         lab.write(items.put_part, "lab", Kind.CLIP, clip.id, "info", info, expected_rev=None)
     lab.write(items.delete_item, "lab", Kind.CLIP, lab.clips[0].id, expected_rev=None)
     return lab
+
+
+@pytest.fixture
+def versioned(database: Database) -> QueriedLab:
+    return made_once(versioned_lab, database)
 
 
 def selected_tree(lab: QueriedLab, text: str) -> str | None:
@@ -48,7 +53,7 @@ def selected_tree(lab: QueriedLab, text: str) -> str | None:
 @example("not action = walk and revision = 1")
 @example("subject = 02 and facet.usage > 0 and tag = night")
 @example("not (has facet.usage or has subject) and not folder = raw")
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(100))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(30))
 def test_the_contents_that_are_selected_first_leave_out_no_entry(versioned: QueriedLab, text: str) -> None:
     found = selected_tree(versioned, text)
     with pytest.MonkeyPatch.context() as patch:

@@ -14,13 +14,20 @@ from marey_server.access.principal import SYSTEM
 from marey_server.store import members, users
 from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.reaper import share_waiting
-from marey_server.store.jobs.result_cache import SHARED_AT_ONCE
 from marey_server.store.retention import Retention, retire
 from marey_server.store.tables import staged_output
 from marey_server.store.transaction import Transaction
 
 GPU = {"gpu": "a100"}
 BIG_GPU = {"gpu": "a100", "memory": "large"}
+AT_ONCE = 3
+"""Greatest number of jobs that get a shared result in one transaction, with the fixture `few_at_once`."""
+
+
+@pytest.fixture
+def few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let few jobs be as many as get a shared result in one transaction."""
+    monkeypatch.setattr(result_cache, "SHARED_AT_ONCE", AT_ONCE)
 
 
 def submit(desk: Desk, **fields: Any) -> str:
@@ -175,15 +182,16 @@ def test_of_jobs_that_cannot_have_a_shared_result_one_computes_and_the_others_wa
     assert [desk.job(job).cached_from for job in misplaced].count(lease.job) == 2
 
 
+@pytest.mark.usefixtures("few_at_once")
 def test_of_jobs_whose_shared_result_was_deleted_one_computes_and_the_others_wait_for_it(desk: Desk) -> None:
     submit(desk)
-    waiting = [submit(desk, into=f"place{number}") for number in range(SHARED_AT_ONCE + 3)]
+    waiting = [submit(desk, into=f"place{number}") for number in range(AT_ONCE + 3)]
     lease = desk.claim()
     desk.stage(lease, "total")
     desk.complete(lease)
     change_drafts(desk, parts={"character": f"sha256:{'0' * 64}"})
     share_rest(desk)
-    assert states(desk, waiting) == {"succeeded": SHARED_AT_ONCE, "queued": 1, "waiting": 2}
+    assert states(desk, waiting) == {"succeeded": AT_ONCE, "queued": 1, "waiting": 2}
     assert states(desk, [submit(desk, into="new")]) == {"waiting": 1}
     lease = desk.claim()
     desk.stage(lease, "total")
@@ -191,22 +199,24 @@ def test_of_jobs_whose_shared_result_was_deleted_one_computes_and_the_others_wai
     assert states(desk, waiting) == {"succeeded": len(waiting)}
 
 
+@pytest.mark.usefixtures("few_at_once")
 @pytest.mark.parametrize("draft", [{"reuse": None, "kind": "no-kind"}, {"sources": {"things": [["item_1", 1]]}}])
 def test_a_result_stored_in_a_form_that_cannot_be_read_is_computed_again(desk: Desk, draft: dict[str, Any]) -> None:
     submit(desk)
-    waiting = [submit(desk, into=f"place{number}") for number in range(SHARED_AT_ONCE + 2)]
+    waiting = [submit(desk, into=f"place{number}") for number in range(AT_ONCE + 2)]
     lease = desk.claim()
     desk.stage(lease, "total")
     desk.complete(lease)
     change_drafts(desk, **draft)
     share_rest(desk)
-    assert states(desk, waiting[SHARED_AT_ONCE:]) == {"queued": 1, "waiting": 1}
+    assert states(desk, waiting[AT_ONCE:]) == {"queued": 1, "waiting": 1}
 
 
+@pytest.mark.usefixtures("few_at_once")
 def test_a_waiting_job_whose_source_was_deleted_because_it_was_old_computes_the_result(desk: Desk) -> None:
     submit(desk)
     desk.complete(desk.claim())
-    waiting = desk.submit_many(*[JobCreate(kind="sum")] * (SHARED_AT_ONCE + 2))[SHARED_AT_ONCE:]
+    waiting = desk.submit_many(*[JobCreate(kind="sum")] * (AT_ONCE + 2))[AT_ONCE:]
     assert states(desk, waiting) == {"waiting": 2}
     desk.clock.advance(3 * 86400)
     retire(desk.database, Retention(jobs_days=1))
@@ -269,11 +279,12 @@ def test_a_result_gathered_from_tasks_is_shared_only_if_the_results_of_all_tasks
     assert (again.state, again.cached_from) == (("succeeded", first) if shareable else ("running", None))
 
 
+@pytest.mark.usefixtures("few_at_once")
 def test_a_task_whose_source_was_released_before_its_turn_gets_no_empty_result(desk: Desk) -> None:
     desk.things(1)
     fields: dict[str, Any] = {"params": {"number": 2}, "inputs": {"things": {"collection": "raw"}}}
     gate = desk.submit()
-    surveys = [desk.submit("survey", after=[gate], into=f"place{n}", **fields) for n in range(SHARED_AT_ONCE + 2)]
+    surveys = [desk.submit("survey", after=[gate], into=f"place{n}", **fields) for n in range(AT_ONCE + 2)]
     desk.complete(desk.claim(job=gate))
     for number, lease in enumerate(desk.claim_many()):
         desk.stage(lease, f"piece{number}")
