@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import pickle
+import socket
 import ssl
 from datetime import timedelta
 from pathlib import Path
@@ -14,9 +15,9 @@ import numpy as np
 import pytest
 from tests.support.scripted_server import ScriptedServer, problem
 
-from marey_client import errors
+from marey_client import errors, transport
 from marey_client.marey import Marey
-from marey_client.retries import Retries
+from marey_client.retries import ONCE, Retries
 from marey_client.transport import trusted_authorities
 from marey_schemas.access import Login, NewToken, ProjectCreate, TokenCreate
 from marey_schemas.encoding.codecs import encode_tree
@@ -285,6 +286,27 @@ def test_authorities_of_the_house_are_trusted_beside_the_public_ones(
     assert len(names) > 50
     assert trusted.verify_mode is ssl.CERT_REQUIRED
     assert trusted.check_hostname
+
+
+def test_certificates_are_read_by_the_first_request_with_tls(monkeypatch: pytest.MonkeyPatch) -> None:
+    contexts: list[ssl.SSLContext] = []
+
+    def read() -> ssl.SSLContext:
+        contexts.append(trusted_authorities())
+        return contexts[-1]
+
+    monkeypatch.setattr(transport, "trusted_authorities", read)
+    with socket.socket() as closed:  # refuses connections, because it does not listen
+        closed.bind(("127.0.0.1", 0))
+        place = f"127.0.0.1:{closed.getsockname()[1]}"
+        for scheme, count in (("http", 0), ("https", 1)):
+            with Marey(f"{scheme}://{place}", "marey_secret", retries=ONCE) as marey:
+                assert contexts == []
+                for _ in range(2):
+                    with pytest.raises(errors.Unreachable):
+                        list(marey.projects())
+            assert len(contexts) == count
+    assert contexts[0].verify_mode is ssl.CERT_REQUIRED
 
 
 def test_a_password_is_sent_though_it_hides_itself(script: ScriptedServer) -> None:
