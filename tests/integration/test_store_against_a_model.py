@@ -17,7 +17,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from tests.support.store_fixtures import Lab
-from tests.support.tiers import examples, is_soak, steps
+from tests.support.tiers import examples, steps
 
 from marey_schemas.items import Item, ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
@@ -180,7 +180,7 @@ def test_items_are_what_the_model_says(database: Database) -> None:
     run_state_machine_as_test(
         machine,
         settings=settings(
-            max_examples=examples(12 if is_soak() else 6),
+            max_examples=examples(12),
             stateful_step_count=steps(20),
             deadline=None,
             suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
