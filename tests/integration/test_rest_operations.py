@@ -38,9 +38,10 @@ class Process:
 
     def __init__(self, folder: Path, **environment: str) -> None:
         self.folder = folder
+        own = {"MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json", "MAREY_WARM_UP": "false"}
         self.process = subprocess.Popen(
             [sys.executable, "-c", SERVE + "asyncio.run(serve(Settings()))"],
-            env={**os.environ, "MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json", **environment},
+            env={**os.environ, **own, **environment},
             stderr=subprocess.PIPE,
             text=True,
         )
@@ -97,26 +98,32 @@ def test_a_fresh_folder_gets_a_database_and_an_administrator_whose_token_only_th
     assert again.end() == 0
 
 
-def test_requests_are_logged_as_json_with_who_what_and_how_long(process: Process) -> None:
-    headers = {"Authorization": f"Bearer {process.token}", "X-Request-Id": "trace-me-please"}
-    httpx.get(f"{process.address}/api/v1/projects/secret-name", headers=headers)
-    process.end()
-    (line,) = [line for line in process.lines if line.get("request_id") == "trace-me-please"]
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> Process:
+    """A server that has answered requests and ended; tests examine its log."""
+    process = Process(tmp_path_factory.mktemp("ended") / "data")
+    headers = {"Authorization": f"Bearer {process.token}"}
+    for _ in range(3):
+        assert httpx.get(f"{process.address}/readyz").status_code == 200
+    url, asked = f"{process.address}/api/v1/leases", {"worker": "w", "kinds": ["retarget"]}
+    found = httpx.post(url, json=asked, headers=headers)
+    assert (found.status_code, found.json()["leases"]) == (200, [])
+    for path in ("/healthz", "/readyz", "/metrics", "/api/v1/me"):
+        assert httpx.get(process.address + path, headers=headers).status_code == 200
+    assert httpx.post(url, json=asked).status_code == 401
+    traced = headers | {"X-Request-Id": "trace-me-please"}
+    assert httpx.get(f"{process.address}/api/v1/projects/secret-name", headers=traced).status_code == 404
+    assert process.end() == 0
+    return process
+
+
+def test_requests_are_logged_as_json_with_who_what_and_how_long(ended: Process) -> None:
+    (line,) = [line for line in ended.lines if line.get("request_id") == "trace-me-please"]
     assert line["principal"] == "admin"
     assert line["route"] == "/api/v1/projects/{project}"
     assert (line["method"], line["status"]) == ("GET", 404)
     assert line["duration_ms"] > 0
-    assert not any("secret-name" in json.dumps(line) or process.token in json.dumps(line) for line in process.lines)
-
-
-def test_questions_for_readiness_are_not_logged(process: Process) -> None:
-    before = len(process.lines)
-    for _ in range(3):
-        assert httpx.get(f"{process.address}/readyz").status_code == 200
-    process.end()
-    told = [line for line in process.lines[before:] if line["logger"] != "marey_server.app"]
-    assert told == []
-    assert any(line["message"].startswith("Running upgrade") for line in process.lines)
+    assert not any("secret-name" in json.dumps(line) or ended.token in json.dumps(line) for line in ended.lines)
 
 
 def test_a_stopping_server_finishes_what_it_began_and_takes_nothing_new(process: Process) -> None:
@@ -281,27 +288,21 @@ def test_signing_in_gives_a_token_and_signing_out_ends_it(database: Database, tm
         assert server.client().post("/login", json=again).status_code == 200
 
 
-def test_a_log_tells_where_everything_is_and_what_to_do_next(process: Process) -> None:
-    process.end()
-    told = "\n".join(line["message"] for line in process.lines)
-    assert f"data: {process.folder}; database: {process.folder / 'marey.db'}" in told
-    assert f"administrator: admin; a token of an administrator is in {process.folder / 'admin.token'}" in told
-    assert f"marey --server {process.address} --token-file {process.folder / 'admin.token'} project create lab" in told
-    assert process.token not in told
+def test_a_log_tells_where_everything_is_and_what_to_do_next(ended: Process) -> None:
+    told = "\n".join(line["message"] for line in ended.lines)
+    assert f"data: {ended.folder}; database: {ended.folder / 'marey.db'}" in told
+    assert f"administrator: admin; a token of an administrator is in {ended.folder / 'admin.token'}" in told
+    assert f"marey --server {ended.address} --token-file {ended.folder / 'admin.token'} project create lab" in told
+    assert ended.token not in told
 
 
-def test_questions_for_work_that_find_none_and_probes_are_not_logged(process: Process) -> None:
-    headers = {"Authorization": f"Bearer {process.token}"}
-    asked = httpx.post(f"{process.address}/api/v1/leases", json={"worker": "w", "kinds": ["retarget"]}, headers=headers)
-    assert (asked.status_code, asked.json()["leases"]) == (200, [])
-    for path in ("/healthz", "/readyz", "/metrics", "/api/v1/me"):
-        assert httpx.get(process.address + path, headers=headers).status_code == 200
-    assert (
-        httpx.post(f"{process.address}/api/v1/leases", json={"worker": "w", "kinds": ["retarget"]}).status_code == 401
-    )
-    process.end()
-    logged = [(line["route"], line["status"]) for line in process.lines if "route" in line]
-    assert logged == [("/api/v1/me", 200), ("/api/v1/leases", 401)]
+def test_questions_for_work_that_find_none_and_probes_are_not_logged(ended: Process) -> None:
+    logged = [(line["route"], line["status"]) for line in ended.lines if "route" in line]
+    assert logged == [("/api/v1/me", 200), ("/api/v1/leases", 401), ("/api/v1/projects/{project}", 404)]
+    after = next(number for number, line in enumerate(ended.lines) if "listening" in line["message"])
+    others = {line["logger"] for line in ended.lines[after + 1 :] if "route" not in line}
+    assert others <= {"marey_server.app"}
+    assert any(line["message"].startswith("Running upgrade") for line in ended.lines)
 
 
 def test_a_worker_beside_the_server_logs_in_the_same_form(tmp_path: Path) -> None:

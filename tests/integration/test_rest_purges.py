@@ -170,25 +170,22 @@ def test_a_preview_changes_nothing_and_events_record_the_purge(lab: Lab, owner: 
     assert (last.kind, last.actor) == ("item.purged", lab.owner.user_name)
 
 
-@pytest.mark.parametrize(
-    ("body", "status", "told"),
-    [
-        ({}, 422, "give an item, a path, a collection or a query"),
-        ({"preview": True}, 422, "an empty collection is the whole project"),
-        ({"collection": "raw", "older_than_days": -1}, 422, "older_than_days"),
-        ({"collection": "raw", "oldr_than_days": 1}, 422, "oldr_than_days"),
-        ({"collection": "raw", "kind": "stone"}, 422, "kind"),
-        ({"query": "frames >"}, 400, "column 9"),
-        ({"collection": "", "after": "x"}, 400, "must be the value of `next`"),
-        ({"item": "clip_nobody"}, 404, "There is no item 'clip_nobody'"),
-    ],
-)
-def test_wrong_requests_are_told_what_is_wrong(
-    lab: Lab, owner: httpx.Client, body: dict[str, Any], status: int, told: str
-) -> None:
-    answer = purge(owner, **body)
-    assert answer.status_code == status, answer.text
-    assert told in answer.text
+WRONG: list[Any] = [
+    ({}, 422, "give an item, a path, a collection or a query"),
+    ({"preview": True}, 422, "an empty collection is the whole project"),
+    ({"collection": "raw", "older_than_days": -1}, 422, "older_than_days"),
+    ({"collection": "raw", "oldr_than_days": 1}, 422, "oldr_than_days"),
+    ({"collection": "raw", "kind": "stone"}, 422, "kind"),
+    ({"query": "frames >"}, 400, "column 9"),
+    ({"collection": "", "after": "x"}, 400, "must be the value of `next`"),
+    ({"item": "clip_nobody"}, 404, "There is no item 'clip_nobody'"),
+]
+
+
+def test_wrong_requests_are_told_what_is_wrong(lab: Lab, owner: httpx.Client) -> None:
+    for body, status, told in WRONG:
+        answer = purge(owner, **body)
+        assert (answer.status_code, told in answer.text) == (status, True), (body, answer.text)
 
 
 def test_an_item_that_is_not_deleted_is_refused_and_stays(lab: Lab, owner: httpx.Client) -> None:

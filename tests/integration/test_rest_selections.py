@@ -64,25 +64,23 @@ def in_folder(owner: httpx.Client) -> list[str]:
     return sorted(f"{one['collection'].removeprefix('gaits').lstrip('/')}/{one['name']}" for one in found)
 
 
-@pytest.mark.parametrize(
-    ("selection", "taken"),
-    [
-        ({"query": "tag = night"}, ["raw/a"]),
-        ({"query": "folder = gaits/raw and not tag = night"}, ["raw/b"]),
-        ({"query": "joints = 1 and name in (a, c)"}, ["old/c", "raw/a"]),
-        ({"paths": ["old", "raw/b"]}, ["old/c", "raw/b"]),
-        ({"paths": ["raw/a", "raw", "raw/b"]}, ["raw/a", "raw/b"]),
-        ({"paths": ["raw"], "query": "path = gaits/old/c or path = gaits/raw/b"}, ["raw/b"]),
-    ],
-)
-def test_only_the_selected_entries_are_taken(
-    owner: httpx.Client, gaits: Callable[..., Any], selection: dict[str, Any], taken: list[str]
-) -> None:
-    assert check_out(owner, **selection) == (len(taken), 3)
-    assert in_folder(owner) == taken
-    refused(owner.post(f"{GAITS}/commits", json={"message": "m"}), 422, "no-changes")
-    assert check_out(owner) == (3, 3)
-    assert in_folder(owner) == list(PATHS)
+TAKEN: list[Any] = [
+    ({"query": "tag = night"}, ["raw/a"]),
+    ({"query": "folder = gaits/raw and not tag = night"}, ["raw/b"]),
+    ({"query": "joints = 1 and name in (a, c)"}, ["old/c", "raw/a"]),
+    ({"paths": ["old", "raw/b"]}, ["old/c", "raw/b"]),
+    ({"paths": ["raw/a", "raw", "raw/b"]}, ["raw/a", "raw/b"]),
+    ({"paths": ["raw"], "query": "path = gaits/old/c or path = gaits/raw/b"}, ["raw/b"]),
+]
+
+
+def test_only_the_selected_entries_are_taken(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    for selection, taken in TAKEN:
+        assert check_out(owner, **selection) == (len(taken), 3)
+        assert in_folder(owner) == taken, selection
+        refused(owner.post(f"{GAITS}/commits", json={"message": "m"}), 422, "no-changes")
+        assert check_out(owner) == (3, 3)
+        assert in_folder(owner) == list(PATHS)
 
 
 def test_a_commit_of_a_part_keeps_what_was_not_checked_out(
@@ -135,24 +133,22 @@ def test_a_selection_that_is_behind_its_branch_is_named(owner: httpx.Client, gai
     assert problem["context"]["checked_out"] == {"commit": first, "query": "tag = night", "paths": ["raw"]}
 
 
-@pytest.mark.parametrize(
-    ("selection", "status", "code"),
-    [
-        ({"query": "tag = day"}, 422, "empty-selection"),
-        ({"query": "tag ="}, 400, "bad-query"),
-        ({"query": "like(a:1) < 1"}, 400, "bad-query"),
-        ({"paths": ["raw", "ra"]}, 404, "no-entry"),
-        ({"paths": [f"{number:03}{'x' * 130}" for number in range(500)]}, 422, "invalid-body"),
-        ({"paths": ["raw", "raw/z"]}, 404, "no-entry"),
-        ({"paths": ["../raw"]}, 404, "no-entry"),
-        ({"query": "joints = 1", "version": "nothing"}, 404, "no-version"),
-    ],
-)
-def test_a_selection_of_nothing_or_of_too_much_is_refused(
-    owner: httpx.Client, gaits: Callable[..., Any], selection: dict[str, Any], status: int, code: str
-) -> None:
-    refused(owner.post(f"{GAITS}/checkout", json=selection), status, code)
-    assert in_folder(owner) == list(PATHS)
+REFUSED: list[Any] = [
+    ({"query": "tag = day"}, 422, "empty-selection"),
+    ({"query": "tag ="}, 400, "bad-query"),
+    ({"query": "like(a:1) < 1"}, 400, "bad-query"),
+    ({"paths": ["raw", "ra"]}, 404, "no-entry"),
+    ({"paths": [f"{number:03}{'x' * 130}" for number in range(500)]}, 422, "invalid-body"),
+    ({"paths": ["raw", "raw/z"]}, 404, "no-entry"),
+    ({"paths": ["../raw"]}, 404, "no-entry"),
+    ({"query": "joints = 1", "version": "nothing"}, 404, "no-version"),
+]
+
+
+def test_a_selection_of_nothing_or_of_too_much_is_refused(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    for selection, status, code in REFUSED:
+        refused(owner.post(f"{GAITS}/checkout", json=selection), status, code)
+        assert in_folder(owner) == list(PATHS), selection
 
 
 def test_a_query_compares_the_content_of_the_version(

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import functools
+import os
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ from marey_schemas.access import MemberChange, ProjectCreate, Role, TokenCreate,
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.app import Application, create_app, listening
 from marey_server.process.children import Children
-from marey_server.process.settings import Settings
+from marey_server.process.settings import PREFIX, Settings
 from marey_server.store import members, projects, users
 from marey_server.store.credentials import tokens
 from marey_server.store.database.connections import Database
@@ -96,6 +97,21 @@ def shared_children() -> SharedChildren:
     return SharedChildren(Settings().child_limits)
 
 
+_CHOSEN: dict[str, Settings] = {}
+
+
+def chosen_settings(folder: Path, given: dict[str, Any]) -> Settings:
+    """Return the settings of a server whose data is in a folder.
+
+    Settings that differ only in this folder are read and checked once, because this takes 3 ms.
+    """
+    variables = sorted(one for one in os.environ.items() if one[0].startswith(PREFIX))
+    key = repr((Path.cwd(), variables, sorted(given.items())))
+    if key not in _CHOSEN:
+        _CHOSEN[key] = Settings(data=folder, port=0, drain_s=5, **given)
+    return _CHOSEN[key].model_copy(update={"data": folder})
+
+
 @contextlib.contextmanager
 def running(database: Database, folder: Path, **settings: Any) -> Iterator[Server]:
     """Run a server with a database until the `with` block ends."""
@@ -104,9 +120,8 @@ def running(database: Database, folder: Path, **settings: Any) -> Iterator[Serve
 
     async def main() -> None:
         stop = asyncio.Event()
-        given: dict[str, Any] = {"script_repositories": (SCRIPTS_AT,), "warm_up": False} | settings
-        chosen = Settings(data=folder, port=0, drain_s=5, **given)
-        children = shared_children() if chosen.child_limits == Settings().child_limits else None
+        chosen = chosen_settings(folder, {"script_repositories": (SCRIPTS_AT,), "warm_up": False} | settings)
+        children = shared_children() if chosen.child_limits == shared_children().limits else None
         app = create_app(chosen, database, children)
         try:
             async with listening(app) as listener:

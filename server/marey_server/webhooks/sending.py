@@ -34,6 +34,7 @@ MOST_OF_ONE_USER = 4
 """Greatest number of requests under way to webhooks of one user, so that no user can occupy all places."""
 RESOLVERS = 16
 """Number of threads that resolve host names, because a slow name server blocks a thread."""
+AGENT = f"marey/{version('marey')}"
 _FIRST_FAILURE = 300
 
 
@@ -87,7 +88,6 @@ class Sender:
             max_body_size=MOST_ANSWER_BYTES,
             max_header_size=MOST_ANSWER_BYTES,
         )
-        self._agent = f"marey/{version('marey')}"
 
     async def send(self, destination: Destination, delivery: Delivery) -> DeliveryResult:
         """Send a delivery once, and return the result. A status from 200 to 299 is a success."""
@@ -97,7 +97,7 @@ class Sender:
         request = HTTPRequest(
             destination.url,
             method="POST",
-            headers={"Content-Type": "application/json", "User-Agent": self._agent, **headers},
+            headers={"Content-Type": "application/json", "User-Agent": AGENT, **headers},
             body=body,
             connect_timeout=TIMEOUT_S,
             request_timeout=TIMEOUT_S,

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import pickle
+import socket
 import ssl
 from datetime import timedelta
 from pathlib import Path
@@ -14,9 +15,9 @@ import numpy as np
 import pytest
 from tests.support.scripted_server import ScriptedServer, problem
 
-from marey_client import errors
+from marey_client import errors, transport
 from marey_client.marey import Marey
-from marey_client.retries import Retries
+from marey_client.retries import ONCE, Retries
 from marey_client.transport import trusted_authorities
 from marey_schemas.access import Login, NewToken, ProjectCreate, TokenCreate
 from marey_schemas.encoding.codecs import encode_tree
@@ -32,30 +33,7 @@ ITEM = {
 }  # fmt: skip
 LOST = httpx.ReadError("connection reset")
 NEVER_CONNECTED = httpx.ConnectError("refused")
-
-
-# A root that signs nothing: its key was thrown away.
-ROOT = """\
------BEGIN CERTIFICATE-----
-MIIDGzCCAgOgAwIBAgIUE+p/D5VmcWOk83BgL/s4u3SisNYwDQYJKoZIhvcNAQEL
-BQAwHDEaMBgGA1UEAwwRUm9vdCBvZiB0aGUgdGVzdHMwIBcNMjYxMTIxMjMwNTI0
-WhgPMjEyNjEwMjgyMzA1MjRaMBwxGjAYBgNVBAMMEVJvb3Qgb2YgdGhlIHRlc3Rz
-MIIBIjANBgkqhkiG9w0BAQEFAAOCAQ8AMIIBCgKCAQEA0fE+P1443dcR9zDOql2v
-tqX9kcmcInFPfpiZfeD5NTkrh8DR3hJleLGV7Cu3KhSdAGCd+xw71EnMhiHnXFFa
-527I7OJuIQGpYVQkgPmYJHadx/tJEhx11EF9s+IQxuFtgCxUcgB/snO3XhGyhMap
-vcO/9BDYKEk+apGPrMRqwd6Gp+vSti4EQA1m2lQOMEmE1BxcXDcBWj6+dvPDKSKi
-6VuLHQSGBe6f5EgQnr7cPyMu+Ju/AeseZsc4y8AiVxzWqzzv9bP6HV/HS8iWTRNb
-xCcO/8mfM1NT2ivjrPWpjjC3fac76gmxTywAVkGQfW0Lsi1wMoB8tVxK2saKcB+l
-zQIDAQABo1MwUTAdBgNVHQ4EFgQUu9ORHPYrULF9uqJomJbKKBf9ANMwHwYDVR0j
-BBgwFoAUu9ORHPYrULF9uqJomJbKKBf9ANMwDwYDVR0TAQH/BAUwAwEB/zANBgkq
-hkiG9w0BAQsFAAOCAQEAw0GCRLzG5G7pwp/a4+Uv8VRB10L5Bru6GkZnlq7bzUJR
-0DhSmC1J+aYGH2wmmGDu2G59vhOWnXOXJefhKPifHmutk1m7cY2Y1TPtbELcwIaD
-U90/oPZdhuuIkf8O9vmblLVmd6FTV/ESKlmbjo9fyP7G8HyaDV90ey9NIIamVv4W
-ZMlCPfxG9/3BRTHmnVwaYqzrhgmcLKJULwUqN4Df9730jfHUWpxu/aXdo8P98jqC
-VEru/ol8c8Mat9GZhtw5uz64dC0mkMJ4V3Gvp8l9h3WN8Nlgd3pVcpF2FwWPH2cI
-8u7F4MKFVDYKpWpdPD8J7YzxcUz7ZzhGk05SqFl90w==
------END CERTIFICATE-----
-"""
+ROOT = Path(__file__).parents[2] / "support" / "root_of_nobody.pem"
 
 
 def ok(document: dict[str, Any], status: int = 200) -> httpx.Response:
@@ -270,13 +248,10 @@ def test_what_is_no_address_is_refused_before_anything_is_sent(url: str) -> None
         Marey(url, "marey_secret")
 
 
-def test_authorities_of_the_house_are_trusted_beside_the_public_ones(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_authorities_of_the_house_are_trusted_beside_the_public_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SSL_CERT_FILE", raising=False)
     public = len(trusted_authorities().get_ca_certs())
-    (tmp_path / "root.pem").write_text(ROOT)
-    monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "root.pem"))
+    monkeypatch.setenv("SSL_CERT_FILE", str(ROOT))
     trusted = trusted_authorities()
     authorities: list[dict[str, Any]] = trusted.get_ca_certs()
     names = [dict(part[0] for part in one["subject"]).get("commonName") for one in authorities]
@@ -285,6 +260,27 @@ def test_authorities_of_the_house_are_trusted_beside_the_public_ones(
     assert len(names) > 50
     assert trusted.verify_mode is ssl.CERT_REQUIRED
     assert trusted.check_hostname
+
+
+def test_certificates_are_read_by_the_first_request_with_tls(monkeypatch: pytest.MonkeyPatch) -> None:
+    contexts: list[ssl.SSLContext] = []
+
+    def read() -> ssl.SSLContext:
+        contexts.append(trusted_authorities())
+        return contexts[-1]
+
+    monkeypatch.setattr(transport, "trusted_authorities", read)
+    with socket.socket() as closed:  # refuses connections, because it does not listen
+        closed.bind(("127.0.0.1", 0))
+        place = f"127.0.0.1:{closed.getsockname()[1]}"
+        for scheme, count in (("http", 0), ("https", 1)):
+            with Marey(f"{scheme}://{place}", "marey_secret", retries=ONCE) as marey:
+                assert contexts == []
+                for _ in range(2):
+                    with pytest.raises(errors.Unreachable):
+                        list(marey.projects())
+            assert len(contexts) == count
+    assert contexts[0].verify_mode is ssl.CERT_REQUIRED
 
 
 def test_a_password_is_sent_though_it_hides_itself(script: ScriptedServer) -> None:
