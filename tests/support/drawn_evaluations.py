@@ -21,7 +21,7 @@ from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.matching.database import DatabaseClip
 from marey_reports.drawing.drawn import DrawnFigure
-from marey_reports.evaluation.figures import USE_FIGURES, draw_figure, draw_figures
+from marey_reports.evaluation.figures import COVERAGE_FIGURES, FIGURES, USE_FIGURES, draw_figure, draw_figures
 from marey_schemas.options.evaluation import EvaluationOptions
 
 DRAWN_EVALUATIONS = pytest.mark.xdist_group("evaluations that are drawn")
@@ -118,6 +118,12 @@ LITTLE: dict[str, Callable[[], EvaluationResult]] = {
 """Evaluations that have little to draw."""
 
 SHOWS = {
+    "one clip": ("points", *USE_FIGURES),
+    "clips of one frame": ("points", *USE_FIGURES),
+    "no transitions": ("transition-cost", *USE_FIGURES),
+    "no windows": COVERAGE_FIGURES,
+    "one trial": ("scenario-circle", "offsets", "errors", *COVERAGE_FIGURES),
+    "one speed": ("offsets", *COVERAGE_FIGURES),
     "no tick moved": ("scenario-circle", "scenario-switching", "transition-cost", "errors"),
     "costs unknown": ("transition-cost",),
     "unknown numbers": ("offsets", "usage", "scenario-circle", "scenario-switching", "transition-cost", "errors"),
@@ -126,7 +132,10 @@ SHOWS = {
     "nothing used": USE_FIGURES,
     "no trials": ("offsets", *USE_FIGURES),
 }
-"""For evaluations that differ from the usual one in some data only: the names of the figures that show this data."""
+"""For each evaluation that has little to draw: the names of the figures that show the data in question."""
+
+NAMING = ("points", *USE_FIGURES)
+"""Figures that contain names of clips."""
 
 
 @functools.cache
@@ -137,8 +146,8 @@ def little(name: str) -> EvaluationResult:
 
 @functools.cache
 def drawn_of_little(name: str) -> Mapping[str, DrawnFigure]:
-    """Return the figures of `little(name)` that differ from the usual ones; in the tier `soak`, all its figures."""
-    if name not in SHOWS or is_soak():
+    """Return the figures of `little(name)` that show what is little; in the tier `soak`, all its figures."""
+    if is_soak():
         return draw_figures(little(name))
     return {figure: draw_figure(figure, little(name)) for figure in SHOWS[name]}
 
@@ -146,7 +155,7 @@ def drawn_of_little(name: str) -> Mapping[str, DrawnFigure]:
 @functools.cache
 def drawn_beside_little(name: str) -> Mapping[str, DrawnFigure]:
     """Return figures that compare `little(name)` with the usual evaluation, selected as in `drawn_of_little`."""
-    if name not in SHOWS or is_soak():
+    if is_soak():
         return draw_figures(little(name), other=usual())
     return {figure: draw_figure(figure, little(name), other=usual()) for figure in SHOWS[name]}
 
@@ -169,5 +178,5 @@ def hostile() -> EvaluationResult:
 
 @functools.cache
 def drawn_hostile() -> Mapping[str, DrawnFigure]:
-    """Return the figures of the evaluation of clips with hostile names."""
-    return draw_figures(hostile())
+    """Return the figures of `hostile()` that contain names of clips; in the tier `soak`, all its figures."""
+    return {name: draw_figure(name, hostile()) for name in (FIGURES if is_soak() else NAMING)}

@@ -6,7 +6,6 @@ at the same time.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,7 +15,7 @@ import numpy as np
 from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
-from marey_reports.drawing.paper import HAIRLINE, INK
+from marey_reports.drawing.paper import HAIRLINE, INK, to_png
 from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, Stances, StickFigure, body_of, stances_at
 from marey_schemas.wording import counted
 
@@ -73,7 +72,6 @@ def contact_sheet(
     ------
     MotionError    if there are no takes or no moments, or too many
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     if not (1 <= len(takes) <= MAX_TAKES and 1 <= moments <= MAX_MOMENTS):
@@ -84,15 +82,12 @@ def contact_sheet(
     rows = [_staged(take, moments) for take in takes]
     height = HEADER + ROW * len(rows)
     figure = Figure(figsize=(PAGE_WIDTH, height), dpi=DPI, facecolor="white")
-    FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, PAGE_WIDTH), ylim=(0.0, height))
     axes.axis("off")
     _draw_header(axes, height, heading, _take_count(len(rows), total))
     for number, row in enumerate(rows):
         _draw_row(axes, row, height - HEADER - number * ROW, (PAGE_WIDTH - 2 * MARGIN) / moments)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return buffer.getvalue()
+    return to_png(figure)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
+from tests.support.tiers import is_soak
 
 from marey_motion.alignment.dtw import RangeBounds, align, distance_bound, distances, least_total, warped_distance
 from marey_motion.arrays import Floats, Ints
@@ -106,7 +107,7 @@ def test_the_total_is_that_of_a_plain_dynamic_program(shape: tuple[int, int]) ->
 @pytest.mark.parametrize("max_run", [None, 1, 3])
 def test_totals_are_those_of_an_independent_library(max_run: int | None) -> None:
     edges = step_graph(23, 31, max_run)
-    for seed in range(100):
+    for seed in range(100 if is_soak() else 25):
         costs = np.random.default_rng(seed).random((23, 31))
         expected = shortest_way(costs, edges)
         assert align(costs, max_run=max_run).total == pytest.approx(expected, rel=0, abs=1e-12)

@@ -10,6 +10,7 @@ import pytest
 from tests.support.compared_evaluations import compare_results
 from tests.support.drawn_evaluations import (
     DRAWN_EVALUATIONS,
+    NAMING,
     changed,
     drawn_beside_little,
     drawn_both,
@@ -37,8 +38,9 @@ from marey_motion.rigs import map_joints
 from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.drawing.markup import element, text
 from marey_reports.drawing.words import duration
+from marey_reports.evaluation import page as pages
 from marey_reports.evaluation.definitions import METRICS, definitions
-from marey_reports.evaluation.figures import FIGURES, USE_FIGURES, draw_figure
+from marey_reports.evaluation.figures import FIGURES, draw_figure
 from marey_reports.evaluation.page import compared, render_comparison, render_report
 from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_reports.evaluation.words import find_holes
@@ -80,7 +82,11 @@ def test_the_same_result_gives_the_same_page(result: EvaluationResult, figures: 
     assert once == again
 
 
-def test_without_figures_a_report_draws_them(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:
+def test_without_figures_a_report_draws_them(
+    result: EvaluationResult, figures: dict[str, DrawnFigure], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not is_soak():  # drawing takes long
+        monkeypatch.setattr(pages, "draw_figures", lambda drawn: figures if drawn is result else {})
     assert render_report(result, title="Walks") == render_report(result, title="Walks", figures=figures)
 
 
@@ -110,7 +116,7 @@ def test_names_of_clips_and_titles_are_shown_and_never_run(result: EvaluationRes
     assert "\u202e" not in page.text
     labels = ("<i>", "</td>")
     figures = None if is_soak() else {
-        name: draw_figure(name, hostile(), other=result, labels=labels) for name in (*USE_FIGURES, "points")
+        name: draw_figure(name, hostile(), other=result, labels=labels) for name in NAMING
     }  # fmt: skip
     assert is_sound(render_comparison(hostile(), result, title=HOSTILE[0], labels=labels, figures=figures))
 
@@ -177,7 +183,8 @@ def test_digests_and_options_are_there_to_repeat_it(page: Page, result: Evaluati
 
 def test_a_report_of_a_thousand_clips_stays_small() -> None:
     big = synthetic_result(clips=1_000, frames=300, unused=300)
-    source = render_report(big, title="big")
+    drawn = None if is_soak() else {name: draw_figure(name, big) for name in NAMING}
+    source = render_report(big, title="big", figures=drawn)
 
     assert len(source.encode()) < 5_000_000
     assert f"All {sum(1 for usage in big.usage if not usage.ticks)} names" in source

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from hypothesis.strategies import DataObject
 from numpy.random import Generator
-from tests.support.tiers import examples
+from tests.support.tiers import examples, is_soak
 
 from marey_motion.arrays import Flags, Floats, Ints
 from marey_motion.errors import MotionError
@@ -108,7 +108,7 @@ def test_a_search_finds_what_going_through_all_rows_finds(make: Callable[..., An
     features = make(rows, dimensions, rng)
     selectable = rng.random(rows) < 0.8
     selectable[rng.integers(rows)] = True
-    queries = queries_for(features, 300, rng)
+    queries = queries_for(features, 300 if is_soak() else 100, rng)
     warm = rng.integers(-1, rows, len(queries))
     truth = [true_nearest(features, selectable, query) for query in queries]
     for method in METHODS:
@@ -118,18 +118,18 @@ def test_a_search_finds_what_going_through_all_rows_finds(make: Callable[..., An
             assert list(zip(*(part.tolist() for part in found), strict=True)) == truth
 
 
-def test_ten_thousand_queries_of_a_walking_database_are_answered_exactly() -> None:
+def test_many_queries_of_a_walking_database_are_answered_exactly() -> None:
     rng = np.random.default_rng(7)
     features = gait_like(6000, 27, rng)
     selectable = np.arange(6000) % 90 < 70
-    queries = queries_for(features, 10_000, rng)
+    queries = queries_for(features, 10_000 if is_soak() else 2_000, rng)
     index = build_index(features, clips_of(6000, 90), selectable, method="boxes")
     rows, costs = find_nearest(index, queries, warm_rows=rng.integers(0, 6000, len(queries)))
     for query, row, cost in zip(queries, rows, costs, strict=True):
         assert (row, cost) == true_nearest(features, selectable, query)
 
 
-@settings(max_examples=examples(150))
+@settings(max_examples=examples(150 if is_soak() else 60))
 @given(st.data())
 def test_differences_that_float32_cannot_show_still_decide(data: DataObject) -> None:
     """All rows are equal in float32, and differ by a few units in the last place of float64."""

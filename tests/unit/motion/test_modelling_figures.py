@@ -62,12 +62,16 @@ def test_every_figure_is_sound(figures: Mapping[str, DrawnFigure]) -> None:
 
 
 def test_the_same_model_gives_the_same_bytes(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
-    again = figures_of(replace(subject))
-    assert {name: (figure.svg, figure.data) for name, figure in again.items()} == {
-        name: (figure.svg, figure.data) for name, figure in figures.items()
-    }
-    for name in figures if is_soak() else ("samples", "alignment-costs"):  # a PNG takes long
-        assert again[name].files() == figures[name].files()
+    copy = replace(subject)
+    if is_soak():
+        again = figures_of(copy)
+        assert set(again) == set(figures)
+    else:  # drawing takes long
+        again = {name: drawn_of(copy, name) for name in ("samples", "durations", "latent-space", "variance")}
+    for name, figure in again.items():
+        assert (figure.svg, figure.data["tables"]) == (figures[name].svg, figures[name].data["tables"])
+    for name in figures if is_soak() else ("samples",):
+        assert again[name].png == figures[name].png
 
 
 def test_threads_draw_the_same_figures_at_once(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
@@ -304,23 +308,42 @@ ODD = {
     "one example": lambda: modelled(alike(walks(2), 1)),
     "two examples": lambda: modelled(walks(2)),
     "several kinds": lambda: modelled(walks(40), QUICK.replace(mixture_components=3, spatial_components=2)),
-    "one pose component": lambda: modelled(walks(), QUICK.replace(spatial_components=1, most_temporal_components=0)),
-    "only time": lambda: modelled(walks(), QUICK.replace(spatial_components=0)),
-    "nothing held out": lambda: modelled(walks(), QUICK.replace(folds=0, leave_one_out=False, report_samples=0)),
+    "one pose component": lambda: modelled(walks(6), QUICK.replace(spatial_components=1, most_temporal_components=0)),
+    "only time": lambda: modelled(walks(6), QUICK.replace(spatial_components=0)),
+    "nothing held out": lambda: modelled(walks(6), QUICK.replace(folds=0, leave_one_out=False, report_samples=0)),
     "long names": lambda: modelled(walks(6, names=LONG_NAMES)),
-    "no known joints": lambda: modelled(headless(walks())),
+    "no known joints": lambda: modelled(headless(walks(6))),
     "few frames": lambda: modelled(walks(5, frames=6)),
-    "many keyframes": lambda: modelled(replace(walks(), keyframes=MANY_KEYFRAMES)),
-    "below the floor": lambda: modelled(backwards(walks())),
+    "many keyframes": lambda: modelled(replace(walks(6), keyframes=MANY_KEYFRAMES)),
+    "below the floor": lambda: modelled(backwards(walks(6))),
 }  # fmt: skip
+NUMBERS = ("variance", "reconstruction", "mixture", "likelihood")
+STRIPS = ("mean", "samples", "component-1")
+ODD_SHOWS = {
+    "no components": ("samples", "paths", "time-components", "latent-space", "alignment-costs", *NUMBERS),
+    "one example": ("samples", "durations", "time-warps", "alignment-costs", "latent-space", *NUMBERS),
+    "two examples": ("component-1", "time-components", "latent-space", "time-warps", *NUMBERS),
+    "several kinds": ("mixture", "latent-space", "likelihood"),
+    "one pose component": ("component-1", "time-components", "latent-space", "variance"),
+    "only time": ("mean", "time-components", "latent-space", "variance"),
+    "nothing held out": ("samples", "durations", "latent-space", *NUMBERS),
+    "long names": ("samples", "paths", "latent-space", "likelihood", "time-warps", "alignment-costs"),
+    "no known joints": ("paths", "time-components", *STRIPS),
+    "few frames": ("time-components", "time-warps", "alignment-costs", *STRIPS),
+    "many keyframes": ("time-components", "time-warps", "alignment-costs", *STRIPS),
+    "below the floor": ("paths", *STRIPS),
+}
+"""Names of the figures that show what is odd about a model."""
 
 
 @pytest.mark.parametrize("odd", ODD)
 def test_odd_models_are_drawn_and_nothing_is_cut_off(odd: str) -> None:
     subject = ODD[odd]()
-    sketches = {name: draw(subject) for name, (_, draw) in MODEL_FIGURES.items()}
-    sketches |= {name: draw(subject.examples) for name, (_, draw) in ALIGNMENT_FIGURES.items()}
-    if subject.primitive.spatial.count:
+    wanted = {*MODEL_FIGURES, *ALIGNMENT_FIGURES, "component-1"}
+    wanted = wanted if is_soak() else wanted.intersection(ODD_SHOWS[odd])
+    sketches = {name: draw(subject) for name, (_, draw) in MODEL_FIGURES.items() if name in wanted}
+    sketches |= {name: draw(subject.examples) for name, (_, draw) in ALIGNMENT_FIGURES.items() if name in wanted}
+    if subject.primitive.spatial.count and "component-1" in wanted:
         sketches["component-1"] = draw_component(subject, 0)
     for name, sketch in sketches.items():
         if sketch is not None:

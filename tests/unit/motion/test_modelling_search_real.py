@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from tests.support.present import present
+from tests.support.tiers import is_soak
 
 from marey_motion.alignment.aligned import AlignedClip
 from marey_motion.alignment.aligning import SourceExample, align_clips
@@ -27,7 +28,7 @@ from marey_motion.skeleton import Skeleton, same_hierarchy
 from marey_schemas.options.modelling import ModelOptions
 from marey_schemas.search_constraints import JointPositionConstraint
 
-TARGETS = 200
+TARGETS = 200 if is_soak() else 60
 HELD_OUT_EVERY = 4
 
 

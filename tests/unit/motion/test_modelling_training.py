@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from scipy.stats import multivariate_normal
 from tests.support.modelling_examples import aligned_set, bending_chains, chain, unit_poses, walks, warps
 from tests.support.present import present
+from tests.support.tiers import is_soak
 
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Recording
 from marey_motion.alignment.aligning import MIRRORED
@@ -177,9 +178,11 @@ def test_signs_of_quaternions_do_not_matter() -> None:
 
 @pytest.mark.parametrize("scaling", SCALINGS)
 def test_training_gives_the_same_bytes_every_time_and_on_any_number_of_threads(scaling: Scaling) -> None:
-    aligned, options = walks(12, 30), ModelOptions(scaling=scaling)
+    aligned = walks(12, 30)
+    options = ModelOptions(scaling=scaling) if is_soak() else ModelOptions(scaling=scaling, starts=2, report_samples=20)
     first = as_bytes(train_primitive(aligned, options, seed=3))
-    assert as_bytes(train_primitive(aligned, options, seed=3)) == first
+    if scaling == SCALINGS[0] or is_soak():
+        assert as_bytes(train_primitive(aligned, options, seed=3)) == first
     assert as_bytes(train_primitive(aligned, options, seed=3, threads=2)) == first
 
 
