@@ -15,7 +15,6 @@ from marey_motion.editing.kept_feet import feet_as_motion, feet_of, with_feet
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
-from marey_motion.savitzky_golay import filter_weights
 from marey_schemas.editing.commands import Smooth
 
 LONG_WINDOW = 512
@@ -107,6 +106,8 @@ def _weights(take: Take, command: Smooth) -> Floats:
     if command.method == "gaussian":
         bell = np.exp(-0.5 * (3.0 * np.arange(-reach, reach + 1) / asked) ** 2)
         return np.asarray(bell / bell.sum(), dtype=np.float64)
+    from scipy.signal import savgol_coeffs
+
     order = command.order
     if order > 2 * asked:
         raise EditError(
@@ -115,7 +116,7 @@ def _weights(take: Take, command: Smooth) -> Floats:
             code="window-too-short",
             where="window_s",
         )
-    return filter_weights(2 * reach + 1, min(order, 2 * reach))
+    return np.asarray(savgol_coeffs(2 * reach + 1, min(order, 2 * reach)), dtype=np.float64)
 
 
 def _smooth_positions(values: Floats, weights: Floats) -> Floats:

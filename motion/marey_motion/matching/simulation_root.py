@@ -11,7 +11,6 @@ from marey_motion.arrays import Floats
 from marey_motion.kinematics import forward_directions, headings
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
-from marey_motion.savitzky_golay import filtered
 
 POSITION_WINDOW_S = 0.5
 DIRECTION_WINDOW_S = 1.0
@@ -150,7 +149,9 @@ def _smoothed(values: Floats, window: int) -> Floats:
     For a clip that is shorter than the window, the window is the greatest odd number of frames of the clip; if this is
     less than `SHORTEST_WINDOW`, the values are returned unchanged.
     """
+    from scipy.signal import savgol_filter
+
     window = min(window, len(values) - (len(values) + 1) % 2)
     if window < SHORTEST_WINDOW:
         return values
-    return filtered(values, window, FILTER_ORDER)
+    return np.asarray(savgol_filter(values, window, FILTER_ORDER, axis=0))

@@ -15,7 +15,6 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.simulation_root import DIRECTION_WINDOW_S, window_frames
 from marey_motion.motion import Motion
 from marey_motion.perception.metric import JOINT_CLASSES
-from marey_motion.savitzky_golay import filtered
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.metrics import WITHOUT_ANGLES, Measurement
 
@@ -211,5 +210,7 @@ def _classes(body: MatchingBody) -> tuple[tuple[str, ...], list[int], Ints]:
 
 def _line_of_a_second(values: Floats, rate_hz: float) -> Floats:
     """Fit a line to each value's nearest second, or to the whole clip if it is shorter."""
+    from scipy.signal import savgol_filter
+
     window = min(window_frames(DIRECTION_WINDOW_S, rate_hz), len(values) - (len(values) + 1) % 2)
-    return values if window < 3 else filtered(values, window, 1)
+    return values if window < 3 else np.asarray(savgol_filter(values, window, 1))

@@ -258,27 +258,6 @@ def test_two_normals_are_found_again() -> None:
     assert fit.weights == pytest.approx((0.4, 0.6), abs=0.02)
 
 
-@pytest.mark.parametrize("narrow", [1e-6, 0.5])
-def test_two_normals_are_those_of_scikit_learn(narrow: float) -> None:
-    from sklearn.mixture import GaussianMixture
-
-    random = np.random.default_rng(1)
-    values = np.concatenate((random.normal(0.0, 1.0, 300), random.normal(1.5, narrow, 200)))
-    values = np.append(values, 60.0)  # an outlier
-    begins = np.arange(len(values)) >= 250
-    groups = (values[~begins], values[begins])
-    peer = GaussianMixture(
-        2, covariance_type="spherical", tol=1e-9, max_iter=500, reg_covar=1e-6 * values.var(),
-        weights_init=[len(group) / len(values) for group in groups],
-        means_init=[[group.mean()] for group in groups], precisions_init=[1.0 / group.var() for group in groups],
-    ).fit(values[:, None])  # fmt: skip
-
-    fit, order = fit_two(values, begins), np.argsort(peer.means_[:, 0])
-    assert fit.weights == pytest.approx(peer.weights_[order], abs=1e-7)
-    assert fit.means == pytest.approx(peer.means_[order, 0], abs=1e-7)
-    assert fit.deviations == pytest.approx(np.sqrt(peer.covariances_[order]), abs=1e-7)
-
-
 def test_a_fit_without_spread_or_without_groups_is_still_one() -> None:
     fit = fit_two(np.full(50, 0.3), np.zeros(50, dtype=bool))
     assert fit.means == pytest.approx((0.3, 0.3))

@@ -3,7 +3,7 @@
 import importlib
 import pkgutil
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from tests.support.present import present
 
 from marey_server import store
 from marey_server.access.principal import SYSTEM
-from marey_server.store.database import engines, prepared
+from marey_server.store.database import prepared
 from marey_server.store.database.connections import Database
 from marey_server.store.database.prepared import Prepared, run_text
 from marey_server.store.tables import event, user
@@ -173,17 +173,3 @@ def test_only_statements_with_a_measured_gain_are_prepared() -> None:
     record = Path("docs/decisions/0012-prepared-statements.md").read_text(encoding="utf-8")
     listed = re.findall(r"^\| `([\w.]+)` \|", record, re.MULTILINE)
     assert sorted(set(prepared_statements())) == sorted(listed)
-
-
-def test_a_statement_is_compiled_once_for_all_engines_of_a_kind(
-    database: Database, open_database: Callable[[], Database]
-) -> None:
-    statement = select(user.c.name.label("compiled_once"))
-    before = len(engines.COMPILED)
-    database.write(SYSTEM, lambda tx: tx.execute(statement).all())
-    known = len(engines.COMPILED)
-    assert known > before
-    for one in (database, open_database()):
-        one.read(SYSTEM, lambda tx: tx.execute(statement).all())
-        one.write(SYSTEM, lambda tx: tx.execute(statement).all())
-    assert len(engines.COMPILED) == known

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -33,51 +34,40 @@ def fit_one(values: AnyFloats) -> Normals:
 
 
 def fit_two(values: AnyFloats, second: NDArray[np.bool_]) -> Normals:
-    """Fit a mixture of two normal distributions by expectation maximisation.
+    """Fit a mixture of two normal distributions with scikit-learn.
 
     The mask `second` selects the values from which the second distribution starts; the first one starts from the other
     values. Because the start is given, the fit is repeatable. If one of these groups is empty, the values are split at
     their mean. Values that are all equal give two equal components.
-
-    scikit-learn gives the same fit, but to load it takes longer than to draw all figures of a report.
     """
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+
     if np.ptp(values) == 0.0:
         one = fit_one(values)
         return Normals(np.full(2, 0.5), np.repeat(one.means, 2), np.repeat(one.deviations, 2))
     if second.all() or not second.any():
         second = values > values.mean()
-    narrowest = NARROWEST * float(values.std())
     groups = (values[~second], values[second])
-    fit = Normals(
-        np.array([len(group) / len(values) for group in groups]),
-        np.array([group.mean() for group in groups]),
-        np.array([max(float(group.std()), narrowest) for group in groups]),
+    narrowest = NARROWEST * float(values.std())
+    mixture = GaussianMixture(
+        2,
+        covariance_type="spherical",
+        tol=TOLERANCE,
+        reg_covar=narrowest**2,
+        max_iter=MOST_STEPS,
+        weights_init=[len(group) / len(values) for group in groups],
+        means_init=[[group.mean()] for group in groups],
+        precisions_init=[1.0 / max(float(group.std()), narrowest) ** 2 for group in groups],
+        init_params="random",  # replaced by the start above
+        random_state=0,
     )
-    before = -np.inf
-    for _ in range(MOST_STEPS):
-        logarithms = _log_densities(values, fit)
-        total = np.logaddexp(logarithms[:, 0], logarithms[:, 1])
-        fit = _maximised(values, np.exp(logarithms - total[:, None]), narrowest)
-        likelihood = float(total.mean())
-        if abs(likelihood - before) < TOLERANCE:
-            break
-        before = likelihood
-    order = np.argsort(fit.means, kind="stable")
-    return Normals(fit.weights[order], fit.means[order], fit.deviations[order])
-
-
-def _maximised(values: AnyFloats, shares: AnyFloats, narrowest: float) -> Normals:
-    """Fit each component to the values (n,) with its shares (n, 2) in them; `narrowest` widens each component."""
-    held = np.maximum(shares.sum(axis=0), np.finfo(np.float64).tiny)
-    means = shares.T @ values / held
-    variances = (shares * (values[:, None] - means) ** 2).sum(axis=0) / held
-    return Normals(held / held.sum(), means, np.sqrt(variances + narrowest**2))
-
-
-def _log_densities(values: AnyFloats, fit: Normals) -> AnyFloats:
-    scaled = (values[:, None] - fit.means) / fit.deviations
-    heights = np.log(np.maximum(fit.weights, np.finfo(np.float64).tiny)) - np.log(fit.deviations * np.sqrt(2.0 * np.pi))
-    return np.asarray(heights - 0.5 * scaled**2, dtype=np.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # after so many steps a picture shows no difference
+        mixture.fit(values[:, None])
+    means, deviations = mixture.means_[:, 0], np.sqrt(mixture.covariances_)
+    order = np.argsort(means, kind="stable")
+    return Normals(mixture.weights_[order], means[order], deviations[order])
 
 
 def _densities(values: AnyFloats, fit: Normals) -> AnyFloats:

@@ -8,7 +8,6 @@ from typing import Any
 
 import sqlalchemy
 from sqlalchemy import URL, Connection, Engine, event
-from sqlalchemy.util import LRUCache
 
 from marey_server.store.database.clock import POSTGRES_NOW
 from marey_server.store.database.prepared import run_texts
@@ -21,23 +20,6 @@ _POSTGRES_SETTINGS = {
     "lock_timeout": "30s",
     "idle_in_transaction_session_timeout": "300s",  # a server that was stopped must not hold its locks for ever
 }
-
-
-class _CompiledStatements(LRUCache[Any, Any]):
-    """Compiled statements of all engines of this process; SQLAlchemy's own cache belongs to one engine.
-
-    SQLite has two engines, which run many equal statements. Engines with the same name of the dialect have the same
-    options here, so their dialects compile a statement to the same text.
-    """
-
-    def get(self, key: Any, default: Any = None) -> Any:
-        return super().get((key[0].name, *key[1:]), default)
-
-    def __setitem__(self, key: Any, value: Any) -> None:
-        super().__setitem__((key[0].name, *key[1:]), value)
-
-
-COMPILED = _CompiledStatements(1000)
 
 
 def _dumps(value: Any) -> str:
@@ -53,7 +35,6 @@ def sqlite_engine(url: URL, connections: int, echo: bool, *, begin: str, query_o
         echo=echo,
         hide_parameters=True,  # parameters contain hashes of secrets, and failed statements are logged
         json_serializer=_dumps,
-        execution_options={"compiled_cache": COMPILED},
         connect_args={"timeout": BUSY_TIMEOUT_MS / 1000, "check_same_thread": False, "isolation_level": None},
         poolclass=sqlalchemy.QueuePool,
     )
@@ -92,7 +73,6 @@ def postgres_engine(url: URL, connections: int, echo: bool) -> Engine:
         hide_parameters=True,  # parameters contain hashes of secrets, and failed statements are logged
         isolation_level="READ COMMITTED",
         json_serializer=_dumps,
-        execution_options={"compiled_cache": COMPILED},
         connect_args=connect_args,
     )
 
