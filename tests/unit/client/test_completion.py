@@ -1,6 +1,7 @@
 """Shell completion without a server: lines, answers for shells, the table of subjects, and failures."""
 
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from marey_client.cli.completion.asking import PATIENCE_S
 from marey_client.cli.completion.found import Suggestion, nothing
 from marey_client.cli.completion.shells import FILES, SCRIPTS, Line, answer_text, read_line
 from marey_client.cli.completion.subjects import SUBJECTS, how_to_complete
+from marey_schemas.kinds import Kind
 
 BREAKS = " \t\n\"'@><=;|&(:"
 """Characters at which bash splits words by default."""
@@ -216,6 +218,17 @@ def test_every_address_and_every_id_of_a_job_is_completed() -> None:
         if how_to_complete(command, name) is None
     ]
     assert missing == []
+
+
+def test_no_parameter_takes_an_item_by_its_id_only() -> None:
+    kinds = "|".join(kind.value for kind in Kind)
+    of_item = re.compile(rf"\bids? of (?:the|an?) (?:{kinds})\b", re.IGNORECASE)
+    by_id = [
+        f"{' '.join(command)} {name}"
+        for command, name, meaning in _declared()
+        if of_item.search(meaning) and "path" not in meaning and "project/" not in meaning
+    ]
+    assert by_id == []
 
 
 def test_no_entry_of_the_table_is_unused() -> None:
