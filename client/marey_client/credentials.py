@@ -9,14 +9,13 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import tempfile
 import tomllib
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
-
-import httpx
 
 from marey_client.errors import BadAddress, BadCredentialFile, BadToken
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SERVER_VARIABLES, SETTINGS_FILE
@@ -27,6 +26,7 @@ ADMIN_TOKEN = "admin.token"  # noqa: S105 - the name of a file
 log = logging.getLogger(__name__)
 
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
+_PLAIN_ADDRESS = re.compile(r"https?://[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?(:[1-9][0-9]{0,3})?(/[A-Za-z0-9._/-]*)?")
 
 
 class TokenFile:
@@ -139,6 +139,10 @@ def _from_file(url: str, file: Path) -> Credential:
 
 def require_address(url: str) -> None:
     """Raise `BadAddress` if `url` is not the address of a server."""
+    if _PLAIN_ADDRESS.fullmatch(url):
+        return  # without httpx, which takes long to load, and which shell completion does not need
+    import httpx
+
     try:
         parts, _ = urlsplit(url), httpx.URL(url)
         fits = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0

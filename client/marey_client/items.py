@@ -284,6 +284,14 @@ class Items(Generic[Handle]):
         }  # fmt: skip
         return (self._handle(item) for item in pages(self.transport, Item, self.url, params))
 
+    def outdated(self, *, collection: str | None = None, page_size: int = 500) -> Iterator[Staleness]:
+        """Yield the ids of items of which an input has a newer revision, with these inputs, requested page by page.
+
+        `collection` is a folder; without it, all items of the kind in the project are examined.
+        """
+        params = {"collection": collection or None, "limit": page_size}
+        return pages(self.transport, Staleness, f"/projects/{self.project}/stale/{self.kind.plural}", params)
+
     def explain(self, query: str, *, collection: str | None = None) -> QueryExplanation:
         """Count the items that a query selects, and the items that each condition of the query excludes.
 

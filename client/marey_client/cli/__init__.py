@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import NoReturn
 
 from marey_client.cli.terminal.failures import INTERRUPTED
 
@@ -24,9 +25,19 @@ def _run() -> None:
     from marey_client.cli.terminal.failures import reported
 
     _take_any_text()
+    if os.environ.get("_MAREY_COMPLETE", "").startswith("complete_"):
+        _complete()
     arguments = with_global_options_first(sys.argv[1:])
     with reported(verbose=any(switch in arguments for switch in GLOBAL_SWITCHES)):
         with_one_command(_command_name(arguments))(args=arguments, prog_name="marey")
+
+
+def _complete() -> NoReturn:
+    """Answer a shell that asks for completion; see `marey_client.cli.completion`."""
+    from marey_client.cli.app import with_one_command
+    from marey_client.cli.completion.running import answer_shell
+
+    sys.exit(answer_shell(with_one_command, apart_from_global_options))
 
 
 def _command_name(arguments: list[str]) -> str | None:
@@ -53,6 +64,12 @@ def with_global_options_first(arguments: list[str]) -> list[str]:
 
     So `marey ls lab --server URL` works, too.
     """
+    first, rest = apart_from_global_options(arguments)
+    return first + rest
+
+
+def apart_from_global_options(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Return the global options with their values, and all other arguments."""
     first: list[str] = []
     rest: list[str] = []
     left = iter(arguments)
@@ -65,4 +82,4 @@ def with_global_options_first(arguments: list[str]) -> list[str]:
             first += [argument, *([value] if (value := next(left, None)) is not None else [])]
         else:
             rest.append(argument)
-    return first + rest
+    return first, rest

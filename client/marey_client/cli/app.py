@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.core import TyperGroup
@@ -31,6 +31,7 @@ from marey_client.cli import (
     webhooks,
 )
 from marey_client.cli.access import accounts, invitations, tokens, user_tables
+from marey_client.cli.completion.shells import SCRIPTS
 from marey_client.cli.datasets import archives, proposals, versions
 from marey_client.cli.difference import diff
 from marey_client.cli.editing import annotating, edits
@@ -88,6 +89,7 @@ app = typer.Typer(
     help="Motion data and model management.",
     no_args_is_help=True,
     rich_markup_mode=None,
+    add_completion=False,  # its scripts add a space after each folder; see `completion`
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -102,6 +104,23 @@ def _print_version(wanted: bool) -> None:
         from importlib.metadata import version
 
         typer.echo(f"marey {version('marey')}")
+        raise typer.Exit
+
+
+def _install_completion(wanted: bool) -> None:
+    if wanted:
+        from typer.completion import install  # type: ignore[attr-defined]
+
+        shell, path = install(prog_name="marey")
+        if shell in SCRIPTS:
+            Path(path).write_text(SCRIPTS[shell], encoding="utf-8")
+        typer.echo(f"completion for {shell} is installed in {path}; it works in shells that you start from now on")
+        raise typer.Exit
+
+
+def _show_completion(shell: str | None) -> None:
+    if shell is not None:
+        typer.echo(SCRIPTS[shell], nl=False)
         raise typer.Exit
 
 
@@ -121,6 +140,21 @@ def marey(
     version: Annotated[  # noqa: ARG001 - its callback does it
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
     ] = False,
+    install_completion: Annotated[  # noqa: ARG001 - its callback does it
+        bool,
+        typer.Option(
+            "--install-completion",
+            callback=_install_completion,
+            is_eager=True,
+            help="Let the current shell complete commands, projects, paths, jobs and versions, and exit.",
+        ),
+    ] = False,
+    show_completion: Annotated[  # noqa: ARG001 - its callback does it
+        Literal["bash", "zsh", "fish"] | None,
+        typer.Option(
+            "--show-completion", callback=_show_completion, is_eager=True, help="Show the script of a shell, and exit."
+        ),
+    ] = None,
 ) -> None:
     """Store, check, retarget, edit and evaluate motion data on a Marey server."""
     context.obj = Invocation(server, token_file, verbose)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import takewhile
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from marey_client.items import ItemHandle
+    from marey_client.project import ProjectHandle
     from marey_schemas.items import Staleness
 
 
@@ -74,7 +76,7 @@ def stale(
         items: list[ItemHandle] = [
             one for kind in Kind for one in project.items(kind).list(collection=address.path or None, sort="name")
         ]
-        found = outdated(items)
+        found = outdated(project, items)
     if as_json:
         return print_json([{"path": one.path, **answer.model_dump(mode="json")} for one, answer in found])
     if not found:
@@ -87,11 +89,24 @@ def stale(
     return print_message("`marey lineage PLACE` shows the job that made a result; `marey job rerun JOB` repeats it")
 
 
-def outdated(items: Sequence[ItemHandle]) -> list[tuple[ItemHandle, Staleness]]:
-    """Return the items of which an input has a newer revision, each with these inputs."""
+def outdated(project: ProjectHandle, items: Sequence[ItemHandle]) -> list[tuple[ItemHandle, Staleness]]:
+    """Return those of the items of which an input has a newer revision, each with these inputs.
+
+    The server is asked once for each page of a kind, for the folder that contains all the items.
+    """
+    folder = _common_folder([one.item.collection for one in items])
+    kinds = dict.fromkeys(one.item.kind for one in items)
     with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
-        answers = pool.map(lambda one: one.staleness(), items)
-        return [(one, answer) for one, answer in zip(items, answers, strict=True) if answer.stale]
+        answers = pool.map(lambda kind: list(project.items(kind).outdated(collection=folder)), kinds)
+        by_item = {answer.item: answer for some in answers for answer in some}
+    return [(one, by_item[one.id]) for one in items if one.id in by_item]
+
+
+def _common_folder(folders: Sequence[str]) -> str:
+    """Return the path of the deepest folder that is equal to or above each of the folders; empty: the root."""
+    parts = [folder.split("/") for folder in folders]
+    shared = (step[0] for step in takewhile(lambda step: len(set(step)) == 1, zip(*parts, strict=False)))
+    return "/".join(shared)
 
 
 def _reasons(answer: Staleness) -> str:

@@ -38,7 +38,7 @@ SEARCH = OptionsOf("marey_schemas.search:SearchRequest", without=("constraints",
 
 INDEX = OptionsOf("marey_schemas.queue.job_params:IndexParams")
 
-SIMILAR = OptionsOf("marey_schemas.search:SimilarOptions", short={"results": "-n"}, without=("metric",))
+SIMILAR = OptionsOf("marey_schemas.search:SimilarOptions", short={"results": "-n"}, without=("metric", "index"))
 
 Many = list[str] | None
 
@@ -210,6 +210,14 @@ def similar(
         ),
     ],
     params: Chosen,
+    at_index: Annotated[
+        str | None,
+        typer.Option(
+            "--index",
+            help="Index to search: project/folder/name, or project/id. Default: the index of the project that was "
+            "updated last.",
+        ),
+    ] = None,
     metric: MetricName = None,
     as_json: AsJson = False,
 ) -> None:
@@ -225,8 +233,23 @@ def similar(
     with connect(context) as marey:
         clip = require_item(marey, place, [Kind.CLIP])
         chosen = None if metric is None else _metric_of(marey, place.project, metric)
+        if at_index is not None:
+            params["index"] = _index_of(marey, place.project, at_index)
         found = marey.project(place.project).similar(clip, moment.frames, metric=chosen, **params)
     return print_json(found) if as_json else _print_similar(found)
+
+
+def _index_of(marey: Marey, project: str, index: str) -> str:
+    """Return the id of the index of a search, given by its address or its id.
+
+    Raises `WrongUsage` if there is none, or if it is of another project.
+    """
+    from marey_schemas.kinds import Kind
+
+    address = Address.parse(index if "/" in index else f"{project}/{index}")
+    if address.project != project:
+        raise WrongUsage(f"the index {index} is in the project {address.project}; the clip is in {project}")
+    return str(require_item(marey, address, [Kind.INDEX]).id)
 
 
 def _metric_of(marey: Marey, project: str, metric: str) -> str:

@@ -1,22 +1,25 @@
-"""Command `view`, and addresses of pages: prints or opens the address of the page that shows a clip in a browser."""
+"""Command `view`: shows clips in a browser, or draws poses to a file; and addresses of pages."""
 
 from __future__ import annotations
 
 import html
 import tempfile
 import webbrowser
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import quote, urlencode
 
 import typer
 
-from marey_client.cli.addresses import Address, addresses_in_one_project
-from marey_client.cli.revisions import require_revision
+from marey_client.cli.addresses import addresses_in_one_project
+from marey_client.cli.difference.diff import PICTURES
+from marey_client.cli.revisions import RevisionNumber, at_revision, require_revision
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.invocation import connect
+from marey_client.cli.terminal.invocation import connect, refuse_ignored
 from marey_client.cli.terminal.output import print_message
+from marey_schemas.kinds import Kind
 
 if TYPE_CHECKING:
     from marey_client.items import ItemHandle
@@ -25,6 +28,9 @@ if TYPE_CHECKING:
 InBrowser = Annotated[
     bool, typer.Option("--browser", help="Open the page in a browser of this machine; default: print its address.")
 ]
+DRAWN_KINDS = (Kind.CLIP, Kind.MODEL, Kind.EVALUATION)
+DEFAULT_MOMENTS = 8
+DEFAULT_ROWS = 3
 SOURCE = "source"
 """Value of `--beside` that means the clip from which the clip was made."""
 _REDIRECT = '<!doctype html><meta charset="utf-8"><title>Marey</title><meta http-equiv="refresh" content="0;url={url}">'
@@ -37,26 +43,63 @@ def add_to(app: typer.Typer) -> None:
 
 def view(
     context: typer.Context,
-    place: Annotated[str, typer.Argument(help="The clip: project/folder/name[@revision], or project/id[@revision].")],
+    place: Annotated[
+        str,
+        typer.Argument(
+            help="The clip: project/folder/name[@revision], or project/id[@revision]. With --out also a model, to draw "
+            "samples, or an evaluation, to draw its worst trials."
+        ),
+    ],
     beside: Annotated[
         str | None,
         typer.Option(help="Another clip of the project to show beside it, or `source`: the clip it was made from."),
     ] = None,
+    revision: RevisionNumber = None,
+    beside_revision: Annotated[
+        int | None,
+        typer.Option(min=1, help="Revision of the clip after --beside; without --beside, of the same clip."),
+    ] = None,
     browser: InBrowser = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "--output", "-o", help="Draw poses to this file, which ends in .png or .svg."),
+    ] = None,
+    frames: Annotated[str | None, typer.Option(help="With --out: frames of the clip to draw, such as 100:200.")] = None,
+    moments: Annotated[int, typer.Option(min=1, help="With --out: number of poses in a row.")] = DEFAULT_MOMENTS,
+    n: Annotated[
+        int, typer.Option("-n", min=1, help="With --out: number of samples or trials to draw.")
+    ] = DEFAULT_ROWS,
+    seed: Annotated[int, typer.Option(min=0, help="With --out: seed of the samples of a model.")] = 0,
 ) -> None:
-    """Show a clip in a browser. The address signs one browser in, once, within two minutes."""
+    """Show a clip in a browser, or draw it; --out also draws samples of a model, and worst trials of an evaluation.
+
+    The address that is printed signs one browser in, once, within two minutes.
+    """
     from marey_schemas.sign_ins import VIEW_PATH
 
     other = [] if beside in (None, SOURCE) else [str(beside)]
-    addresses = addresses_in_one_project([place, *other])
+    addresses = addresses_in_one_project([at_revision(place, revision), *other])
     project = addresses[0].project
+    if out is None:
+        refuse_ignored(context, "without --out", "frames", "moments", "n", "seed")
     with connect(context) as marey:
-        found = [_clip_at(marey, address) for address in addresses]
-        shown = [_named(clip.id, revision) for clip, revision in found]
+        found, number = require_revision(marey, addresses[0], DRAWN_KINDS if out is not None else [Kind.CLIP])
+        if out is not None and found.item.kind is not Kind.CLIP:
+            refuse_ignored(context, "on a model or an evaluation", "beside", "beside_revision", "frames")
+            drawn = Drawing(out, moments, n, seed).of_item(found, number)
+            return print_message(f"wrote {drawn}")
+        pair = [(found, number)]
         if beside == SOURCE:
-            shown.append(_source_of(*found[0]))
-        clips = dict(zip(("clip", "beside"), (f"{project}/{one}" for one in shown), strict=False))
-        url = page_address(marey, project, VIEW_PATH, clips)
+            pair.append(_source_of(marey, *pair[0]))
+        elif other:
+            pair.append(require_revision(marey, addresses[1], [Kind.CLIP]))
+        if beside_revision is not None:
+            pair = [pair[0], (pair[-1][0], beside_revision)]
+        if out is not None:
+            refuse_ignored(context, "on a clip", "n", "seed")
+            return print_message(f"wrote {Drawing(out, moments, n, seed).of_clips(pair, frames)}")
+        shown = (f"{project}/{_named(clip.id, one)}" for clip, one in pair)
+        url = page_address(marey, project, VIEW_PATH, dict(zip(("clip", "beside"), shown, strict=False)))
     return show_page(url, browser=browser)
 
 
@@ -73,20 +116,12 @@ def show_page(url: str, *, browser: bool) -> None:
     return typer.echo(url)
 
 
-def _clip_at(marey: Marey, address: Address) -> tuple[ItemHandle, int | None]:
-    from marey_schemas.kinds import Kind
-
-    return require_revision(marey, address, [Kind.CLIP])
-
-
 def _named(item: str, revision: int | None) -> str:
     return item if revision is None else f"{item}@{revision}"
 
 
-def _source_of(clip: ItemHandle, revision: int | None) -> str:
-    """Return the id and revision of the clip from which a clip was made. Raises `WrongUsage` if it is not just one."""
-    from marey_schemas.kinds import Kind
-
+def _source_of(marey: Marey, clip: ItemHandle, revision: int | None) -> tuple[ItemHandle, int]:
+    """Return the clip from which a clip was made, and its revision. Raises `WrongUsage` if it is not just one."""
     graph = clip.lineage_graph(revision, direction="inputs", depth=1)
     sources = [one for one in graph.revisions if one.kind is Kind.CLIP and one.distance == -1 and not one.deleted]
     if len(sources) != 1:
@@ -95,7 +130,55 @@ def _source_of(clip: ItemHandle, revision: int | None) -> str:
             f"{place} was made from {len(sources)} clips that exist; name a clip after --beside, see `marey lineage "
             f"{place}`"
         )
-    return _named(sources[0].item, sources[0].revision)
+    found: ItemHandle = marey.project(clip.project).items(Kind.CLIP).get(sources[0].item)
+    return found, sources[0].revision
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """File with poses, and what it shows: poses in a row, and rows of a model or an evaluation."""
+
+    out: Path
+    moments: int
+    rows: int
+    seed: int
+
+    def of_item(self, found: Any, revision: int | None) -> Path:
+        """Draw samples of a model, or the worst trials of an evaluation; return the path of the file."""
+        from marey_client.poses.strips import draw_samples, draw_worst_trials
+
+        form = self._file_type
+        if found.item.kind is Kind.MODEL:
+            return self._write(draw_samples(found, revision, self.rows, self.seed, self.moments, form))
+        return self._write(draw_worst_trials(found, revision, self.rows, self.moments, form))
+
+    def of_clips(self, pair: Sequence[tuple[Any, int | None]], frames: str | None) -> Path:
+        """Draw a clip, and the second one of the pair below it; return the path of the file."""
+        from marey_client.poses.strips import ClipOfStrip, draw_clips
+
+        form = self._file_type
+        chosen = None if frames is None else read_frames(frames)
+        clips = [ClipOfStrip(clip, revision, chosen) for clip, revision in pair]
+        return self._write(draw_clips(clips[0], clips[1] if len(clips) > 1 else None, self.moments, form))
+
+    @property
+    def _file_type(self) -> str:
+        file_type = self.out.suffix.lower().lstrip(".")
+        if file_type not in PICTURES:
+            raise WrongUsage(f"{self.out} must end in .png or .svg")
+        return file_type
+
+    def _write(self, data: bytes) -> Path:
+        self.out.write_bytes(data)
+        return self.out
+
+
+def read_frames(text: str) -> slice:
+    """Return the range of frames in a text such as 100:200. Raises `WrongUsage` for other texts."""
+    first, colon, end = text.partition(":")
+    if not (colon and all(one == "" or one.isdecimal() for one in (first, end))):
+        raise WrongUsage(f"--frames: {text!r} is not a range of frames; write first:end, such as 100:200")
+    return slice(int(first) if first else None, int(end) if end else None)
 
 
 def _open(url: str) -> None:

@@ -48,9 +48,9 @@ class EvaluationHandle(ReportedHandle):
         """Return one row per clip: name, number of frames, and use of the clip by the trials."""
         return list(clip_rows(self.document()))
 
-    def records(self) -> dict[str, dict[str, NDArray[Any]]]:
+    def records(self, *, revision: int | None = None) -> dict[str, dict[str, NDArray[Any]]]:
         """Return every tick of every trial, by the name of the trial; `record_arrays` describes the arrays."""
-        return record_arrays(self.part("records"))
+        return record_arrays(self.part("records", revision=revision))
 
     def walk_graph(self, *, trial: str | None = None) -> dict[str, Any]:
         """Return the frames that the trials displayed, the jumps between frames, and the walk of each trial, as lists.

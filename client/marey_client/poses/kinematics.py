@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from marey_client.errors import NoSuchJoint
 from marey_client.extras import room
 from marey_client.handles.skeletons import SkeletonHandle
+from marey_client.items import ItemHandle
 from marey_client.one_or_several import several
 from marey_client.poses.arrays import Joints, PosedItem, frames_text
 from marey_client.transport import Transport
@@ -79,12 +80,13 @@ def rig_of(clip: PosedItem) -> PosedSkeleton:
         assert isinstance(reference, RevisionRef)
         by_skeleton = (clip.project, reference.item, reference.revision)
         if by_skeleton not in known:
-            known[by_skeleton] = _read_rig(clip, reference)
+            known[by_skeleton] = read_rig(clip, reference)
         known[by_clip] = known[by_skeleton]
     return known[by_clip]
 
 
-def _read_rig(clip: PosedItem, reference: RevisionRef) -> PosedSkeleton:
+def read_rig(clip: ItemHandle, reference: RevisionRef) -> PosedSkeleton:
+    """Return the revision of a skeleton to which a motion refers."""
     item = clip.transport.get(Item, f"/projects/{clip.project}/{Kind.SKELETON.plural}/{reference.item}")
     handle = SkeletonHandle(clip.transport, clip.project, item)
     return PosedSkeleton(

@@ -121,13 +121,74 @@ def draw_clip_strip(poses: Sequence[Clip], frames: Sequence[int], frame_rate_hz:
     title : title of the picture, for readers who do not see it
     """
     body = body_of(poses[0].skeleton)
-    points = np.concatenate([global_positions(one, end_sites=True) for one in poses]).astype(np.float64)
+    points = _points_of(poses)
     middles = points[:, body.pelvis][:, (0, 2)]
     labels = [f"{frame / frame_rate_hz:.2f} s" for frame in frames]
     moments = StripMoments(middles, [f"frame {frame}" for frame in frames], labels)
     row = StripRow("", "", points[None], np.empty((0, 0, 3)))
     figure = draw_strips(body, [row], moments, _camera_direction(points, body.facing), cell_in=POSE_CELL_IN)
     return to_svg(figure, title)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRow:
+    """Poses of one motion, in one row of a strip.
+
+    Parameters
+    ----------
+    label, note : texts to the left of the row
+    poses : one frame of the motion for each moment
+    ghost : one frame of another motion for each moment, drawn in grey behind the poses
+    headings_rad : (T,) directions about +Y, 0 for +z, into which the poses are turned; None: as they are
+    """
+
+    label: str
+    note: str
+    poses: Sequence[Clip]
+    ghost: Sequence[Clip] = ()
+    headings_rad: Floats | None = None
+
+
+def draw_pose_rows(rows: Sequence[PoseRow], names: Sequence[str], labels: Sequence[str], *, ghost: str = "") -> Figure:
+    """Draw motions of one skeleton at T moments, one in each row; each body is in the middle of its cell.
+
+    Ghosts keep their distance from the bodies before them.
+
+    Parameters
+    ----------
+    names, labels : T texts each, below the columns
+    ghost : name of the ghosts in the legend; empty: there are none
+    """
+    body = body_of(rows[0].poses[0].skeleton)
+    drawn = []
+    for row in rows:
+        points = _points_of(row.poses)
+        pelvis = points[:, body.pelvis] * (1.0, 0.0, 1.0)
+        behind = _points_of(row.ghost) - pelvis[:, None] if row.ghost else None
+        points = points - pelvis[:, None]
+        if row.headings_rad is not None:
+            points = _turned(points, body.facing, row.headings_rad)
+        drawn.append(StripRow(row.label, row.note, points[None], np.empty((0, 0, 3)), behind))
+    moments = StripMoments(np.zeros((len(names), 2)), names, labels)
+    direction = _camera_direction(drawn[0].bodies[0], body.facing)
+    legend = [(ghost, REFERENCE)] if ghost else []
+    return draw_strips(body, drawn, moments, direction, cell_in=POSE_CELL_IN, legend=legend)
+
+
+def _points_of(poses: Sequence[Clip]) -> Floats:
+    return np.concatenate([global_positions(one, end_sites=True) for one in poses]).astype(np.float64)
+
+
+def _turned(points: Floats, facing: tuple[tuple[int, ...], tuple[int, ...]], headings_rad: Floats) -> Floats:
+    """Turn points (T, P, 3) about the vertical through the origin until each pose faces its heading."""
+    try:
+        ahead = forward_directions(points, *facing)
+    except MotionError:
+        return points
+    angle = headings_rad - np.arctan2(ahead[:, 0], ahead[:, 1])
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    x, z = points[..., 0], points[..., 2]
+    return np.stack((cos * x + sin * z, points[..., 1], cos * z - sin * x), axis=-1)
 
 
 def _camera_direction(points: Floats, facing: tuple[tuple[int, ...], tuple[int, ...]]) -> float:

@@ -16,6 +16,16 @@ class CollectionsQuery(PageQuery):
     """Query parameters of a list of folders."""
 
     path: str = Field("", max_length=1024, description="Folder to list, with all folders below it; empty: all folders.")
+    directly_in: str | None = Field(
+        None,
+        max_length=1024,
+        description="List only the subfolders of this folder, without the folders below them; empty: the root.",
+    )
+    name: str | None = Field(
+        None,
+        max_length=255,
+        description="With `directly_in`: list only subfolders with this name; a final * matches any ending.",
+    )
     deleted: bool = Field(False, description="List deleted folders instead of existing ones.")
 
 
@@ -32,6 +42,8 @@ class ProjectCollections(Resource):
             collections.list_collections,
             project,
             path=query.path,
+            directly_in=query.directly_in,
+            name=query.name,
             deleted=query.deleted,
             cursor=query.cursor,
             limit=query.limit,

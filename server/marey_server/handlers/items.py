@@ -281,6 +281,32 @@ class StalenessResource(Resource):
         return await self.answer(items.read_staleness, project, kind_of(kind), item)
 
 
+class StalenessQuery(PageQuery):
+    """Query parameters of a list of outdated items."""
+
+    collection: str | None = Field(
+        None, max_length=1024, description="Examine only items in this folder or below it; absent: the whole project."
+    )
+
+
+class StaleItems(Resource):
+    """Outdated items of a kind."""
+
+    path = "/projects/{project}/stale/{kind}"
+    tag = "Items"
+
+    @reads(access=Access.READER, query=StalenessQuery, answer=Staleness, paged=True)
+    async def get(self, project: str, kind: str, query: StalenessQuery) -> Rendered:
+        """List the items of which an input has a newer revision, with these inputs.
+
+        A page examines as many items as `limit` says, so it may contain fewer, or none; `next_cursor` leads on.
+        """
+        filters = ItemFilters(collection=query.collection)
+        return await self.answer(
+            items.list_staleness, project, kind_of(kind), filters, cursor=query.cursor, limit=query.limit
+        )
+
+
 class ExplanationQuery(Request):
     """Query parameters of an explanation: the query to explain, and the folder whose items are counted."""
 
@@ -315,5 +341,6 @@ RESOURCES: tuple[type[Resource], ...] = (
     RevisionResource,
     LineageResource,
     LineageGraphResource,
+    StaleItems,
     StalenessResource,
 )

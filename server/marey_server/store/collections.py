@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Row, func, literal, or_, select, update
 from marey_schemas.access import Role
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Page
 from marey_server.access.folder_rights import FolderRights
-from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
+from marey_server.errors import BadRequestProblem, ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
@@ -91,13 +91,18 @@ def list_collections(
     project: str,
     *,
     path: str = "",
+    directly_in: str | None = None,
+    name: str | None = None,
     deleted: bool = False,
     cursor: str | None = None,
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
     """List the collections at and below `path`, without the root, in the order of their paths.
 
-    With `deleted`, deleted collections are listed instead.
+    With `directly_in`, only the subfolders of this folder are listed, and with `name`, only those with this name, or
+    whose names begin with the text before a final `*`. With `deleted`, deleted collections are listed instead.
+
+    Raises `BadRequestProblem` if `name` is given without `directly_in`.
     """
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if deleted else Role.READER)
     order = listing.parse_order("path", {"path": collection.c.path, "id": collection.c.id})
@@ -105,12 +110,29 @@ def list_collections(
         collection.c.project_id == project_row.id,
         collection.c.path != "",
         at_or_below(path),
+        *_children(directly_in, name),
         collection.c.deleted_us.is_not(None) if deleted else _ALIVE,
     )
-    identity = ["collections", project_row.id, path, deleted]
+    identity = ["collections", project_row.id, path, directly_in, name, deleted]
     rows, next_cursor = listing.read_page(tx, statement, order, identity, cursor, limit)
     rights = rights_shown(tx, project_row)
     return Page(items=tuple(_document(project_row, rights, row) for row in rows), next_cursor=next_cursor)
+
+
+def _children(directly_in: str | None, name: str | None) -> list[ColumnElement[bool]]:
+    """Return the conditions on the folders in a folder; `name` ends with `*` if it is the beginning of their names."""
+    if directly_in is None:
+        if name is not None:
+            raise BadRequestProblem(
+                "The parameter `name` selects among the subfolders of one folder; add `directly_in`.", code="bad-filter"
+            )
+        return []
+    folder = f"{directly_in}/" if directly_in else ""
+    if name is not None and not name.endswith("*"):
+        return [collection.c.path == f"{folder}{name}"]
+    start = folder + (name or "*")[:-1]
+    rest = func.substr(collection.c.path, len(folder) + 1)
+    return [collection.c.path >= start, func.substr(collection.c.path, 1, len(start)) == start, ~rest.contains("/")]
 
 
 def find_collection(tx: Transaction, project_row: ProjectRow, collection_id: str, *, lock: bool = False) -> Row[Any]:

@@ -14,6 +14,7 @@ from tests.support.command_line import CommandLine
 
 from marey_client.errors import JobUnsuccessful
 from marey_client.imports import find_files
+from marey_client.poses.strips import trial_name
 from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
 from marey_motion.formats import write_bvh
@@ -59,6 +60,17 @@ def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, ru
     run("report", "lab/walks-eval", "--out", "again.html", "--figures", "figures")
     assert (tmp_path / "again.html").read_text(encoding="utf-8") == page
     assert (tmp_path / "figures" / "offsets.png").read_bytes().startswith(b"\x89PNG")
+
+    run("view", "lab/walks-eval", "-n", 2, "--moments", 4, "--out", "worst.svg")
+    drawn = (tmp_path / "worst.svg").read_text(encoding="utf-8")
+    ranked = sorted(found.document()["trials"], key=lambda one: one["worst_rank"])
+    worst = [trial_name(one["trial"]) for one in ranked]
+    assert [drawn.count(f">{name}<") for name in worst[:3]] == [1, 1, 0]
+    assert "measures beyond limits" in drawn
+    assert (
+        "no effect on a model or an evaluation"
+        in run("view", "lab/walks-eval", "--out", "x.svg", "--beside", "source", status=2).stderr
+    )
     assert "again.html" in {path.name for path in tmp_path.iterdir()}
 
     run("report", "lab/walks-eval", "--walk-graph", "walks.graphml")

@@ -145,6 +145,13 @@ def test_wrong_examples_are_refused_with_the_reason(lab: ProjectHandle, run: Com
     assert "ends at frame 1000" in run("similar", "lab/walks/walk 1.5 0:0-1000", status=1).stderr
     assert "names no frames" in run("similar", "lab/walks/walk 1.5 0", status=2).stderr
     assert "after the start" in run("similar", "lab/walks/walk 1.5 0:60-60", status=2).stderr
+    (index,) = lab.items(Kind.INDEX).list()
+    moment = "lab/walks/walk 1.5 0:30-60"
+    found = run("similar", moment).stdout
+    for named in (index.id, f"lab/{index.id}", f"lab/{index.path}"):
+        assert run("similar", moment, "--index", named).stdout == found
+    assert "there is no index at lab/walks" in run("similar", moment, "--index", "lab/walks/none", status=2).stderr
+    assert "is in the project other" in run("similar", moment, "--index", f"other/{index.path}", status=2).stderr
     (walk,) = lab.clips.list(path="walks/walk 1.5 0")
     with pytest.raises(RequestFailed, match="less than or equal to 100"):
         lab.transport.send(

@@ -451,6 +451,14 @@ def test_a_project_says_what_it_holds_what_is_stale_and_takes_paths_and_revision
     walk.put_info(walk.info().model_copy(update={"comment": "changed"}))
     assert "made/raw/walk" in run("stale", f"{name}/made").stdout
     assert json.loads(run("stale", name, "--json").stdout)[0]["because"][0]["revision"] == 1
+    by_item = [answer for clip in project.clips.list(sort="name") if (answer := clip.staleness()).stale]
+    assert list(project.clips.outdated(page_size=1)) == by_item  # pages without a stale item are passed
+    assert [list(project.clips.outdated(collection=folder)) for folder in ("raw", "made")] == [[], by_item]
+    shown = run("ls", name, "-r", "--kind", "clip", "--columns", "kind,stale", "--sort=-stale").stdout
+    lines = [line.split() for line in shown.splitlines() if "/walk" in line]
+    assert lines == [["made/raw/walk", "clip", "stale"], ["again/walk", "clip"], ["raw/walk", "clip"]]
+    assert run("ls", f"{name}/made/raw/walk", "--columns", "stale").stdout.split()[-1] == "stale"
+    assert "raw/walk" not in run("ls", f"{name}/raw", "--stale").stdout
     assert "comment" not in run("show", f"{name}/raw/walk", "--revision", "1", "--part", "info").stdout
     run("download", f"{name}/raw/walk", "--revision", "1", "--format", "bvh", "-o", "out")
     held = run("df", name).stdout

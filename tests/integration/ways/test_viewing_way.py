@@ -50,4 +50,25 @@ def test_the_commands_of_the_page_give_addresses_whose_codes_open_the_project(
         assert browser.get("/projects/lab/clips").status_code == 404
         assert browser.post("/browser-sessions", json={"code": addresses[0].fragment}).status_code == 201
         assert browser.get(f"/projects/lab/clips/{walk}/parts/motion").status_code == 200
-    assert "0 clips that exist" in run("view", "lab/gaits/raw/walk", "--beside", "source", status=2).stderr
+    pictures = re.search(r"```sh\n(marey view [^`]*?--out.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert pictures is not None
+    turn_by = "rotate_joint joint=left_upper_arm angle_deg=60 axis=[0,0,1]"
+    joint = project_with_version.clips["gaits/raw/walk"].motion(frames=slice(0, 1)).joints[5]
+    run("edit", "apply", "lab/gaits/raw/walk", "--do", turn_by.replace("left_upper_arm", joint), "--in-place")
+    drawn = [shlex.split(line, comments=True)[1:] for line in pictures[1].splitlines()]
+    for words in (one for one in drawn if "models" not in one[1] and "eval" not in one[1]):
+        name = words[words.index("--out") + 1]
+        assert run(*words).stderr == f"wrote {name}\n"
+        assert (run.folder / name).read_bytes().startswith(b"<?xml" if name.endswith(".svg") else b"\x89PNG")
+    two = (run.folder / "change.svg").read_text(encoding="utf-8")
+    assert re.findall(r">(revision \d)<", two) == ["revision 1", "revision 1", "revision 2"]  # legend and rows
+    wrong = {
+        ("--out", "x.gif"): "must end in .png or .svg", ("--out", "x.png", "--frames", "9000:"): "contains no frame",
+        ("--out", "x.png", "--frames", "a:b"): "not a range of frames", ("--frames", "1:2"): "no effect without --out",
+        ("--out", "x.png", "--moments", "99"): "shows 1 to 24 moments",
+        ("--out", "x.png", "-n", "2"): "no effect on a clip",
+    }  # fmt: skip
+    for options, told in wrong.items():
+        assert told in run("view", "lab/gaits/raw/walk", *options, status=2).stderr
+    assert not list(run.folder.glob("x.*"))
+    assert "0 clips that exist" in run("view", "lab/gaits/raw/turn", "--beside", "source", status=2).stderr

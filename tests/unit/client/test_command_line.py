@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import re
-import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -694,14 +693,6 @@ def test_what_a_step_found_nothing_in_is_counted_as_people_count(capsys: pytest.
         job = a_job(result={"empty": empty})
         _print_shortfalls(PipelineRun(cast(Any, None), {"annotate": job}))
         assert capsys.readouterr().err == f"annotate found nothing {told}\n"
-
-
-def test_completion_is_offered_for_the_shell_that_starts_the_command(nowhere: dict[str, str]) -> None:
-    script = f"{shlex.quote(sys.executable)} -m marey_client.cli --show-completion; exit $?"
-    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, env={**os.environ, **nowhere})
-    assert done.returncode == 0, done.stderr
-    assert "complete -o" in done.stdout
-    assert "marey" in done.stdout
 
 
 def test_version_is_told() -> None:

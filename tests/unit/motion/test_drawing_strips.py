@@ -1,5 +1,7 @@
 """Strips of small figures: where the bodies are on the page, and which parts of a body are drawn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -13,7 +15,7 @@ from marey_motion.gait import generate_gait
 from marey_motion.skeleton import Skeleton
 from marey_reports.drawing.paper import COLOURS, INK, REFERENCE
 from marey_reports.drawing.stick_figures import body_of, runs_of
-from marey_reports.drawing.strips import StripMoments, StripRow, draw_strips
+from marey_reports.drawing.strips import POSE_CELL_IN, PoseRow, StripMoments, StripRow, draw_pose_rows, draw_strips
 
 
 @pytest.fixture(scope="module")
@@ -109,3 +111,26 @@ def test_bones_are_joined_to_runs_that_hold_each_bone_once() -> None:
     drawn = [tuple(pair) for run in runs for pair in zip(run[:-1].tolist(), run[1:].tolist(), strict=True)]
     assert sorted(drawn) == sorted(map(tuple, bones.tolist()))
     assert len(runs) == 2
+
+
+def test_poses_are_turned_into_their_headings_and_stay_in_the_middle() -> None:
+    walk = generate_gait(1.2, 0.0, 1.0)
+    pose = replace(walk, poses=walk.poses[30:31])
+    row = PoseRow("", "", [pose, pose], headings_rad=np.array([0.0, np.pi]))
+    figure = draw_pose_rows([row], ["a", "b"], ["", ""])
+    left, right = ([points_of(one)[:, 0] for one in coloured(figure, colour)] for colour in COLOURS[:2])
+    apart = [a.mean() - b.mean() for a, b in zip(left, right, strict=True)]
+    assert apart[0] * apart[1] < 0  # seen from the front, then from behind
+    assert abs(apart[0] + apart[1]) < 0.02
+    middles = [(a.mean() + b.mean()) / 2 for a, b in zip(left, right, strict=True)]
+    assert middles[1] - middles[0] == pytest.approx(POSE_CELL_IN[0], abs=0.3)
+
+
+def test_ghosts_of_pose_rows_are_named_and_keep_their_distance() -> None:
+    walk = generate_gait(1.2, 0.0, 1.0)
+    here, there = (replace(walk, poses=walk.poses[frame : frame + 1]) for frame in (30, 33))
+    figure = draw_pose_rows([PoseRow("", "", [here], ghost=[there])], ["a"], [""], ghost="revision 1")
+    assert "revision 1" in {text.get_text() for text in figure.axes[0].texts}
+    ghosts = np.concatenate([points_of(one) for one in coloured(figure, REFERENCE)])
+    bodies = np.concatenate([points_of(one) for colour in COLOURS[:2] for one in coloured(figure, colour)])
+    assert 0.01 < abs(ghosts[:, 0].mean() - bodies[:, 0].mean()) < 0.3

@@ -17,7 +17,7 @@ from marey_schemas.queries.fields import FACET_PREFIX
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
@@ -31,6 +31,7 @@ def _of_summary(name: str) -> Callable[[Item], object]:
 
 RECORDED = ("subject", "action", "take", "shoot_day", "select", "licence", "capture_system", "consent_until")
 """Columns with fields of take records."""
+STALE = "stale"
 COLUMNS: dict[str, Callable[[Item], object]] = {
     "kind": lambda item: item.kind,
     "revision": lambda item: item.revision,
@@ -44,8 +45,9 @@ COLUMNS: dict[str, Callable[[Item], object]] = {
     "created": lambda item: item.created_at,
     "updated": lambda item: item.updated_at,
     "id": lambda item: item.id,
+    STALE: lambda item: None,  # noqa: ARG005 - what the server answers decides, see `_value`
 }
-"""Columns that follow the name in a list of items."""
+"""Columns that follow the name in a list of items; whether an item is stale, the server is asked for separately."""
 DEFAULT_COLUMNS = "kind,revision,joints,frames,Hz,tags"
 FIGURES = ("revision", "joints", "frames", "Hz", "seconds")
 """Columns with numbers."""
@@ -120,9 +122,11 @@ def ls(
         items = _items_in(marey, address, recursive=everywhere, kinds=kind, tag=tag, find=find, query=query)
         if not folders and not items and marey.project(address.project).collections.at(address.path) is None:
             items = _items_called(marey, address)
-        if stale:
-            items = [one for one, _ in outdated(items)]
-    items = _sorted(items, order[0], reverse=sort.startswith("-"))
+        old: set[str] = set()
+        if stale or STALE in (*shown, *order):
+            old = {one.id for one, _ in outdated(marey.project(address.project), items)}
+    items = [one for one in items if one.id in old] if stale else items
+    items = _sorted(items, order[0], old, reverse=sort.startswith("-"))
     if as_json:
         return print_json({"collections": folders, "items": [one.item for one in items]})
     if not folders and not items:
@@ -132,7 +136,7 @@ def ls(
     ]
     for one in items:
         name = one.path if everywhere else one.name
-        rows.append((name, *(_value(one.item, column) for column in shown)))
+        rows.append((name, *(_value(one.item, column, old) for column in shown)))
     return print_table(
         ("name", *shown),
         rows,
@@ -176,19 +180,24 @@ def _columns(text: str, *, also: Sequence[str] = ()) -> list[str]:
     return names
 
 
-def _value(item: Item, column: str) -> object:
-    """Return the value of a column for an item; a facet is rounded to four digits, or None if the item lacks it."""
+def _value(item: Item, column: str, old: Collection[str]) -> object:
+    """Return the value of a column for an item; a facet is rounded to four digits, or None if the item lacks it.
+
+    `old` are the ids of stale items.
+    """
+    if column == STALE:
+        return STALE if item.id in old else None
     if column.startswith(FACET_PREFIX):
         value = item.facets.get(column.removeprefix(FACET_PREFIX))
         return None if value is None else float(f"{value:.4g}")
     return COLUMNS[column](item)
 
 
-def _sorted(items: Sequence[ItemHandle], column: str, *, reverse: bool) -> list[ItemHandle]:
+def _sorted(items: Sequence[ItemHandle], column: str, old: Collection[str], *, reverse: bool) -> list[ItemHandle]:
     """Sort items by a column; items without a value come last in either order."""
     if column == "name":
         return list(reversed(items)) if reverse else list(items)
-    values: dict[str, Any] = {one.id: _value(one.item, column) for one in items}
+    values: dict[str, Any] = {one.id: _value(one.item, column, old) for one in items}
     with_value = [one for one in items if values[one.id] not in (None, "")]
     without = [one for one in items if values[one.id] in (None, "")]
     return [*sorted(with_value, key=lambda one: values[one.id], reverse=reverse), *without]

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import typer
 from typer.core import TyperCommand
@@ -201,14 +201,23 @@ class _Option:
         return written.get(self._form)
 
 
+class SchemaCommand(TyperCommand):
+    """Command with options from models; its subclasses name its function, and the models by parameter."""
+
+    function: ClassVar[Callable[..., Any]]
+    groups: ClassVar[Mapping[str, OptionsOf]]
+
+
 def add_command(app: typer.Typer, function: Callable[..., Any], name: str | None = None, **options: OptionsOf) -> None:
     """Register a command; the parameters named in `options` receive the options given for their models."""
 
-    class Command(TyperCommand):
+    class Command(SchemaCommand):
+        groups = options
+
         @cached_property
         def whole(self) -> TyperCommand:
             one = typer.Typer(add_completion=False, rich_markup_mode=None)
-            one.command(name)(_expanded(function, options))
+            one.command(name)(expanded(function, options))
             whole = typer.main.get_command(one)
             assert isinstance(whole, TyperCommand)
             return whole
@@ -219,13 +228,15 @@ def add_command(app: typer.Typer, function: Callable[..., Any], name: str | None
         def invoke(self, ctx: Any) -> Any:
             return self.whole.invoke(ctx)
 
+    Command.function = staticmethod(function)
+
     def stub() -> None: ...
 
     stub.__name__, stub.__doc__ = function.__name__, function.__doc__
     app.command(name, cls=Command)(stub)
 
 
-def _expanded(function: Callable[..., Any], groups: Mapping[str, OptionsOf]) -> Callable[..., Any]:
+def expanded(function: Callable[..., Any], groups: Mapping[str, OptionsOf]) -> Callable[..., Any]:
     """Return a function that has each option as a parameter, and calls `function` with the given options."""
 
     def run(**typed: Any) -> Any:

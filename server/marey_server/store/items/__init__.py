@@ -18,7 +18,13 @@ from marey_server.store.items.changing import (
 )
 from marey_server.store.items.consents import find_ended_consents, permit_export, require_consent
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
-from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
+from marey_server.store.items.history import (
+    list_revisions,
+    list_staleness,
+    read_lineage,
+    read_revision,
+    read_staleness,
+)
 from marey_server.store.items.lineage_graphs import read_lineage_graph
 from marey_server.store.items.listing import ItemFilters, Namesakes, explain_query, find_namesakes, list_items
 from marey_server.store.items.publishing import publish
@@ -56,6 +62,7 @@ __all__ = [
     "find_part",
     "list_items",
     "list_revisions",
+    "list_staleness",
     "load_part",
     "load_parts",
     "merge_skeletons",

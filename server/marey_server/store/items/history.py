@@ -14,9 +14,10 @@ from marey_schemas.tracing.context import HEADER
 from marey_server.errors import NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
+from marey_server.store.items.listing import ItemFilters, list_items
 from marey_server.store.items.reading import find_item, read_parts
 from marey_server.store.tables import item, job, lineage, project, revision, user
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 MAX_EDGES = 1000
 
@@ -125,6 +126,36 @@ def _has_newer_content(item_id: Any, number: Any) -> ColumnElement[bool]:
     return exists().where(later.c.item_id == item_id, later.c.number > number, ~exists().where(is_merge))
 
 
+def list_staleness(
+    tx: Transaction,
+    project_name: str,
+    kind: Kind,
+    filters: ItemFilters,
+    *,
+    cursor: str | None = None,
+    limit: int = listing.DEFAULT_LIMIT,
+) -> Page:
+    """List the items of a kind of which an input has a newer revision, in the order of their names.
+
+    `read_staleness` says what counts. A page examines `limit` items, so it may list fewer, even none.
+    """
+    examined = list_items(
+        tx, project_name, kind, filters, sort="name", cursor=cursor, limit=limit, fields=("id", "revision")
+    )
+    heads = [(one["id"], one["revision"]) for one in examined.items]
+    made = _with_inputs(tx, [item_id for item_id, _ in heads])
+    found = (_staleness(tx, item_id, head) for item_id, head in heads if item_id in made)
+    return Page(items=tuple(one for one in found if one.stale), next_cursor=examined.next_cursor)
+
+
+def _with_inputs(tx: Transaction, items: Collection[str]) -> set[str]:
+    """Return those of the items of which any revision has an input: only these can be outdated."""
+    found: set[str] = set()
+    for some in in_lists(sorted(items)):
+        found.update(tx.execute(select(lineage.c.item_id).where(lineage.c.item_id.in_(some)).distinct()).scalars())
+    return found
+
+
 def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str) -> Staleness:
     """Return whether a direct or indirect input of the newest revision has a newer revision.
 
@@ -133,9 +164,13 @@ def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str)
     skeletons made do not count as newer, because the motion is the same.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
+    return _staleness(tx, item_id, found.head)
+
+
+def _staleness(tx: Transaction, item_id: str, head: int) -> Staleness:
     ancestry = (
         select(revision.c.item_id, revision.c.number)
-        .where(revision.c.item_id == item_id, revision.c.number == found.head)
+        .where(revision.c.item_id == item_id, revision.c.number == head)
         .cte("ancestry", recursive=True)
     )
     made_from = and_(lineage.c.item_id == ancestry.c.item_id, lineage.c.number == ancestry.c.number)
@@ -149,4 +184,4 @@ def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str)
     newer = select(lineage.c.item_id).join(item, item.c.id == lineage.c.input_item_id).where(outdated)
     stale = tx.execute(newer.limit(1)).first() is not None
     because = _edges(tx, lineage.c.input_item_id, lineage.c.input_number, outdated) if stale else ()
-    return Staleness(item=item_id, revision=found.head, stale=stale, because=because)
+    return Staleness(item=item_id, revision=head, stale=stale, because=because)

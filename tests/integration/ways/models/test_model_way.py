@@ -179,6 +179,10 @@ def test_from_the_command_line(lab: ProjectHandle, run: CommandLine, tmp_path: P
     assert (tmp_path / "samples" / "cli_1_0002.bvh").read_bytes().startswith(b"HIERARCHY")
     clips = json.loads(run("sample", "lab/models/cli", "--into", "from-cli", "--json").stdout)
     assert clips == {"clips": ["lab/from-cli/cli_0_0001"]}
+    run("view", "lab/models/cli", "-n", 2, "--seed", 1, "--moments", 3, "--out", "samples.svg")
+    drawn = (tmp_path / "samples.svg").read_text(encoding="utf-8")
+    assert [drawn.count(f">{text}<") for text in ("sample 1", "sample 2", "sample 3", "50 %")] == [1, 1, 0, 1]
+    assert "no clip at lab/models/cli" in run("view", "lab/models/cli", status=2).stderr
     shown = run("show", "lab/models/cli").stdout
     assert "verdict" in shown
     assert "left_out_error_cm" in shown

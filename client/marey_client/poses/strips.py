@@ -1,0 +1,240 @@
+"""Strips of poses as files: of clips and their revisions, samples of models, and trials of evaluations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from marey_client.errors import BadArgument
+from marey_client.extras import room
+from marey_client.handles.clips import ClipHandle
+from marey_client.handles.evaluations import EvaluationHandle
+from marey_client.handles.models import ModelHandle
+from marey_client.poses.kinematics import PosedSkeleton, read_rig
+from marey_client.poses.pictures import FIGURES_EXTRA, MOST_MOMENTS, READS_AT_ONCE
+from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
+
+FILE_TYPES = ("png", "svg")
+MOST_ROWS = 24
+
+
+@dataclass(frozen=True)
+class ClipOfStrip:
+    """A revision of a clip and a range of its frames, for a picture."""
+
+    clip: ClipHandle
+    revision: int | None = None
+    frames: slice | None = None
+
+    @property
+    def number(self) -> int:
+        """The number of the revision."""
+        return self.revision or self.clip.item.revision
+
+    def chosen(self, moments: int) -> list[int]:
+        """Return the numbers of the frames at some moments, at equal distances."""
+        return _spread(range(*(self.frames or slice(None)).indices(self._count)), moments, self.clip.path)
+
+    def poses(self, frames: Sequence[int]) -> list[Any]:
+        """Read single frames, each as a clip of `marey_motion`."""
+
+        def read(frame: int) -> MotionDocument:
+            return self.clip.motion(frames=slice(frame, frame + 1), revision=self.number)
+
+        with ThreadPoolExecutor(READS_AT_ONCE, thread_name_prefix="marey-poses") as pool:
+            found = list(pool.map(read, frames))
+        reference = found[0].skeleton
+        assert isinstance(reference, RevisionRef)
+        rig = read_rig(self.clip, reference)
+        return [_posed(one, rig) for one in found]
+
+    def at_times_of(self, other: ClipOfStrip, frames: Sequence[int]) -> list[int]:
+        """Return the frames of this clip at the times of frames of another clip, as far as this clip reaches."""
+        ratio = self.clip.frame_rate_hz / other.clip.frame_rate_hz
+        found = [frame for frame in (round(one * ratio) for one in frames) if frame < self._count]
+        if not found:
+            raise BadArgument(f"frames: {self.clip.path!r} ends before the first of these frames")
+        return found
+
+    def whole(self) -> Any:
+        """Read the range of frames as a clip of `marey_motion`."""
+        motion = self.clip.motion(frames=self.frames, revision=self.number)
+        reference = motion.skeleton
+        assert isinstance(reference, RevisionRef)
+        return _posed(motion, read_rig(self.clip, reference))
+
+    @property
+    def _count(self) -> int:
+        if self.number == self.clip.item.revision:
+            return self.clip.frames
+        return len(self.clip.motion(revision=self.number).poses)
+
+
+def draw_clips(first: ClipOfStrip, second: ClipOfStrip | None, moments: int, file_type: str) -> bytes:
+    """Draw a clip, and another clip or revision below it, at the same times, as PNG or SVG.
+
+    Another revision of the same clip is drawn before grey poses of the first one. Clips with different joints are drawn
+    side by side, which is possible as PNG only. Raises `BadArgument` if the clips have no time in common.
+    """
+    frames = first.chosen(moments)
+    poses = first.poses(frames)
+    strips = room("marey_reports.drawing.strips", FIGURES_EXTRA)
+    rows = [strips.PoseRow(first.clip.name, f"revision {first.number}", poses)]
+    same_clip = second is not None and second.clip.id == first.clip.id
+    if second is not None:
+        at_times = second.at_times_of(first, frames)
+        others = second.poses(at_times)
+        if others[0].skeleton.joint_names != poses[0].skeleton.joint_names:
+            return _side_by_side(first, second, moments, file_type)
+        frames, poses = frames[: len(others)], poses[: len(others)]
+        rows = [
+            strips.PoseRow(first.clip.name, f"revision {first.number}", poses),
+            strips.PoseRow(second.clip.name, f"revision {second.number}", others, ghost=poses if same_clip else ()),
+        ]
+    labels = [f"{frame / first.clip.frame_rate_hz:.2f} s" for frame in frames]
+    ghost = f"revision {first.number}" if same_clip else ""
+    figure = strips.draw_pose_rows(rows, [f"frame {frame}" for frame in frames], labels, ghost=ghost)
+    return _written(figure, file_type, first.clip.path)
+
+
+def _side_by_side(first: ClipOfStrip, second: ClipOfStrip, moments: int, file_type: str) -> bytes:
+    sheets = room("marey_reports.drawing.contact_sheet", FIGURES_EXTRA)
+    if file_type != "png" or moments > sheets.MAX_MOMENTS:
+        raise BadArgument(
+            f"{first.clip.path!r} and {second.clip.path!r} have different joints; draw them to a .png file, at "
+            f"most {sheets.MAX_MOMENTS} moments"
+        )
+    title = f"{second.clip.path} (white), {first.clip.path} (tinted)"
+    pair = sheets.TakePair(title, second.whole(), first.whole())
+    data: bytes = sheets.contact_sheet([pair], heading=first.clip.name, moments=moments)
+    return data
+
+
+def draw_samples(model: ModelHandle, revision: int | None, n: int, seed: int, moments: int, file_type: str) -> bytes:
+    """Draw samples of a model, one in each row, at equal shares of their durations, as PNG or SVG."""
+    _require_rows(n)
+    drawn = model.sample(n, seed, revision=revision)
+    strips = room("marey_reports.drawing.strips", FIGURES_EXTRA)
+    rows = []
+    for number, motion in enumerate(drawn.motions, 1):
+        reference = motion.skeleton
+        assert isinstance(reference, RevisionRef)
+        rig = read_rig(model, reference)
+        frames = _spread(range(len(motion.poses)), moments, model.path)
+        seconds = len(motion.poses) / motion.frame_rate_hz
+        poses = [_posed(_frame_of(motion, frame), rig) for frame in frames]
+        rows.append(strips.PoseRow(f"sample {number}", f"seed {seed}, {seconds:.2f} s", poses))
+    count = min(len(row.poses) for row in rows)
+    shares = [f"{100 * place / max(1, count - 1):.0f} %" for place in range(count)]
+    rows = [strips.PoseRow(row.label, row.note, row.poses[:count]) for row in rows]
+    return _written(strips.draw_pose_rows(rows, ["of the motion"] * count, shares), file_type, model.path)
+
+
+def draw_worst_trials(
+    evaluation: EvaluationHandle, revision: int | None, count: int, moments: int, file_type: str
+) -> bytes:
+    """Draw the worst trials of an evaluation, the worst first, as PNG or SVG.
+
+    A cell shows the recorded frame that the character displayed at a moment, turned into the heading of the character;
+    the smoothing after switches between clips is left out. Raises `BadArgument` without ranks and records of trials.
+    """
+    _require_rows(count)
+    document = evaluation.document(revision=revision)
+    ranked = sorted((one for one in document["trials"] if "worst_rank" in one), key=lambda one: one["worst_rank"])
+    if not ranked:
+        raise BadArgument(f"{evaluation.path!r} does not say which trials are the worst; evaluate the clips again")
+    strips = room("marey_reports.drawing.strips", FIGURES_EXTRA)
+    records = evaluation.records(revision=revision)
+    shown = _DisplayedFrames(evaluation, document)
+    rows, times = [], []
+    for one in ranked[:count]:
+        name = trial_name(one["trial"])
+        record = records[name]
+        ticks = _spread(range(len(record["rows"])), moments, name)
+        times = [tick / shown.rate_hz for tick in ticks]
+        poses = [shown.pose(int(record["rows"][tick])) for tick in ticks]
+        limits = f"{counted(len(one['beyond_limits']), 'measure')} beyond limits"
+        headings = np.asarray(record["headings"][ticks], dtype=np.float64)
+        rows.append(strips.PoseRow(name, limits, poses, headings_rad=headings))
+    figure = strips.draw_pose_rows(rows, ["of the trial"] * len(times), [f"{time_s:.1f} s" for time_s in times])
+    return _written(figure, file_type, evaluation.path)
+
+
+def trial_name(trial: dict[str, Any]) -> str:
+    """Return the name of a trial of an evaluation's document."""
+    return f"{trial['family']} v={trial['speed_m_s']:g} w={math.degrees(trial['turn_rate_rad_s']):g}"
+
+
+class _DisplayedFrames:
+    """Frames of recorded clips, by their rows in the database of an evaluation."""
+
+    def __init__(self, evaluation: EvaluationHandle, document: dict[str, Any]) -> None:
+        self.rate_hz = float(document["options"]["database"]["rate_hz"])
+        self._evaluation = evaluation
+        self._clips = document["clips"]
+        self._starts = [one["start"] for one in self._clips]
+        self._handles: dict[str, ClipHandle] = {}
+
+    def pose(self, row: int) -> Any:
+        """Return the recorded pose of a row, as a clip of one frame; mirrored if the row is of a mirrored copy."""
+        found = self._clips[int(np.searchsorted(self._starts, row, side="right")) - 1]
+        item, _, revision = found["uid"].partition("~")[0].partition("@")  # of a mirrored copy, more follows
+        clip = self._clip(item)
+        time_s = found["first_s"] + (row - found["start"]) / self.rate_hz
+        frame = min(round(time_s * clip.frame_rate_hz), clip.frames - 1)
+        (pose,) = ClipOfStrip(clip, int(revision)).poses([frame])
+        if found["mirrored_from"] is None:
+            return pose
+        rigs = room("marey_motion.rigs", FIGURES_EXTRA)
+        partners = rigs.symmetric_joints(pose.skeleton, rigs.map_joints(pose.skeleton))
+        return room("marey_motion.mirroring", FIGURES_EXTRA).mirror_clip(pose, partners)
+
+    def _clip(self, item: str) -> ClipHandle:
+        if item not in self._handles:
+            path = f"/projects/{self._evaluation.project}/{Kind.CLIP.plural}/{item}"
+            found = self._evaluation.transport.get(type(self._evaluation.item), path)
+            self._handles[item] = ClipHandle(self._evaluation.transport, self._evaluation.project, found)
+        return self._handles[item]
+
+
+def _spread(frames: range, moments: int, name: str) -> list[int]:
+    """Return up to `moments` of the frames, at equal distances. Raises `BadArgument` if there are none."""
+    if not 1 <= moments <= MOST_MOMENTS:
+        raise BadArgument(f"moments: a picture shows 1 to {MOST_MOMENTS} moments, not {moments}")
+    if not frames:
+        raise BadArgument(f"frames: the range contains no frame of {name!r}")
+    return [frames[round(place)] for place in np.linspace(0, len(frames) - 1, min(moments, len(frames)))]
+
+
+def _require_rows(count: int) -> None:
+    if not 1 <= count <= MOST_ROWS:
+        raise BadArgument(f"a picture shows 1 to {MOST_ROWS} rows, not {count}")
+
+
+def _frame_of(motion: MotionDocument, frame: int) -> MotionDocument:
+    translations = motion.translations
+    one = slice(frame, frame + 1)
+    return motion.model_copy(
+        update={"poses": motion.poses[one], "translations": None if translations is None else translations[one]}
+    )
+
+
+def _posed(motion: MotionDocument, rig: PosedSkeleton) -> Any:
+    documents = room("marey_motion.documents", FIGURES_EXTRA)
+    return documents.clip_from_document(motion, documents.skeleton_from_document(rig.hierarchy))
+
+
+def _written(figure: Any, file_type: str, title: str) -> bytes:
+    paper = room("marey_reports.drawing.paper", FIGURES_EXTRA)
+    if file_type == "svg":
+        return str(paper.to_svg(figure, title)).encode()
+    data: bytes = paper.to_png(figure)
+    return data
