@@ -12,13 +12,17 @@ import os
 import re
 import tempfile
 import tomllib
-from collections.abc import Generator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from marey_client.errors import BadAddress, BadCredentialFile, BadToken
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SERVER_VARIABLES, SETTINGS_FILE
+
+if TYPE_CHECKING:
+    import httpx  # takes long to load; completion in a shell needs credentials only
 
 DEFAULT_URL = f"http://{DEFAULT_HOST}:{DEFAULT_PORT}"
 DEFAULT_DATA = "marey-data"
@@ -60,8 +64,8 @@ class TokenFile:
         return found.st_mtime_ns, found.st_ino, found.st_size
 
 
-class BearerToken(httpx.Auth):
-    """Authentication that adds the token to requests; the token is not shown elsewhere, for example in logs."""
+class BearerToken:
+    """Function for httpx that adds the token to requests; the token is not shown elsewhere, for example in logs."""
 
     def __init__(self, token: str | TokenFile) -> None:
         self._source = token if isinstance(token, TokenFile) else as_token(token)
@@ -71,10 +75,10 @@ class BearerToken(httpx.Auth):
         """The current token."""
         return self._source.token if isinstance(self._source, TokenFile) else self._source
 
-    def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
+    def __call__(self, request: httpx.Request) -> httpx.Request:
         """Set the header `Authorization` of a request to the current token."""
         request.headers["Authorization"] = f"Bearer {self.token}"
-        yield request
+        return request
 
     def __repr__(self) -> str:
         return "BearerToken(...)"

@@ -12,6 +12,7 @@ from typing import Any, ParamSpec
 
 import pytest
 import sqlalchemy
+import sqlalchemy.event
 from sqlalchemy import Dialect, Engine
 from sqlalchemy.util import LRUCache
 

@@ -109,7 +109,7 @@ def _print_version(wanted: bool) -> None:
 
 def _install_completion(wanted: bool) -> None:
     if wanted:
-        from typer.completion import install  # type: ignore[attr-defined]
+        from typer.completion import install  # pyrefly: ignore[implicit-reexport]  # defined in a private module
 
         shell, path = install(prog_name="marey")
         if shell in SCRIPTS:

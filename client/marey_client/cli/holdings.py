@@ -15,7 +15,7 @@ from marey_schemas.sizes import GIB, MIB
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from marey_client.items import ItemHandle
     from marey_client.project import ProjectHandle
@@ -105,7 +105,7 @@ def outdated(project: ProjectHandle, items: Sequence[ItemHandle]) -> list[tuple[
 def _common_folder(folders: Sequence[str]) -> str:
     """Return the path of the deepest folder that is equal to or above each of the folders; empty: the root."""
     parts = [folder.split("/") for folder in folders]
-    shared = (step[0] for step in takewhile(lambda step: len(set(step)) == 1, zip(*parts, strict=False)))
+    shared: Iterator[str] = (step[0] for step in takewhile(lambda step: len(set(step)) == 1, zip(*parts, strict=False)))
     return "/".join(shared)
 
 

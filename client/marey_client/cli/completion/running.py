@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, get_args, get_origin
 
 import typer
+import typer.core
 from typer.models import CommandInfo, ParameterInfo
 
 from marey_client.cli.completion.found import How, Suggestion, Typed
@@ -32,7 +33,7 @@ MOST_SUGGESTIONS = 1000
 
 def complete(app: typer.Typer, line: Line) -> list[Suggestion] | None:
     """Return suggestions for the end of a line; None if file names fit there."""
-    from typer.completion import completion_init  # type: ignore[attr-defined]
+    from typer.completion import completion_init  # pyrefly: ignore[implicit-reexport]  # of a private module
 
     completion_init()
     asked = _Asked(line)
@@ -118,7 +119,7 @@ class _Asked:
             made = parameter if how is None else _with_completion(parameter, self._answering(how, len(command)))
             parameters.append(made.replace(kind=inspect.Parameter.KEYWORD_ONLY))
         run.__name__, run.__doc__ = function.__name__, function.__doc__
-        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__signature__ = inspect.Signature(parameters)  # pyrefly: ignore[missing-attribute]  # functions take it
         run.__annotations__ = {one.name: one.annotation for one in parameters}
         return run
 
@@ -172,7 +173,7 @@ def _reduced(function: Callable[..., Any], groups: Mapping[str, Any]) -> Callabl
     parameters = inspect.signature(function, eval_str=True).parameters.items()
     left = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for name, one in parameters if name not in groups]
     run.__name__, run.__doc__ = function.__name__, function.__doc__
-    run.__signature__ = inspect.Signature(left)  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature(left)  # pyrefly: ignore[missing-attribute]  # functions take it
     return run
 
 

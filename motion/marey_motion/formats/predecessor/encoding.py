@@ -82,7 +82,7 @@ def decode_content(data: bytes, file: str) -> dict[str, Any] | list[Any]:
         if isinstance(error, bson.errors.BSONError) and not str(error):
             raise MemoryError from error  # which bson replaces by an error of its own without a text
         raise FormatError(f"the document cannot be read: {error}", code="document-damaged", file=file) from error
-    if not isinstance(document, dict | list):
+    if not isinstance(document, (dict, list)):
         raise FormatError("the file contains no document", code="document-damaged", file=file)
     return document
 

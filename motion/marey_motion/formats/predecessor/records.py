@@ -97,7 +97,7 @@ def _values(content: Any) -> Iterator[tuple[str, Any, bool]]:
     waiting: list[tuple[str, Any, bool]] = [("", content, False)]
     while waiting:
         pointer, value, is_secret = waiting.pop()
-        if not value or is_secret or not isinstance(value, Mapping | list) or _is_row(value):
+        if not value or is_secret or not isinstance(value, (Mapping, list)) or _is_row(value):
             yield pointer, value, is_secret and bool(value)
             continue
         members = value.items() if isinstance(value, Mapping) else enumerate(value)
@@ -106,7 +106,7 @@ def _values(content: Any) -> Iterator[tuple[str, Any, bool]]:
 
 
 def _is_row(value: Any) -> bool:
-    return isinstance(value, list) and not any(isinstance(one, Mapping | list) for one in value)
+    return isinstance(value, list) and not any(isinstance(one, (Mapping, list)) for one in value)
 
 
 def _is_credential(key: object) -> bool:
@@ -125,7 +125,7 @@ def _shown(value: Any) -> FieldValue:
         return int(value)
     if isinstance(value, float) and math.isfinite(value):
         return value
-    if isinstance(value, Mapping | list):
+    if isinstance(value, (Mapping, list)):
         value = json.dumps(value, ensure_ascii=False, default=str)
     text = _plain(str(value))
     return text if len(text) <= LONGEST_TEXT else f"{text[: LONGEST_TEXT - 1]}…"

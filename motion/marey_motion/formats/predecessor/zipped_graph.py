@@ -246,7 +246,7 @@ class _Nodes:
         follows: dict[Place, dict[Place, None]] = {place: {} for place in self._places}
         unknown = []
         for key, targets in field_of(self._definition, "transitions", dict, self._file).items():
-            if not isinstance(targets, dict | list):
+            if not isinstance(targets, (dict, list)):
                 raise FormatError(f"the transitions of {key!r} must be a list or an object", file=self._file)
             for target in map(str, targets):
                 start, end = self._named.get(key), self._named.get(target)
