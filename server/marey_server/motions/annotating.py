@@ -142,8 +142,9 @@ def read_annotation(order: bytes) -> bytes:
 
     Raises `InvalidProblem` if the file is not a valid annotation of the clip.
     """
-    from marey_motion.errors import MotionError
-    from marey_motion.formats.predecessor.encoding import decode_document
+    with LOADING:
+        from marey_motion.errors import MotionError
+        from marey_motion.formats.predecessor.encoding import decode_document
 
     wanted = AnnotationOrder.unpack(order)
     assert wanted.given.file is not None
