@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 LIST = Path(__file__).with_name("slow_tests.txt")
-LONGEST_S = 0.7
+LONGEST_S = 0.4
 """Longest time in seconds of all cases of a function in the tier `check`, on a slow machine that does nothing else."""
 CERTAINLY_SLOW_S = 3 * LONGEST_S
 """Time of a function which the tier `check` prints if the list lacks this function; busy machines take longer, too."""
