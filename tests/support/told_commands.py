@@ -24,6 +24,8 @@ def unknown_options(words: list[str]) -> set[str]:
         told = told[1 if of_all[told[0]].is_flag else 2 :]
     while told and told[0] in getattr(command, "commands", {}):
         command = command.commands[told.pop(0)]
+    if any(of_all[word].is_eager for word in words if word in of_all):
+        return set()  # such an option does all that the command does
     assert getattr(command, "invoke_without_command", True), (
         f"no command: {words}"
     )  # of a group that does nothing itself
