@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from tests.support.tiers import examples, is_soak
+from tests.support.tiers import examples
 
 from marey_schemas.encoding import codecs
 from marey_schemas.encoding.arrays import EncodedArray
@@ -91,7 +91,7 @@ CODECS = [
 
 
 @given(tree=objects)
-@settings(max_examples=examples(200 if is_soak() else 80))
+@settings(max_examples=examples(80, soak=200))
 def test_what_every_codec_writes_reads_back_equal_to_the_bit_and_is_always_the_same(tree: object) -> None:
     for codec in CODECS:
         data = codec.encode(tree)
@@ -100,7 +100,7 @@ def test_what_every_codec_writes_reads_back_equal_to_the_bit_and_is_always_the_s
 
 
 @given(data=st.binary(max_size=200))
-@settings(max_examples=examples(500 if is_soak() else 200))
+@settings(max_examples=examples(200, soak=500))
 def test_every_codec_reads_or_refuses_rubbish_and_never_crashes(data: bytes) -> None:
     for codec in CODECS:
         with suppress(CodecError):
@@ -242,7 +242,7 @@ class TestEveryCodec:
 
 
 @given(tree=objects)
-@settings(max_examples=examples(150 if is_soak() else 60))
+@settings(max_examples=examples(60, soak=150))
 def test_all_media_types_decode_to_the_same_tree(tree: object) -> None:
     decoded = [decode_tree(encode_tree(tree, media_type), media_type) for media_type in codecs.MEDIA_TYPES]
     assert same(decoded[0], decoded[1])
@@ -250,7 +250,7 @@ def test_all_media_types_decode_to_the_same_tree(tree: object) -> None:
 
 
 @given(tree=values.filter(lambda tree: not isinstance(tree, dict)))
-@settings(max_examples=examples(60 if is_soak() else 30))
+@settings(max_examples=examples(30, soak=60))
 def test_lists_and_scalars_are_documents_in_json_and_messagepack(tree: object) -> None:
     for media_type in (codecs.JSON, codecs.MSGPACK):
         assert same(decode_tree(encode_tree(tree, media_type), media_type), tree)

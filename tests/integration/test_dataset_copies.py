@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from tests.support.rest_server import Server
 from tests.support.store_fixtures import motion_tree, skeleton_tree
-from tests.support.tiers import examples, is_soak
+from tests.support.tiers import examples
 
 from marey_client import Marey
 from marey_client.archives import documents
@@ -342,7 +342,7 @@ def test_a_few_edited_frames_of_a_short_clip_are_sent_alone_on_both_ways(
     assert (poses_in(partner) == clip.part("motion")["poses"]).all()
 
 
-@pytest.mark.parametrize("seed", range(examples(4 if is_soak() else 2)))
+@pytest.mark.parametrize("seed", range(examples(2, soak=4)))
 def test_random_edits_of_random_clips_arrive_equal_whatever_the_receiver_holds(
     lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, seed: int
 ) -> None:

@@ -189,9 +189,14 @@ ON_DATABASES = pytest.StashKey[Counter[str]]()
 """Key of the number of databases on which a test can run, by its name without the database."""
 
 
-def examples(count: int) -> int:
-    """Return how many examples a property test draws in the running tier; `count` is the number in the tier `test`."""
-    return max(1, count * present(hypothesis.settings.default).max_examples // EXAMPLES)
+def examples(count: int, soak: int | None = None) -> int:
+    """Return how many examples a property test draws in the running tier; `count` is the number in the tier `test`.
+
+    The tier `soak` multiplies this number, or `soak` if that is given: a test that is too slow to draw enough examples
+    each time draws them in `soak`.
+    """
+    base = soak if soak is not None and is_soak() else count
+    return max(1, base * present(hypothesis.settings.default).max_examples // EXAMPLES)
 
 
 def steps(count: int) -> int:

@@ -52,7 +52,7 @@ some_histories = st.integers(2, 12).flatmap(
 )
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(some_histories, st.booleans(), st.data())
 def test_the_range_has_every_version_that_can_be_the_first_bad_one(
     parents: Sequence[Sequence[int]], first_parent: bool, data: st.DataObject

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound
-from tests.support.tiers import examples, is_soak
+from tests.support.tiers import examples
 
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import EditedClip, edit_clip
@@ -112,7 +112,7 @@ def frames_after(clip: Clip, commands: list[AnyCommand]) -> int | None:
     return frames
 
 
-@settings(max_examples=examples(150 if is_soak() else 60), suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(60, soak=150), suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(COMMAND, min_size=1, max_size=6))
 def test_any_list_of_commands_makes_sound_clips_or_is_refused_in_words(commands: list[AnyCommand]) -> None:
     made = outcome_of(commands)
@@ -129,7 +129,7 @@ def test_any_list_of_commands_makes_sound_clips_or_is_refused_in_words(commands:
         assert expected is None or sum(one.clip.frame_count for one in made) == expected
 
 
-@settings(max_examples=examples(30 if is_soak() else 10))
+@settings(max_examples=examples(10, soak=30))
 @given(st.lists(COMMAND, min_size=1, max_size=4))
 def test_the_same_list_gives_the_same_bytes(commands: list[AnyCommand]) -> None:
     def bytes_of() -> list[bytes] | str:

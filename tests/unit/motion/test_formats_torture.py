@@ -92,7 +92,7 @@ def readers() -> None:
 
 
 @pytest.mark.usefixtures("readers")
-@settings(max_examples=examples(400 if is_soak() else 150))
+@settings(max_examples=examples(150, soak=400))
 @given(choice=st.integers(0, len(seeds()) - 1), source=st.randoms(use_true_random=False))
 def test_broken_files_are_read_or_refused_and_nothing_else(choice: int, source: random.Random) -> None:
     started_s = time.process_time()
@@ -124,7 +124,7 @@ def clips(draw: st.DrawFn) -> Clip:
     return Clip(skeleton, draw(st.sampled_from([24.0, 30.0, 59.94, 120.0, 77.7])), poses, translations, moved)
 
 
-@settings(max_examples=examples(100 if is_soak() else 50))
+@settings(max_examples=examples(50, soak=100))
 @given(clips(), st.sampled_from(["xyz", "xzy", "yxz", "yzx", "zxy", "zyx"]))
 def test_any_clip_survives_being_written_as_bvh(clip: Clip, order: str) -> None:
     back = read_motion(write_bvh(clip, rotation_order=order), "back.bvh", options=CENTIMETRES).clip

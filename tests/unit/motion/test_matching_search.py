@@ -129,7 +129,7 @@ def test_many_queries_of_a_walking_database_are_answered_exactly() -> None:
         assert (row, cost) == true_nearest(features, selectable, query)
 
 
-@settings(max_examples=examples(150 if is_soak() else 60))
+@settings(max_examples=examples(60, soak=150))
 @given(st.data())
 def test_differences_that_float32_cannot_show_still_decide(data: DataObject) -> None:
     """All rows are equal in float32, and differ by a few units in the last place of float64."""

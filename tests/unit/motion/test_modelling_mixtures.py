@@ -191,7 +191,7 @@ def test_identical_examples_give_identical_mixtures_every_time() -> None:
     assert first.candidates == second.candidates
 
 
-@settings(max_examples=examples(4 if is_soak() else 2))
+@settings(max_examples=examples(2, soak=4))
 @given(st.sampled_from([1e-4, 0.03, 7.0, 1e4]), st.integers(0, 50))
 def test_the_choice_does_not_depend_on_the_unit(unit: float, seed: int) -> None:
     examples = two_kinds(80, 2, 5.0, seed)

@@ -389,7 +389,7 @@ def run(lab: Lab, known: dict[str, str], count: int, length: int) -> None:
 
 
 def test_a_dataset_behaves_as_its_model(lab: Lab, known_items: dict[str, str]) -> None:
-    run(lab, known_items, examples(6), steps(30))
+    run(lab, known_items, examples(6, soak=15), steps(30))
 
 
 def drop_their_side(patch: pytest.MonkeyPatch) -> None:

@@ -81,7 +81,7 @@ TURNS = st.lists(st.sampled_from(["ann", "ben", "cleo", "numbers", "numbers", "f
 
 def test_a_follower_gets_every_event_once_however_transactions_overlap(lab: Lab) -> None:
     @given(TURNS)
-    @settings(max_examples=examples(30))
+    @settings(max_examples=examples(30, soak=100))
     def check(turns: list[str]) -> None:
         overlap = Overlap(lab)
         for name in turns:

@@ -165,7 +165,7 @@ def test_followers_and_webhooks_know_of_every_event_or_how_far_they_were_deleted
     monkeypatch.setattr(events, "DELETED_AT_ONCE", 3)
 
     @given(TURNS)
-    @settings(max_examples=examples(30))
+    @settings(max_examples=examples(30, soak=100))
     def check(turns: list[str]) -> None:
         world = World(lab, clock)
         for turn in turns:

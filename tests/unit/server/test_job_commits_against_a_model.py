@@ -234,7 +234,7 @@ def run(desk: Desk, count: int, length: int) -> None:
 
 
 def test_jobs_that_commit_behave_as_their_model(desk: Desk) -> None:
-    run(desk, examples(3), steps(25))
+    run(desk, examples(3, soak=6), steps(25))
 
 
 def overwrite_what_others_changed(patch: pytest.MonkeyPatch) -> None:

@@ -209,7 +209,7 @@ def test_cursors_of_one_server_are_worth_nothing_on_another(filled: FilledLab) -
 
 
 @given(text=st.text(max_size=8), number=st.integers(-(2**70), 2**70))
-@settings(max_examples=examples(20), suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(20, soak=60), suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_no_filter_value_breaks_a_list(filled: FilledLab, text: str, number: int) -> None:
     texts: list[dict[str, Any]] = [{"q": text}, {"name": text}, {"name": f"{text}*"}, {"path": text}, {"tags": (text,)}]
     texts += [{"directly_in": text}]

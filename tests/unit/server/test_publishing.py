@@ -342,7 +342,7 @@ names = st.sampled_from("abcdef")
 
 
 @given(st.dictionaries(names, st.lists(names, max_size=3)))
-@settings(max_examples=examples(100))
+@settings(max_examples=examples(100, soak=300))
 def test_references_are_followed_before_what_refers(refers: dict[str, Any]) -> None:
     try:
         order = references.in_order(refers)

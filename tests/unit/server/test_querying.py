@@ -207,7 +207,7 @@ queries = st.recursive(
 @example("shoot_day = 2025-03-01T10:00", 0)
 @example("shoot_day in (2025-02-28, 2025-03-01T10:00)", 1000)
 @example("action in (walk, Übung) and subject in (02, 2)", 3)
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(50))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(50, soak=150))
 def test_sql_selects_what_the_conditions_say(queried: QueriedLab, text: str, few: int) -> None:
     query = parse(text)
     expected = {clip.id for clip in queried.clips if selects(queried, query, clip)}

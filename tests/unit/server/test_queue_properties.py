@@ -390,7 +390,7 @@ def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     run_state_machine_as_test(
         cast(Any, lambda: QueueMachine(desk, clock)),
         settings=settings(
-            max_examples=examples(6),
+            max_examples=examples(6, soak=15),
             stateful_step_count=steps(40),
             deadline=None,
             suppress_health_check=list(HealthCheck),

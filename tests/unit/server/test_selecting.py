@@ -53,7 +53,7 @@ def selected_tree(lab: QueriedLab, text: str) -> str | None:
 @example("not action = walk and revision = 1")
 @example("subject = 02 and facet.usage > 0 and tag = night")
 @example("not (has facet.usage or has subject) and not folder = raw")
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(30))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(30, soak=100))
 def test_the_contents_that_are_selected_first_leave_out_no_entry(versioned: QueriedLab, text: str) -> None:
     found = selected_tree(versioned, text)
     with pytest.MonkeyPatch.context() as patch:

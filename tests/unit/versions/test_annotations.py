@@ -102,13 +102,13 @@ def expected(
     return tuple(sorted((base & ours & theirs) | mine | their))
 
 
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(60, soak=200), deadline=None)
 @given(edited_layers())
 def test_segments_are_merged_as_a_comparison_of_all_pairs_says(sides: tuple[Segments, Segments, Segments]) -> None:
     assert merge_segments(*sides) == expected(sides, overlap, overlap)
 
 
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(60, soak=200), deadline=None)
 @given(edited_keyframes)
 def test_keyframes_are_merged_as_a_comparison_of_all_pairs_says(sides: tuple[Keyframes, Keyframes, Keyframes]) -> None:
     assert merge_keyframes(*sides) == expected(sides, alike, lambda _one, _other: False)
@@ -119,7 +119,7 @@ CASES = [(merge_segments, edited_layers()), (merge_keyframes, edited_keyframes)]
 
 @pytest.mark.parametrize(("merge", "cases"), CASES)
 def test_the_laws_of_merging_hold(merge: Callable[..., Any], cases: st.SearchStrategy[Any]) -> None:
-    @settings(max_examples=examples(60), deadline=None)
+    @settings(max_examples=examples(60, soak=200), deadline=None)
     @given(cases)
     def check(sides: Any) -> None:
         base, ours, theirs = sides
@@ -144,7 +144,7 @@ def check_that_nothing_disappears(base: set[Any], ours: set[Any], theirs: set[An
     assert merged <= ours | theirs
 
 
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(60, soak=200), deadline=None)
 @given(edited_layers())
 def test_merged_segments_never_overlap(sides: tuple[Segments, Segments, Segments]) -> None:
     merged = merge_segments(*sides)

@@ -161,7 +161,7 @@ def test_the_same_members_give_the_same_bytes() -> None:
     assert example().write().getvalue() == example().write().getvalue()
 
 
-@settings(max_examples=examples(40))
+@settings(max_examples=examples(40, soak=100))
 @given(st.integers(min_value=0, max_value=20_000))
 def test_an_archive_that_was_cut_off_anywhere_is_refused_and_continued(length: int) -> None:
     whole = example().write().getvalue()
@@ -204,7 +204,7 @@ def test_a_missing_member_is_named(member: ArchiveMember) -> None:
 
 
 @pytest.mark.parametrize("member", MEMBERS, ids=lambda one: one.kind.value)
-@settings(max_examples=examples(25))
+@settings(max_examples=examples(25, soak=100))
 @given(data=st.data())
 def test_a_changed_byte_is_found_and_the_member_named(member: ArchiveMember, data: st.DataObject) -> None:
     made = example()

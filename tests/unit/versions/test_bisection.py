@@ -56,7 +56,7 @@ some_histories = st.integers(1, 14).flatmap(
 ).map(history)  # fmt: skip
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(some_histories, st.data())
 def test_the_commit_that_brought_the_fault_is_found_in_few_tests(commits: History, data: st.DataObject) -> None:
     newest = str(len(commits) - 1)
@@ -67,7 +67,7 @@ def test_the_commit_that_brought_the_fault_is_found_in_few_tests(commits: Histor
     assert len(tested) == len(set(tested)) <= most_tests(len(reachable))
 
 
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=examples(60, soak=200), deadline=None)
 @given(some_histories, st.data())
 def test_the_answer_is_bad_and_all_commits_before_it_are_good(commits: History, data: st.DataObject) -> None:
     newest = str(len(commits) - 1)
@@ -78,7 +78,7 @@ def test_the_answer_is_bad_and_all_commits_before_it_are_good(commits: History, 
     assert not bad & set(commits[answer])
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(some_histories, st.data())
 def test_with_commits_that_cannot_be_tested_the_fault_is_among_the_suspects(
     commits: History, data: st.DataObject

@@ -78,7 +78,7 @@ def changes(before: State, after: State) -> list[tuple[ChangeKind, str | None, s
     ]
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(states, states)
 def test_a_difference_turns_one_state_into_the_other(before: State, after: State) -> None:
     found = compared(before, after)
@@ -88,7 +88,7 @@ def test_a_difference_turns_one_state_into_the_other(before: State, after: State
     assert turned == after
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(states, states)
 def test_merging_with_an_unchanged_side_gives_the_other_side(base: State, changed: State) -> None:
     assert merge(base, base, changed) == (changed, merge(base, base, changed)[1])
@@ -97,7 +97,7 @@ def test_merging_with_an_unchanged_side_gives_the_other_side(base: State, change
     assert not merge(base, base, changed)[1].conflicts
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(states, states, states)
 def test_the_order_of_the_sides_matters_for_their_names_only(base: State, ours: State, theirs: State) -> None:
     one, merged = merge(base, ours, theirs)
@@ -107,7 +107,7 @@ def test_the_order_of_the_sides_matters_for_their_names_only(base: State, ours: 
         assert one == other
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(states, states, states)
 def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: State) -> None:
     """A part that a side has changed is in the result or in a conflict, unless the other side removed the entry."""
@@ -146,7 +146,7 @@ def motions(entries: Iterable[Value]) -> set[str]:
     return {one["parts"]["motion"] for one in entries}
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(histories(), st.lists(st.sampled_from(Side), min_size=20, max_size=20))
 def test_no_entry_disappears_by_a_resolution_of_other_entries(
     versions: tuple[State, State, State], choices: list[Side]
@@ -228,7 +228,7 @@ def test_an_entry_whose_own_place_is_taken_stays_in_conflict() -> None:
     assert (result, merged.conflicts) == (theirs, [])
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(states, states, states, st.none() | st.sampled_from(Side))
 def test_each_content_is_that_of_a_side_or_is_listed_as_combined(
     base: State, ours: State, theirs: State, take: Side | None
@@ -374,7 +374,7 @@ def test_a_part_that_both_sides_removed_is_taken_from_the_base_with_what_it_was_
     assert merge(*sides, [(key, Side.BASE, "report")])[0] == sides[0]
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=examples(100, soak=300), deadline=None)
 @given(states, states, states, st.sampled_from([Side.OURS, Side.THEIRS]))
 @example(
     state(a=entry("1"), b=entry("2", "1")),
