@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import re
+import ssl
 import tempfile
 import tomllib
 from collections.abc import Mapping
@@ -17,6 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
+
+import certifi
 
 from marey_client.errors import BadAddress, BadCredentialFile, BadToken
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SERVER_VARIABLES, SETTINGS_FILE
@@ -30,7 +33,11 @@ ADMIN_TOKEN = "admin.token"  # noqa: S105 - the name of a file
 log = logging.getLogger(__name__)
 
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
-_PLAIN_ADDRESS = re.compile(r"https?://[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?(:[1-9][0-9]{0,3})?(/[A-Za-z0-9._/-]*)?")
+_PLAIN_ADDRESS = re.compile(
+    r"https?://(127\.0\.0\.1|(?![0-9.]+[:/]|[0-9.]+$)[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?)(:[1-9][0-9]{0,3})?"
+    r"(/[A-Za-z0-9._/-]*)?"
+)
+"""Addresses with the name of a host, or with the usual number of this machine."""
 
 
 class TokenFile:
@@ -62,6 +69,13 @@ class TokenFile:
         except OSError:
             return None
         return found.st_mtime_ns, found.st_ino, found.st_size
+
+
+def trusted_authorities() -> ssl.SSLContext:
+    """Return a TLS context that trusts public certificate authorities and those of this machine and `SSL_CERT_FILE`."""
+    context = ssl.create_default_context(cafile=certifi.where())
+    context.load_default_certs()
+    return context
 
 
 class BearerToken:

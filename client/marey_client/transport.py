@@ -17,7 +17,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from marey_client.credentials import BearerToken, TokenFile, require_address, resolve
+from marey_client.credentials import BearerToken, TokenFile, require_address, resolve, trusted_authorities
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
 from marey_client.tracing import TracedRequest, calling
@@ -38,13 +38,6 @@ TRIES_TO_REACH = 3
 """Number of attempts for the first request: a server that has never answered is probably not running."""
 
 log = logging.getLogger(__name__)
-
-
-def trusted_authorities() -> ssl.SSLContext:
-    """Return a TLS context that trusts public certificate authorities and those of this machine and `SSL_CERT_FILE`."""
-    context = httpx.create_ssl_context(trust_env=False)
-    context.load_default_certs()
-    return context
 
 
 class _TlsOnFirstUse(httpx.BaseTransport):

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from marey_client.project import ProjectHandle
     from marey_schemas.items import Staleness
 
+FEW = 50
+"""Number of items up to which each is asked for, because their folder may contain many others."""
+
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
@@ -68,11 +71,14 @@ def stale(
     as_json: AsJson = False,
 ) -> None:
     """List the results in a folder and below that are outdated, each with the inputs that have newer revisions."""
+    from marey_client.listing.paths import require_folder
     from marey_schemas.kinds import Kind
 
     address = Address.parse(place)
     with connect(context) as marey:
         project = marey.project(address.project)
+        if address.path:
+            require_folder(marey.transport, address.project, address.path)
         items: list[ItemHandle] = [
             one for kind in Kind for one in project.items(kind).list(collection=address.path or None, sort="name")
         ]
@@ -92,13 +98,17 @@ def stale(
 def outdated(project: ProjectHandle, items: Sequence[ItemHandle]) -> list[tuple[ItemHandle, Staleness]]:
     """Return those of the items of which an input has a newer revision, each with these inputs.
 
-    The server is asked once for each page of a kind, for the folder that contains all the items.
+    Few items are asked for one by one. Otherwise, the server is asked once for each page of a kind, for the folder that
+    contains all the items, and examines all items of the kind there.
     """
-    folder = _common_folder([one.item.collection for one in items])
-    kinds = dict.fromkeys(one.item.kind for one in items)
     with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
-        answers = pool.map(lambda kind: list(project.items(kind).outdated(collection=folder)), kinds)
-        by_item = {answer.item: answer for some in answers for answer in some}
+        if len(items) <= FEW:
+            by_item = {answer.item: answer for answer in pool.map(lambda one: one.staleness(), items) if answer.stale}
+        else:
+            folder = _common_folder([one.item.collection for one in items])
+            kinds = dict.fromkeys(one.item.kind for one in items)
+            answers = pool.map(lambda kind: list(project.items(kind).outdated(collection=folder)), kinds)
+            by_item = {answer.item: answer for some in answers for answer in some}
     return [(one, by_item[one.id]) for one in items if one.id in by_item]
 
 

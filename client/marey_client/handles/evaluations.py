@@ -21,7 +21,7 @@ from marey_client.items import Items
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.keywords.evaluation import CompareKeywords, OptimiseKeywords, SuggestKeywords, SweepKeywords
 from marey_client.places import Places, as_inputs, resolved
-from marey_schemas.documents.evaluations import COSTS, MOST_EVALUATIONS_COMPARED
+from marey_schemas.documents.evaluations import COSTS, MOST_EVALUATIONS_COMPARED, trial_name
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.queue.jobs import JobCreate
@@ -173,7 +173,7 @@ def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         asked = one["trial"]
         turn_rate_deg_s = math.degrees(asked["turn_rate_rad_s"])
         yield {
-            "trial": f"{asked['family']} v={asked['speed_m_s']:g} w={turn_rate_deg_s:g}",
+            "trial": trial_name(asked["family"], asked["speed_m_s"], asked["turn_rate_rad_s"]),
             "family": asked["family"],
             "speed_m_s": asked["speed_m_s"],
             "turn_rate_deg_s": turn_rate_deg_s,

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import orjson
 
-from marey_client.transport import trusted_authorities
+from marey_client.credentials import trusted_authorities
 from marey_schemas.address import API
 
 NO_ANSWER = "no-answer"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -18,11 +17,11 @@ from marey_client.handles.models import ModelHandle
 from marey_client.poses.kinematics import PosedSkeleton, read_rig
 from marey_client.poses.pictures import FIGURES_EXTRA, MOST_MOMENTS, READS_AT_ONCE
 from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.evaluations import trial_name
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
 
-FILE_TYPES = ("png", "svg")
 MOST_ROWS = 24
 
 
@@ -156,7 +155,8 @@ def draw_worst_trials(
     shown = _DisplayedFrames(evaluation, document)
     rows, times = [], []
     for one in ranked[:count]:
-        name = trial_name(one["trial"])
+        asked = one["trial"]
+        name = trial_name(asked["family"], asked["speed_m_s"], asked["turn_rate_rad_s"])
         record = records[name]
         ticks = _spread(range(len(record["rows"])), moments, name)
         times = [tick / shown.rate_hz for tick in ticks]
@@ -166,11 +166,6 @@ def draw_worst_trials(
         rows.append(strips.PoseRow(name, limits, poses, headings_rad=headings))
     figure = strips.draw_pose_rows(rows, ["of the trial"] * len(times), [f"{time_s:.1f} s" for time_s in times])
     return _written(figure, file_type, evaluation.path)
-
-
-def trial_name(trial: dict[str, Any]) -> str:
-    """Return the name of a trial of an evaluation's document."""
-    return f"{trial['family']} v={trial['speed_m_s']:g} w={math.degrees(trial['turn_rate_rad_s']):g}"
 
 
 class _DisplayedFrames:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
+from marey_schemas.documents.evaluations import trial_name
 from marey_schemas.options.evaluation import EvaluationOptions, Family
 from marey_schemas.options.matching import TICK_RATE_HZ
 
@@ -43,8 +44,8 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Stable name, unique within a suite, such as "circle v=1.25 w=-50"."""
-        return f"{self.family} v={self.speed_m_s:g} w={np.degrees(self.turn_rate_rad_s):g}"
+        """Stable name, unique within a suite."""
+        return trial_name(self.family, self.speed_m_s, self.turn_rate_rad_s)
 
 
 def demand(trial: Trial) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
@@ -19,6 +20,11 @@ CONFIDENCE = 0.95
 
 MOST_EVALUATIONS_COMPARED = 8
 """Greatest number of evaluations in one comparison: more do not fit beside each other in a table."""
+
+
+def trial_name(family: str, speed_m_s: float, turn_rate_rad_s: float) -> str:
+    """Return the name of a trial, unique in a suite, such as "circle v=1.25 w=-50"; w is in degrees per second."""
+    return f"{family} v={speed_m_s:g} w={math.degrees(turn_rate_rad_s):g}"
 
 
 class HeadlineMetric(NamedTuple):

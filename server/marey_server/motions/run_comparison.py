@@ -159,7 +159,8 @@ def _columns(runs: Sequence[ComparedRun], fields: Sequence[str]) -> Iterator[Com
         ("input", name) for name in dict.fromkeys(key for run in runs for key in run.inputs)
     ]
     named += [("value", name) for name in dict.fromkeys(key for run in runs for key in run.values)]
-    named += [("commit", "commit") for _ in runs[:1]]
+    if runs:
+        named.append(("commit", "commit"))
     named += [("field", name) for name in fields]
     for of, name in named:
         column = ComparedColumn(name=name, of=of, differs=False, numeric=False)

@@ -14,11 +14,11 @@ from tests.support.command_line import CommandLine
 
 from marey_client.errors import JobUnsuccessful
 from marey_client.imports import find_files
-from marey_client.poses.strips import trial_name
 from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
 from marey_motion.formats import write_bvh
 from marey_motion.gait import game_skeleton
+from marey_schemas.documents.evaluations import trial_name
 from marey_schemas.items import ItemChange
 from marey_schemas.options.imports import ImportOptions
 
@@ -64,7 +64,7 @@ def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, ru
     run("view", "lab/walks-eval", "-n", 2, "--moments", 4, "--out", "worst.svg")
     drawn = (tmp_path / "worst.svg").read_text(encoding="utf-8")
     ranked = sorted(found.document()["trials"], key=lambda one: one["worst_rank"])
-    worst = [trial_name(one["trial"]) for one in ranked]
+    worst = [trial_name(*(one["trial"][key] for key in ("family", "speed_m_s", "turn_rate_rad_s"))) for one in ranked]
     assert [drawn.count(f">{name}<") for name in worst[:3]] == [1, 1, 0]
     assert "measures beyond limits" in drawn
     assert (

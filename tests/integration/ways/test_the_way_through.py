@@ -447,6 +447,8 @@ def test_a_project_says_what_it_holds_what_is_stale_and_takes_paths_and_revision
     assert project.clips["again/walk"].item.summary["skeleton"] == own.id
     run("retarget", f"{name}/raw", "--to", f"{name}/{own.path}", "--into", "made")
     assert "nothing is stale among 4 items" in run("stale", name).stderr
+    missing = run("stale", f"{name}/nowhere", status=1)
+    assert "there is no folder 'nowhere'" in missing.stderr
     walk = project.clips["raw/walk"]
     walk.put_info(walk.info().model_copy(update={"comment": "changed"}))
     assert "made/raw/walk" in run("stale", f"{name}/made").stdout

@@ -16,9 +16,9 @@ import pytest
 from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client import errors, transport
+from marey_client.credentials import trusted_authorities
 from marey_client.marey import Marey
 from marey_client.retries import ONCE, Retries
-from marey_client.transport import trusted_authorities
 from marey_schemas.access import Login, NewToken, ProjectCreate, TokenCreate
 from marey_schemas.encoding.codecs import encode_tree
 from marey_schemas.items import ItemChange
@@ -242,7 +242,13 @@ def test_what_is_no_token_is_refused_before_it_is_sent_and_shown_nowhere(script:
     assert script.requests == []
 
 
-@pytest.mark.parametrize("url", ["127.0.0.1:8460", "marey.example.org", "ftp://marey.example.org", "http://"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "127.0.0.1:8460", "marey.example.org", "ftp://marey.example.org", "http://", "http://127.0.0.256:8000",
+        "http://999.1.1.1",
+    ],
+)  # fmt: skip
 def test_what_is_no_address_is_refused_before_anything_is_sent(url: str) -> None:
     with pytest.raises(errors.BadAddress, match="not the address of a server"):
         Marey(url, "marey_secret")

@@ -114,12 +114,16 @@ class Desk:
     def _connection(self, scheme: str, host: str, port: int | None) -> http.client.HTTPConnection:
         timeout_s = max(0.01, self._left_s)
         if scheme == "https":
+            port = port or http.client.HTTPS_PORT
             return http.client.HTTPSConnection(host, port, timeout=timeout_s, context=self._trusted)
-        return http.client.HTTPConnection(host, port, timeout=timeout_s)
+        # Without a port, http.client would take the end of an IPv6 address for one.
+        return http.client.HTTPConnection(host, port or http.client.HTTP_PORT, timeout=timeout_s)
 
     @cached_property
     def _trusted(self) -> ssl.SSLContext:
-        return ssl.create_default_context()
+        from marey_client.credentials import trusted_authorities
+
+        return trusted_authorities()
 
 
 def _entries(answer: object) -> Iterable[dict[str, Any]]:

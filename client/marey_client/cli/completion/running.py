@@ -119,7 +119,7 @@ class _Asked:
             made = parameter if how is None else _with_completion(parameter, self._answering(how, len(command)))
             parameters.append(made.replace(kind=inspect.Parameter.KEYWORD_ONLY))
         run.__name__, run.__doc__ = function.__name__, function.__doc__
-        run.__signature__ = inspect.Signature(parameters)  # pyrefly: ignore[missing-attribute]  # functions take it
+        run.__signature__ = inspect.Signature(parameters)  # pyrefly: ignore[missing-attribute]  # read by `inspect`
         run.__annotations__ = {one.name: one.annotation for one in parameters}
         return run
 
@@ -173,7 +173,7 @@ def _reduced(function: Callable[..., Any], groups: Mapping[str, Any]) -> Callabl
     parameters = inspect.signature(function, eval_str=True).parameters.items()
     left = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for name, one in parameters if name not in groups]
     run.__name__, run.__doc__ = function.__name__, function.__doc__
-    run.__signature__ = inspect.Signature(left)  # pyrefly: ignore[missing-attribute]  # functions take it
+    run.__signature__ = inspect.Signature(left)  # pyrefly: ignore[missing-attribute]  # read by `inspect`
     return run
 
 

@@ -28,7 +28,7 @@ from marey_client.cli.completion.found import (
     users,
     versions,
 )
-from marey_schemas.formats import MOTION_FORMATS
+from marey_schemas.formats import EXPORT_FORMATS, MOTION_FORMATS, SAMPLE_FORMATS, WRITTEN_UNITS
 from marey_schemas.kinds import Kind
 
 _CLIPS = places_or_versions(Kind.CLIP)
@@ -43,7 +43,7 @@ _FOLDERS = places()
 _STUDIES = places(Kind.STUDY)
 _SCRIPTS = in_project("scripts", remark="description")
 _SCHEDULES = in_project("schedules", remark="description")
-_UNITS = one_of("cm", "m")
+_UNITS = one_of(*WRITTEN_UNITS)
 
 
 SUBJECTS: Mapping[str, How] = {
@@ -97,7 +97,7 @@ SUBJECTS: Mapping[str, How] = {
     "dataset unit": _UNITS,
     "diff after": _ANY,
     "diff before": _ANY,
-    "download format": one_of("original", *MOTION_FORMATS, "predecessor", "json"),
+    "download format": one_of(*EXPORT_FORMATS),
     "download place": places_or_versions(*Kind),
     "download unit": _UNITS,
     "edit address": places(Kind.CLIP, Kind.EDIT),
@@ -140,14 +140,14 @@ SUBJECTS: Mapping[str, How] = {
     "revert place": _ANY,
     "rm kind": _KINDS_OR_FOLDERS,
     "rm places": _ANY,
-    "sample format": one_of(*MOTION_FORMATS, "predecessor", "json"),
+    "sample format": one_of(*SAMPLE_FORMATS),
     "sample place": _MODELS,
     "sample unit": _UNITS,
     "schedule name": _SCHEDULES,
     "schedule create name": nothing,
     "script name": _SCRIPTS,
     "search place": _MODELS,
-    "search format": one_of(*MOTION_FORMATS, "predecessor"),
+    "search format": one_of(*MOTION_FORMATS),
     "show place": _ANY,
     "similar example": places(Kind.CLIP),
     "similar at_index": places(Kind.INDEX),

@@ -62,25 +62,23 @@ def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None
     ceiling = max(float(np.quantile(view.costs_cm, 0.98)) for view in views) or 1.0
     figure = new_figure(0.75 + len(views) * (SIDE + 0.85) + 0.35, SIDE + 1.15)
     rate = aligned.frame_rate_hz
-    names = dict(
-        zip(
-            (clip.uid for clip in aligned.clips),
-            differing_parts([clip.name for clip in aligned.clips]),
-            strict=True,
-        )
-    )
+    shown = differing_parts([clip.name for clip in aligned.clips])
+    names = dict(zip((clip.uid for clip in aligned.clips), shown, strict=True))
+    images = []
     for place, view in enumerate(views):
         panel = add_panel(figure, Place(0.75 + place * (SIDE + 0.85), 0.65, SIDE, SIDE), grid=False,
                           title=f"{view.role}: {shortened(names[view.clip.uid], 20)}", x="time in the reference (s)",
                           y="time in the clip (s)")  # fmt: skip
         ends = (float(view.frames[0][-1]) / rate, float(view.frames[1][-1]) / rate)
-        panel.imshow(view.costs_cm.T, origin="lower", extent=(0.0, ends[0], 0.0, ends[1]), aspect="auto",
-                             cmap=MORE_IS_WORSE, vmin=0.0, vmax=ceiling, interpolation="nearest")  # fmt: skip
+        images.append(
+            panel.imshow(view.costs_cm.T, origin="lower", extent=(0.0, ends[0], 0.0, ends[1]), aspect="auto",
+                         cmap=MORE_IS_WORSE, vmin=0.0, vmax=ceiling, interpolation="nearest")
+        )  # fmt: skip
         path_s = np.arange(aligned.frame_count) / rate
         for colour, width in ((LIGHT, 3.0), (DARK, 1.3)):
             panel.plot(path_s, view.clip.time_function / rate, color=colour, lw=width)
     place_of_bar = Place(0.75 + len(views) * (SIDE + 0.85) - 0.55, 0.65, 0.12, SIDE)
-    add_colour_bar(figure, figure.axes[-1].images[-1], place_of_bar, "distance of poses (cm)")
+    add_colour_bar(figure, images[-1], place_of_bar, "distance of poses (cm)")
     parts = [
         f"{view.clip.name}, {view.role} ({100.0 * np.sqrt(view.clip.cost):.1f} cm along its path)" for view in views
     ]

@@ -147,6 +147,7 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
     measured = any(each.held_out_log_likelihood is not None for each in candidates)
     panels = [("held_out_log_likelihood", "likelihood of left-out takes (higher is better)")] if measured else []
     panels.append(("bic", "BIC (lower is better)"))
+    drawn = []
     for place, (name, label) in enumerate(panels):
         panel = add_panel(figure, Place(0.95 + 3.9 * place, 0.65, 2.9, 2.3), x="normal distributions", y=label)
         for kind, colour, marker in zip(("full", "tied", "diagonal"), COLOURS, "os^", strict=False):
@@ -158,8 +159,9 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
             [chosen] * len(values), values, ls="", marker="o", ms=11, mfc="none", mec=INK, label=f"used: {chosen}"
         )
         tick_whole_numbers(panel.xaxis)
+        drawn.append(panel)
         panel.set_xlim(0.5, max(each.components for each in candidates) + 0.5)
-    add_keys(figure.axes[-1], loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    add_keys(drawn[-1], loc="upper left", bbox_to_anchor=(1.02, 1.0))
     columns = (
         "components", "covariance", "held_out_log_likelihood", "bic", "aic", "log_likelihood", "smallest_weight",
         "refusal",

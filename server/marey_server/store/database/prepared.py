@@ -187,7 +187,7 @@ def _row_maker(statement: Any, dialect: Dialect) -> Convert | None:
     columns = statement.exported_columns
     if not columns:
         return None
-    row: Any = namedtuple("Row", columns.keys())  # pyrefly: ignore[bad-class-definition]  # known when it runs
+    row: Any = namedtuple("Row", columns.keys())  # pyrefly: ignore[bad-class-definition]  # the columns are known only when this runs
     make: Convert = row._make
     converts = [
         (index, convert)

@@ -141,6 +141,7 @@ def _answer(
     others = (dataset.c.project_id == project_row.id, dataset.c.name == row.name, dataset.c.id != row.id)
     held = holders_of(tx, prepared.citing)
     holders = tuple(one for one in held.holders if isinstance(one, ItemHolder | JobHolder))
+    assert len(holders) == len(held.holders)  # no version of another dataset cites this one
     return DatasetPurgeAnswer(
         preview=request.preview, dataset=row.id, name=row.name, commits=_count(tx, dataset_commit, row.id),
         proposals=_count(tx, proposal, row.id), holders=holders, others=held.others,
