@@ -234,4 +234,4 @@ def test_a_graph_that_a_job_imports_finds_models_of_the_job_and_of_the_project(
     reference = {"item": stand.id, "revision": 1}
     assert graph.part("graph")["actions"]["idle"]["primitives"]["stand"]["model"] == reference
     # The same files again, now that the project has the models: the job is not answered with the earlier refusal.
-    assert imported(alone)["zgraph.json"].status == "created"
+    assert imported(alone)["zgraph.json"].status == "unchanged"
