@@ -65,8 +65,10 @@ def all_callers(_route: Route) -> tuple[str, ...]:
 def some_callers(route: Route) -> tuple[str, ...]:
     """Return the kinds of callers that send the request of a route in the tiers `check` and `test`.
 
-    They include everybody who is refused, and whoever needs the role that the route requires. Of callers whom the
-    server treats alike, such as those with higher roles, one is chosen, which differs between routes.
+    They include everybody with a lower role than the route requires, and whoever has just this role. One of each of the
+    following groups is chosen, which differs between routes: callers whose credentials are refused, users without a
+    role in the project, and callers with higher roles than required. At routes for anyone, credentials that only other
+    routes refuse are left out.
     """
     number = zlib.crc32(f"{route.operation.method} {route.template}".encode())
     standings = {role: person.standing for role, person in PEOPLE.items()}
@@ -248,7 +250,7 @@ def test_a_token_allows_no_more_than_its_scopes(house: House) -> None:
     owner = house.people.client(house.tokens["owner"])
     for scope in ("read", "write", "jobs", "read!project=lab", "write!project=other"):
         made = owner.post("/tokens", json={"name": "narrow", "scopes": [scope]})
-        assert made.status_code == 201
+        assert made.status_code == 201, scope
         narrow = house.people.client(made.json()["secret"])
         item = house.variables["item"]
         reads = narrow.get(f"/projects/lab/clips/{item}").status_code

@@ -257,5 +257,5 @@ def test_no_answer_of_any_route_names_hidden_things_to_writers(server: Server) -
         headers = {name: precondition if name == "If-Match" else text for name, text in request.headers.items()}
         answer = writer.request(request.method, server.address + request.path, headers=headers, content=request.content)
         if SECRET in answer.text + str(answer.headers):
-            leaks.append(f"{request.method} {route.template}: {answer.status_code} {answer.text[:500]}")
+            leaks.append(f"{request.method} {route.template} {precondition}: {answer.status_code} {answer.text[:500]}")
     assert not leaks, "\n".join(leaks)

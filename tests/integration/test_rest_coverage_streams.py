@@ -96,10 +96,11 @@ def test_frames_come_in_every_media_type(owner: httpx.Client) -> None:
     for media_type in (JSON, MSGPACK, BSON):
         progress = send(owner, begin(owner), media_type, offset=0, roots=roots, ends_take=True).json()
         assert (progress["offset"], progress["windows"]) == (181, 121), media_type
+        assert len(progress["changed"]) == 1, media_type
         (cell,) = progress["changed"]
-        assert (cell["speed_m_s"], cell["turn_rate_deg_s"]) == (2.0, -50.0)
-        assert cell["seconds"] == pytest.approx(121 / 60)
-        assert progress["performer"] is None
+        assert (cell["speed_m_s"], cell["turn_rate_deg_s"]) == (2.0, -50.0), media_type
+        assert cell["seconds"] == pytest.approx(121 / 60), media_type
+        assert progress["performer"] is None, media_type
 
 
 def test_the_map_is_there_for_who_looks_on(owner: httpx.Client, server: Server) -> None:
@@ -229,7 +230,8 @@ SENSELESS: list[Any] = [
 
 def test_streams_that_make_no_sense_are_refused(owner: httpx.Client) -> None:
     for body, said in SENSELESS:
-        assert said in problem(owner.post(STREAMS, json=body), 422)["detail"], body
+        answer = owner.post(STREAMS, json=body)
+        assert (answer.status_code, said in answer.text) == (422, True), (body, answer.text)
 
 
 def test_a_grid_of_which_one_side_is_given_has_its_limit_too(owner: httpx.Client) -> None:

@@ -149,7 +149,7 @@ def test_wrong_examples_are_refused_with_the_reason(lab: ProjectHandle, run: Com
     moment = "lab/walks/walk 1.5 0:30-60"
     found = run("similar", moment).stdout
     for named in (index.id, f"lab/{index.id}", f"lab/{index.path}"):
-        assert run("similar", moment, "--index", named).stdout == found
+        assert run("similar", moment, "--index", named).stdout == found, named
     assert "there is no index at lab/walks" in run("similar", moment, "--index", "lab/walks/none", status=2).stderr
     assert "is in the project other" in run("similar", moment, "--index", f"other/{index.path}", status=2).stderr
     (walk,) = lab.clips.list(path="walks/walk 1.5 0")
