@@ -128,7 +128,7 @@ SHOWS = {
     "costs unknown": ("transition-cost",),
     "unknown numbers": ("offsets", "usage", "scenario-circle", "scenario-switching", "transition-cost", "errors"),
     "no numbers": ("offsets", "usage"),
-    "no records": (),
+    "no records": ("usage", "frame-use"),
     "nothing used": USE_FIGURES,
     "no trials": ("offsets", *USE_FIGURES),
 }

@@ -69,15 +69,18 @@ def test_a_figure_has_the_same_bytes_each_time(name: str, result: EvaluationResu
 
 
 @pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_of_two_results_is_sound(name: str) -> None:
+    is_sound_svg(drawn_both()[name])
+
+
+@pytest.mark.parametrize("name", FIGURES if is_soak() else ARRANGED)
 def test_a_figure_of_two_results_is_the_same_drawing_each_time(
     name: str, result: EvaluationResult, other: EvaluationResult
 ) -> None:
-    first = is_sound_svg(drawn_both()[name])
-    if name in ARRANGED or is_soak():
-        second = draw_figure(name, result, other=other, labels=("old", "new"))
-        assert (first.svg, first.data) == (second.svg, second.data)
-        if is_soak():
-            assert is_sound(first).png == second.png
+    first, second = drawn_both()[name], draw_figure(name, result, other=other, labels=("old", "new"))
+    assert (first.svg, first.data) == (second.svg, second.data)
+    if is_soak():
+        assert is_sound(first).png == second.png
 
 
 def test_threads_draw_the_same_figures_at_once(result: EvaluationResult) -> None:
@@ -397,12 +400,14 @@ ALONE = ("clips of one frame", "no transitions", "one trial")
 
 @pytest.mark.parametrize("name", LITTLE)
 def test_evaluations_of_little_are_drawn(name: str) -> None:
+    assert drawn_of_little(name)
     for figure in drawn_of_little(name).values():
         is_sound(figure) if is_soak() else is_sound_svg(figure)
 
 
 @pytest.mark.parametrize("name", [name for name in LITTLE if name not in ALONE])
 def test_evaluations_of_little_are_compared(name: str) -> None:
+    assert drawn_beside_little(name)
     for figure in drawn_beside_little(name).values():
         is_sound(figure) if is_soak() else is_sound_svg(figure)
 

@@ -193,6 +193,7 @@ def test_a_report_of_a_thousand_clips_stays_small() -> None:
 
 @pytest.mark.parametrize("name", ["no records", "nothing used", "no trials", "no numbers"])
 def test_reports_are_made_of_little(name: str, result: EvaluationResult) -> None:
+    assert drawn_of_little(name)
     is_sound(render_report(little(name), title="little", figures=drawn_of_little(name)))
     is_sound(render_comparison(little(name), result, title="little", figures=drawn_beside_little(name)))
 
