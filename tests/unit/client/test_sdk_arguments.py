@@ -5,7 +5,7 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import httpx
 import numpy as np
@@ -18,6 +18,7 @@ from marey_client.handles.clips import MotionArrays
 from marey_client.handles.edits import as_edit
 from marey_client.handles.searches import search_request
 from marey_client.imports import find_files
+from marey_client.project import ProjectHandle
 from marey_client.transport import BLOCKS
 from marey_schemas.encoding.codecs import decode_tree, encode_tree
 
@@ -144,12 +145,12 @@ def test_one_digest_one_folder_one_command_and_one_constraint_need_no_list(
     assert search_request(constraint) == search_request([constraint])
 
 
-MISTAKES: dict[str, Callable[[Any], object]] = {
-    "unit": lambda lab: lab.upload("/tmp", unit="parsec"),
+MISTAKES: dict[str, Callable[[ProjectHandle], object]] = {
+    "unit": lambda lab: lab.upload("/tmp", unit=cast(Any, "parsec")),
     "name": lambda lab: lab.clips.create("a/b", {"motion": {}}),
     "path": lambda lab: lab.collections.create("/a//b"),
-    "role": lambda lab: lab.members.put("ann", "emperor"),
-    "samples": lambda lab: lab.evaluate("raw", samples=-1),
+    "role": lambda lab: lab.members.put("ann", cast(Any, "emperor")),
+    "samples": lambda lab: lab.evaluate("raw", **cast(Any, {"samples": -1})),
     "url": lambda lab: lab.webhooks.create("ftp://x", kinds=["item.created"]),
     "commands": lambda lab: as_edit([{"command": "nope"}]),
 }

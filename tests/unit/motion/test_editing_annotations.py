@@ -248,7 +248,7 @@ def test_commands_look_only_at_what_they_change_however_many_segments_there_are(
         looks = 0
 
         @property
-        def start(self) -> int:  # pyrefly: ignore[bad-override]  # it counts
+        def start(self) -> int:  # pyrefly: ignore[bad-override]  # a property instead of the field, to count reads
             Watched.looks += 1
             return self[1]
 
