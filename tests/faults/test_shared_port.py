@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Self
 
 import httpx
@@ -242,8 +243,21 @@ def test_processes_are_replaced_without_a_failed_request(server: SharingServer) 
     assert not after & before
 
 
-def test_processes_end_when_their_parent_is_killed(server: SharingServer) -> None:
-    processes = server.modules(PROGRAM)
-    assert len(processes) == 2
-    server.kill()
-    assert psutil.wait_procs(processes, timeout=60)[1] == []
+def test_processes_that_are_not_forked_share_the_port_and_end_when_their_parent_is_killed(
+    tmp_path: Path, postgres_url: URL
+) -> None:
+    """The processes of the other tests are forked; these are started as in production, and inherit the sockets."""
+    with new_postgres_database(postgres_url, "not_forked") as url:
+        server = SharingServer(tmp_path, database_address(url), MAREY_PROCESSES="2")
+        server.own_children = True
+        try:
+            server.start()
+            server.wait_for("both are ready", lambda: server.logged("all 2 server processes are ready") == 1)
+            processes = server.modules(PROGRAM)
+            assert len(processes) == 2
+            for one in processes:
+                with contextlib.closing(server.client_of(one.pid)) as client:
+                    assert client.get("/me").status_code == 200
+        finally:
+            server.kill()
+        assert psutil.wait_procs(processes, timeout=60)[1] == []

@@ -1,5 +1,6 @@
 """Starting, watching and stopping a server."""
 
+import contextlib
 import json
 import os
 import re
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import psutil
 import pytest
 from tests.support.rest_server import PATIENCE_S, Server, running
 
@@ -36,9 +38,12 @@ SERVE = "import asyncio; from marey_server.app import serve; from marey_server.p
 class Process:
     """A server in a separate process, started as by an operator."""
 
-    def __init__(self, folder: Path, **environment: str) -> None:
+    def __init__(self, folder: Path, *, warm_up: bool = False, **environment: str) -> None:
+        """Start the server; with `warm_up`, it warms up as it does without any setting."""
         self.folder = folder
-        own = {"MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json", "MAREY_WARM_UP": "false"}
+        own = {"MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json"}
+        if not warm_up:
+            own["MAREY_WARM_UP"] = "false"
         self.process = subprocess.Popen(
             [sys.executable, "-c", SERVE + "asyncio.run(serve(Settings()))"],
             env={**os.environ, **own, **environment},
@@ -51,7 +56,9 @@ class Process:
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
         assert self._listening.wait(PATIENCE_S), self.lines
-        self.address = next(found[1] for line in self.lines if (found := re.search(r"(http://\S+)", line["message"])))
+        found = [found[1] for line in self.lines if (found := re.search(r"(http://\S+)", line["message"]))]
+        assert found, f"the server has ended: {self.lines} {''.join(self.no_json)}"
+        self.address = found[0]
 
     def _read(self) -> None:
         assert self.process.stderr is not None
@@ -62,6 +69,7 @@ class Process:
                 self.no_json.append(line)
             if "listening" in line:
                 self._listening.set()
+        self._listening.set()  # the server has ended
 
     @property
     def token(self) -> str:
@@ -115,6 +123,29 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Process:
     assert httpx.get(f"{process.address}/api/v1/projects/secret-name", headers=traced).status_code == 404
     assert process.end() == 0
     return process
+
+
+def children_of(process: Process) -> int:
+    """Return how many processes below a server are children that compute."""
+    count = 0
+    for one in psutil.Process(process.process.pid).children(recursive=True):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            count += "marey_server.motions.child" in one.cmdline()
+    return count
+
+
+def test_a_server_with_default_settings_starts_its_children_before_a_request_needs_them(tmp_path: Path) -> None:
+    """Two processes are waited for: one that has loaded the modules, and the child that it forks."""
+    process = Process(tmp_path / "data", warm_up=True, MAREY_CHILD_PROCESSES="2")
+    try:
+        deadline = time.monotonic() + PATIENCE_S
+        while children_of(process) < 2:
+            assert time.monotonic() < deadline, process.lines
+            time.sleep(0.1)
+        assert httpx.get(f"{process.address}/readyz").status_code == 200
+    finally:
+        status = process.end()
+    assert (status, process.no_json) == (0, [])
 
 
 def test_requests_are_logged_as_json_with_who_what_and_how_long(ended: Process) -> None:
