@@ -7,6 +7,7 @@ database, and takes and returns only plain values, bytes and arrays. Its results
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from pydantic import ValidationError
@@ -17,6 +18,7 @@ from marey_motion.errors import AmbiguousUnits, FormatError, MotionError
 from marey_motion.formats import read_source
 from marey_motion.formats.conversion import convert
 from marey_motion.formats.predecessor.skeleton import FORMAT as PREDECESSOR
+from marey_motion.formats.texts import cut_text, short_name
 from marey_motion.importing.anatomy import anatomy_of
 from marey_motion.importing.items import (
     FileToImport,
@@ -39,6 +41,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.names import base_name
 
 _LONGEST_COLLECTION = 1024
+_LONGEST_MESSAGE = 4000
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
@@ -79,7 +82,7 @@ def import_file(file: FileToImport) -> ImportedFile:
                 "shorter one",
                 code="name-invalid",
             )
-        return _imported(file)
+        return _storable(_imported(file))
     except MotionError as error:
         return ImportedFile(file.planned.name, refusal=refusal_of(error))
     except (OverflowError, UnicodeError, ValidationError) as error:  # of a value that no document may contain
@@ -99,8 +102,21 @@ def refusal_of(error: MotionError) -> Refusal:
     -------
     Refusal    code and text
     """
-    place = {name: value for name in ("line", "joint") if (value := getattr(error, name, None)) is not None}
-    return Refusal(code=error.code, detail=str(error), **place)
+    line, joint = getattr(error, "line", None), getattr(error, "joint", None)
+    detail = cut_text(str(error), _LONGEST_MESSAGE)
+    return Refusal(code=error.code, detail=detail, line=line, joint=None if joint is None else short_name(joint))
+
+
+def _storable(found: ImportedFile) -> ImportedFile:
+    """Give the messages the form in which they can be stored; documents are checked where they are encoded.
+
+    Raises `UnicodeError` if the graph contains a name that cannot be stored.
+    """
+    if found.graph is not None:
+        for (action, name), node in found.graph.graph.nodes.items():
+            "".join((action, name, node.model_id, *chain(*node.transitions))).encode()
+    checks = tuple({**check, "message": cut_text(check["message"], _LONGEST_MESSAGE)} for check in found.checks)
+    return replace(found, checks=checks)
 
 
 def _imported(file: FileToImport) -> ImportedFile:

@@ -17,6 +17,7 @@ from marey_motion.formats.predecessor.model import PredecessorModel, model_of_do
 from marey_motion.formats.predecessor.records import fields_of_record
 from marey_motion.formats.predecessor.time_functions import PredecessorTime
 from marey_motion.formats.predecessor.tree import read_predecessor_tree
+from marey_motion.formats.texts import short_name
 from marey_motion.importing.items import (
     FileToImport,
     ImportedFile,
@@ -105,7 +106,7 @@ def _imported_record(file: FileToImport, document: Mapping[str, Any]) -> Importe
     checks: tuple[Tree, ...] = ()
     if fields.credentials:
         more = " and more" if len(fields.credentials) > MOST_NAMED else ""
-        named = ", ".join(fields.credentials[:MOST_NAMED]) + more
+        named = ", ".join(map(short_name, fields.credentials[:MOST_NAMED])) + more
         message = (
             f"the file contains credentials ({named}); they are not shown, but everybody who may read the project can "
             "download the file: revoke them, or remove them from the file before you import it"
@@ -127,7 +128,9 @@ def model_checks(found: PredecessorModel) -> tuple[Tree, ...]:
     """
     if not found.moved_keyframes:
         return ()
-    labels, last = ", ".join(found.moved_keyframes), found.primitive.frame_count - 1
+    more = f" and {len(found.moved_keyframes) - MOST_NAMED} more" if len(found.moved_keyframes) > MOST_NAMED else ""
+    labels = ", ".join(map(short_name, found.moved_keyframes[:MOST_NAMED])) + more
+    last = found.primitive.frame_count - 1
     message = f"the file places these keyframes at the end of the motion, after its last frame {last}: {labels}"
     return ({"code": "keyframes-at-end", "message": message},)
 

@@ -18,6 +18,7 @@ from marey_motion.formats.predecessor.model import PredecessorModel, model_of_do
 from marey_motion.formats.predecessor.sections import LAST_FRAME
 from marey_motion.formats.predecessor.skeleton import read_skeleton_document
 from marey_motion.formats.predecessor.zipped_graph import ZippedGraph, ZippedModel, read_zipped_graph
+from marey_motion.formats.texts import short_name
 from marey_motion.importing.items import (
     FileToImport,
     ImportedFile,
@@ -123,7 +124,8 @@ def _keyframes(given: Mapping[str, Any], frames: int, member: str) -> Iterator[t
             try:
                 number = int(frame)
             except (TypeError, ValueError) as error:
-                message = f"keyframe {label!r} is at {frame!r}, which is neither a frame, 'lastFrame' nor 'middle'"
+                at = f"{short_name(label)!r} is at {short_name(frame)!r}"
+                message = f"keyframe {at}, which is neither a frame, 'lastFrame' nor 'middle'"
                 raise FormatError(message, file=member) from error
             yield label, min(max(number, 0), frames - 1)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support import predecessor_documents as old
 from tests.support import predecessor_models as models
 from tests.support.motion_files import ARM, POSITIONS, ZXY, bvh
 
@@ -252,3 +253,21 @@ def test_a_skeleton_with_a_tail_is_called_an_animal() -> None:
     tailed = write_bvh(clip).replace(b"LeftShoulder", b"Tail01")
     options = ImportOptions(unit="cm", up_axis="y")
     assert read("dog.bvh", tailed, options=options).items[0].item_name == "animal"
+
+
+def test_refusals_can_be_stored_and_are_short() -> None:
+    lost = json.dumps({"nodes": {"walk": {"1": {"name": "begin", "type": "start", "transitions": {}}}},
+                       "start_node": ["walk", "x" * 100_000]})  # fmt: skip
+    model = json.dumps(models.layout_3(11, old.joints_of(old.RIG)) | {"skeleton": old.file_skeleton(old.RIG)})
+    for document in (lost, model.replace('"LeftFoot"', '"\\ud800"', 1)):
+        refused = import_file(FileToImport(plan_imports(["one.json"])[0], document.encode(), DIGEST)).refusal
+        assert refused is not None
+        assert len(refused.model_dump_json()) < 5000
+
+
+def test_graphs_with_names_that_cannot_be_stored_are_refused() -> None:
+    graph = {"nodes": {"walk": {"1": {"name": "\ud800", "type": "start", "transitions": {}}}},
+             "start_node": ["walk", "1"]}  # fmt: skip
+    refused = import_file(FileToImport(plan_imports(["one.json"])[0], json.dumps(graph).encode(), DIGEST)).refusal
+    assert refused is not None
+    assert refused.code == "value-range"

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from tests.support import predecessor_documents as old
 from tests.support import predecessor_models as models
 from tests.support.predecessor_records import zipped, zipped_graph
@@ -119,6 +124,57 @@ def test_pickled_trees_are_not_read_and_strange_transitions_left_out_with_warnin
     ).checks] == [("transitions-ignored", True)]  # fmt: skip
 
 
+@pytest.mark.parametrize("name", ["jump\ud800high", "x" * 2_000_000], ids=["half of a pair", "long"])
+def test_names_in_warnings_can_be_stored_and_are_short(name: str) -> None:
+    transitions = {name: [f"{name}{end}" for end in range(2)], "walk_begin": ["walk_left"]}
+    (check,) = imported(changed(definition={"transitions": transitions, "startNode": ["idle", "stand"]})).checks
+    assert check["code"] == "transitions-ignored"
+    assert len(check["message"].encode()) < 1000
+
+
+def test_names_in_refusals_are_short() -> None:
+    for wrong in ({"transitions": {"x" * 100_000: 1}}, {"transitions": {}, "startNode": ["walk", "x" * 100_000]}):
+        assert len(refusal(changed(definition=wrong))[1]) < 1000
+    labels = {"annotations": {"begin": {"x" * 100_000: "y" * 100_000}}}
+    assert len(refusal(changed(meta=labels))[1]) < 1000
+
+
+def test_types_and_trees_are_found_without_searching_all_members_for_each_model(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Searching them took time with the square of their number: minutes for as many models as are permitted."""
+    searched: Counter[str] = Counter()
+    unpacked, list_of = reader._members, reader._list_of
+
+    class Members(dict[str, bytes]):
+        def __iter__(self) -> Iterator[str]:
+            searched["members"] += 1
+            return super().__iter__()
+
+    def counted(document: Any, name: str, file: str) -> list[Any]:
+        searched[name] += 1
+        return list_of(document, name, file)
+
+    monkeypatch.setattr(reader, "_members", lambda data, file: Members(unpacked(data, file)))
+    monkeypatch.setattr(reader, "_list_of", counted)
+    count, folder = 50, "elementary_action_models/elementary_action_walk"
+    members: dict[str, Any] = {
+        "skeleton.json": {},
+        "graph_definition.json": {"transitions": {}, "startNode": ["walk", "m0"]},
+        f"{folder}/meta_information.json": {"cycle_states": [f"m{number}" for number in range(count)]},
+    }
+    for number in range(count):
+        members[f"{folder}/walk_m{number}_quaternion_mm.json"] = {}
+        members[f"{folder}/walk_m{number}_cluster_tree.json"] = {"of": number}
+        members[f"{folder}/walk_m{number}_cluster_tree.pck"] = b""
+    read = reader.read_zipped_graph(zipped(members), NAME)
+    assert [json.loads(one.tree or b"") for one in read.models] == [{"of": number} for number in range(count)]
+    assert {node.type for node in read.graph.nodes.values()} == {"cycle_end"}
+    assert len(read.pickled) == count
+    assert searched["members"] < 10
+    assert searched["cycle_states"] == 1
+
+
 def test_a_skeleton_in_bvh_has_the_unit_and_the_axes_of_the_predecessor() -> None:
     found = imported(zipped_graph(skeleton="bvh"))
     assert found.refusal is None, found.refusal
@@ -156,6 +212,30 @@ def test_archives_that_unpack_to_too_much_are_refused_before_they_are_unpacked(
     assert "at most 1,048,576 bytes" in detail
     lying = bomb.replace(((1 << 20) + 2).to_bytes(4, "little"), (64).to_bytes(4, "little"))
     assert refusal(lying)[0] == "not-a-graph", "a member that declares less than it holds is damaged"
+
+
+@pytest.mark.parametrize("name", ["", "\0notes.json"])
+def test_members_without_a_name_are_refused(name: str) -> None:
+    archive = io.BytesIO(zipped_graph())
+    with zipfile.ZipFile(archive, "a") as written:
+        member = zipfile.ZipInfo("x" * len(name))
+        member.filename = name  # the constructor would end it at NUL
+        written.writestr(member, b"{}")
+    assert refusal(archive.getvalue()) == ("not-a-graph", f"{NAME}: a member of the archive has no name")
+
+
+SMALL = zipped({"graph_definition.json": {"transitions": {}}, "skeleton.json": {}, "notes/": b""})
+FIRST_NAME = SMALL.index(b"PK\x01\x02") + 46
+
+
+@given(st.lists(st.tuples(st.integers(0, len(SMALL) - 1), st.integers(0, 255)), min_size=1, max_size=4))
+@example([(FIRST_NAME, 0)])
+@example([(FIRST_NAME - 18, 0), (FIRST_NAME - 16, 21)])
+def test_damaged_archives_are_refused(flips: Iterable[tuple[int, int]]) -> None:
+    data = bytearray(SMALL)
+    for place, byte in flips:
+        data[place] = byte
+    assert import_file(FileToImport(plan_imports([NAME])[0], bytes(data), DIGEST)).refusal is not None
 
 
 def test_other_archives_are_still_to_be_unpacked() -> None:

@@ -16,10 +16,11 @@ primitive joined by `_` or `:`.
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
@@ -28,6 +29,7 @@ from marey_motion.errors import FormatError, FormatLimit
 from marey_motion.formats.document_fields import field_of
 from marey_motion.formats.predecessor.encoding import decode_document
 from marey_motion.formats.predecessor.graph import TYPES, GraphNode, Place, PredecessorGraph
+from marey_motion.formats.texts import short_name
 from marey_schemas.documents.graphs import MOST_PRIMITIVES
 from marey_schemas.formats import MOST_UNPACKED_BYTES
 from marey_schemas.formats.companions import TREE_ENDINGS, model_name
@@ -43,7 +45,10 @@ _MOST_MEMBERS = 4 * MOST_PRIMITIVES
 # Methods whose members `zipfile` unpacks only up to the declared size.
 _BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # All that a damaged or hostile archive raises; RuntimeError stands for encryption and for unknown compression, too.
-_ARCHIVE_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, OverflowError, RuntimeError, ValueError)
+_ARCHIVE_ERRORS = (
+    zipfile.BadZipFile, zlib.error, struct.error, EOFError, IndexError, OSError, OverflowError, RuntimeError,
+    ValueError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -118,15 +123,20 @@ def read_zipped_graph(data: bytes, file: str) -> ZippedGraph:
         raise FormatLimit(f"the graph has {len(models)} nodes; the limit is {MOST_PRIMITIVES}", file=file)
     names = Counter("_".join(place) for place in models)
     if (repeated := max(names, key=names.__getitem__)) and names[repeated] > 1:
-        raise FormatError(f"two models are called {repeated!r}, in different actions; rename one", file=file)
+        message = f"two models are called {short_name(repeated)!r}, in different actions; rename one"
+        raise FormatError(message, file=file)
     known = _Nodes(members, definition, list(models), file)
     onwards, unknown = known.transitions()
     nodes = {
         (action, f"{action}_{mp}"): GraphNode(f"{action}_{mp}", known.type_of((action, mp)), onwards[action, mp])
         for action, mp in models
     }
-    read = [_model(members, place, member, known.keyframes(place)) for place, member in models.items()]
-    pickled = [found for member in models.values() if (found := _tree_of(members, member, pickled=True))]
+    trees, pickles = _trees(members)
+    read = [
+        _model(members, place, member, trees.get(_whole_name(member)), known.keyframes(place))
+        for place, member in models.items()
+    ]
+    pickled = [found for member in models.values() if (found := pickles.get(_whole_name(member)))]
     graph = PredecessorGraph(nodes, known.start())
     return ZippedGraph(graph, tuple(read), members[skeleton], skeleton, tuple(pickled), tuple(unknown))
 
@@ -135,7 +145,9 @@ def _members(data: bytes, file: str) -> dict[str, bytes]:
     """Unpack the documents of an archive; the names are relative to the folder of the graph's definition."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            listed = {one.filename: one for one in archive.infolist() if not one.is_dir()}
+            listed = {one.filename: one for one in archive.infolist() if not one.filename.endswith("/")}
+            if "" in listed:  # also if the name begins with NUL, where zipfile ends names
+                raise FormatError("a member of the archive has no name", code="not-a-graph", file=file)
             total = sum(one.file_size for one in listed.values())
             if len(listed) > _MOST_MEMBERS or total > MOST_UNPACKED_BYTES:
                 raise FormatLimit(
@@ -145,7 +157,9 @@ def _members(data: bytes, file: str) -> dict[str, bytes]:
                 )
             foreign = next((name for name, one in listed.items() if one.compress_type not in _BOUNDED), None)
             if foreign is not None:
-                message = f"member {foreign!r} is compressed by an unusual method; use the ordinary one (deflate)"
+                message = (
+                    f"member {short_name(foreign)!r} is compressed by an unusual method; use the ordinary one (deflate)"
+                )
                 raise FormatError(message, code="not-a-graph", file=file)
             top = next((name.removesuffix(DEFINITION) for name in listed if _base(name) == DEFINITION), None)
             if top is None:
@@ -193,15 +207,29 @@ def _models(action: str, names: Sequence[str]) -> Iterator[tuple[Place, str]]:
             yield (action, model_name(stem).removeprefix(f"{action}_")), name
 
 
-def _tree_of(members: Mapping[str, bytes], model: str, *, pickled: bool = False) -> str | None:
-    """Return the name of the member with the tree of a model, or None."""
-    stem = model.removesuffix(f"{_base(model)}") + model_name(_base(model).removesuffix(".json"))
-    beside = [name for name in members if name.startswith(tuple(f"{stem}{end}." for end in TREE_ENDINGS))]
-    return next((name for name in beside if name.endswith(".json") != pickled), None)
+def _whole_name(member: str) -> str:
+    """Return the name of the model in a member, with the folder of the member."""
+    base = _base(member)
+    return member.removesuffix(base) + model_name(base.removesuffix(".json"))
 
 
-def _model(members: Mapping[str, bytes], place: Place, member: str, keyframes: Mapping[str, Any]) -> ZippedModel:
-    tree = _tree_of(members, member)
+def _trees(members: Collection[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Map names of models, with their folders, to members with trees: those in JSON, and those of other encodings."""
+    readable: dict[str, str] = {}
+    pickled: dict[str, str] = {}
+    for name in members:
+        base = _base(name)
+        found = readable if name.endswith(".json") else pickled
+        for ending in TREE_ENDINGS:
+            stem, mark, _ = base.rpartition(f"{ending}.")
+            if mark:
+                found.setdefault(name.removesuffix(base) + stem, name)
+    return readable, pickled
+
+
+def _model(
+    members: Mapping[str, bytes], place: Place, member: str, tree: str | None, keyframes: Mapping[str, Any]
+) -> ZippedModel:
     return ZippedModel("_".join(place), member, members[member], members[tree] if tree else None, tree, keyframes)
 
 
@@ -215,6 +243,7 @@ class _Nodes:
         self._places = places
         self._file = file
         self._named = {f"{action}{mark}{mp}": (action, mp) for action, mp in places for mark in "_:"}
+        self._types: dict[str, dict[str, str]] = {}
         self._meta: dict[str, dict[str, Any]] = {}
         for action, names in _actions(members):
             found = next((name for name in names if _base(name) == META), None)
@@ -223,17 +252,26 @@ class _Nodes:
     def type_of(self, place: Place) -> str:
         """Return the type of a node; nodes of which nothing is said are standard."""
         action, mp = place
+        if action not in self._types:
+            self._types[action] = self._types_of(action)
+        return self._types[action].get(mp, "standard")
+
+    def _types_of(self, action: str) -> dict[str, str]:
+        """Return the types of the primitives of an action; the first one that is found counts."""
+        found: dict[str, str] = {}
         for field, kind in _STATES.items():
-            if mp in _list_of(self._meta[action], field, self._file):
-                return kind
+            for mp in _list_of(self._meta[action], field, self._file):
+                if isinstance(mp, str):
+                    found.setdefault(mp, kind)
         actions = self._definition.get("actionDefinitions")
         described = actions.get(action) if isinstance(actions, dict) else None
         sequence = described.get("node_sequence") if isinstance(described, dict) else None
         for entry in sequence if isinstance(sequence, list) else []:
-            kind = str(entry[1]).removesuffix("_primitive") if isinstance(entry, list) and len(entry) == 2 else ""
-            if kind in TYPES and entry[0] == mp:
-                return kind
-        return "standard"
+            if isinstance(entry, list) and len(entry) == 2 and all(isinstance(one, str) for one in entry):
+                kind = entry[1].removesuffix("_primitive")
+                if kind in TYPES:
+                    found.setdefault(entry[0], kind)
+        return found
 
     def keyframes(self, place: Place) -> dict[str, Any]:
         """Return the keyframes of a model that its action lists."""
@@ -247,11 +285,12 @@ class _Nodes:
         unknown = []
         for key, targets in field_of(self._definition, "transitions", dict, self._file).items():
             if not isinstance(targets, (dict, list)):
-                raise FormatError(f"the transitions of {key!r} must be a list or an object", file=self._file)
+                message = f"the transitions of {short_name(key)!r} must be a list or an object"
+                raise FormatError(message, file=self._file)
             for target in map(str, targets):
                 start, end = self._named.get(key), self._named.get(target)
                 if start is None or end is None:
-                    unknown.append(f"{key} to {target}")
+                    unknown.append(f"{short_name(key)} to {short_name(target)}")
                 else:
                     follows[start][end[0], "_".join(end)] = None
         return {place: tuple(found) for place, found in follows.items()}, unknown
@@ -268,7 +307,8 @@ class _Nodes:
         action, mp = map(str, given)
         found = self._named.get(f"{action}:{mp}") or self._named.get(mp)
         if found is None or found[0] != action:
-            raise FormatError(f"field 'startNode' refers to the node {given!r}, which does not exist", file=self._file)
+            message = f"field 'startNode' refers to the node {short_name(given)}, which does not exist"
+            raise FormatError(message, file=self._file)
         return found[0], "_".join(found)
 
 

@@ -1,0 +1,64 @@
+"""Texts of files in messages: what JSON can name but UTF-8 cannot contain is replaced, and long ones are cut off."""
+
+from __future__ import annotations
+
+LONGEST_NAME = 80
+"""Greatest number of characters of a name in a message."""
+
+
+def plain_text(text: str) -> str:
+    r"""Replace halves of surrogate pairs, which JSON can name but UTF-8 cannot contain.
+
+    Parameters
+    ----------
+    text : str    the text
+
+    Returns
+    -------
+    str    the text, with a question mark for each half
+
+    Examples
+    --------
+    >>> plain_text("walk\ud800")
+    'walk?'
+    """
+    return text.encode("utf-8", "replace").decode()
+
+
+def cut_text(text: str, longest: int) -> str:
+    """Return a text as `plain_text` does, but at most its beginning.
+
+    Parameters
+    ----------
+    text : str    the text
+    longest : int    greatest number of characters
+
+    Returns
+    -------
+    str    the text; an ellipsis ends a text that was cut off
+
+    Examples
+    --------
+    >>> cut_text("a long text", 6)
+    'a lon…'
+    """
+    return plain_text(text if len(text) <= longest else f"{text[: longest - 1]}…")
+
+
+def short_name(name: object) -> str:
+    """Return a name from a file as messages show it, with at most `LONGEST_NAME` characters.
+
+    Parameters
+    ----------
+    name : object    the name, or another value that a file has in place of one
+
+    Returns
+    -------
+    str    its beginning
+
+    Examples
+    --------
+    >>> short_name("walk_left")
+    'walk_left'
+    """
+    return cut_text(name if isinstance(name, str) else str(name), LONGEST_NAME)
