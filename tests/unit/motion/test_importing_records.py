@@ -53,7 +53,6 @@ def test_fields_are_shown_by_their_pointers_with_lists_of_plain_values_as_one() 
     assert shown["/elementaryActions/1/constraints/0/keyframeConstraints/0/time"] == 1.5
     shown = record(written.edit_history()).fields
     assert (shown["/0/0"], shown["/1"]) == ("rotate_joint", '["mirror_animation", null]')
-    assert record([]).fields == {"": "[]"}
 
 
 def test_credentials_are_hidden_and_named_in_a_warning() -> None:
@@ -68,6 +67,56 @@ def test_credentials_are_hidden_and_named_in_a_warning() -> None:
     assert imported(old.encode(written.transform_run(), "one.json")).checks == (), "its token is empty"
     below = record({**written.job(), "token": {"value": [written.SECRET]}})
     assert below.fields["/token"] == HIDDEN
+
+
+@pytest.mark.parametrize(
+    ("member", "pointer"),
+    [
+        ({"apiKey": "x"}, "/apiKey"),
+        ({"accessKey": "x"}, "/accessKey"),
+        ({"authorization": "Bearer zz"}, "/authorization"),
+        ({"header": "Bearer zz"}, "/header"),
+        ({"auth": ["eva", "x"]}, "/auth"),
+        ({"passwd": "x"}, "/passwd"),
+        ({"pwd": "x"}, "/pwd"),
+        ({"private_key": "x"}, "/private_key"),
+        ({"credentials": {"pass": "x"}}, "/credentials"),
+        ({"env": ["TOKEN=abc", "DB_PASSWORD=s3"]}, "/env"),
+        ({"env": ["A=1", {"name": "DB_PASSWORD", "value": "topsecret"}]}, "/env/1/value"),
+        ({"run": "python train.py --password hunter2"}, "/run"),
+        ({"run": ["train.py", "--password", "hunter2"]}, "/run"),
+        ({"run": "curl -H 'Authorization: Bearer zz'"}, "/run"),
+        ({"set": '{"env": "TOKEN=abc"}'}, "/set"),
+        ({"repo": "https://eva:x@git.lab/mg.git"}, "/repo"),
+        ({"token": {"n": [{"token": 1}], "value": "x"}}, "/token"),
+    ],
+)
+def test_credentials_are_found_by_whole_words_in_names_and_by_assignments(member: Any, pointer: str) -> None:
+    found = imported(json.dumps({**written.transform_run(), "hparams": member}).encode())
+    fields = found.items[0].parts["record"]["fields"]
+    assert [name for name, value in fields.items() if value == HIDDEN] == [f"/hparams{pointer}"]
+    assert f"(/hparams{pointer})" in found.checks[0]["message"]
+
+
+def test_credentials_in_commands_of_a_history_are_hidden() -> None:
+    assert record([["set_token", "tok123"], ["smooth", None]]).fields == {"/0": HIDDEN, "/1": '["smooth", null]'}
+    assert record([["set_token", {"to": "tok123"}]]).fields == {"/0": HIDDEN}
+
+
+def test_numbers_and_names_that_only_contain_a_word_are_shown() -> None:
+    plain = {"n_tokens": 5, "max_token_length": 512, "tokenizer": "bert", "secretary": "eva", "token": {"count": [1]},
+             "use_password": True, "author": "eva", "run": "train.py --max_token_length 512 --tokenizer bert",
+             "url": "https://git.lab/mg.git", "image": "registry.lab/mg:3", "text": "the keyframe=3"}  # fmt: skip
+    found = imported(json.dumps({**written.transform_run(), "hparams": plain}).encode())
+    assert found.checks == ()
+    fields = found.items[0].parts["record"]["fields"]
+    assert fields["/hparams/max_token_length"] == 512
+    assert fields["/hparams/token/count"] == "[1]"
+
+
+def test_pointers_in_the_warning_are_short() -> None:
+    found = imported(json.dumps({**written.job(), "x" * 100_000: {"token": "a"}}).encode())
+    assert len(found.checks[0]["message"]) < 1000
 
 
 def test_what_json_cannot_contain_is_shown_as_text_and_long_documents_are_cut() -> None:
@@ -93,8 +142,9 @@ def test_fields_that_look_like_references_to_stored_bytes_are_none() -> None:
     assert not {"blob", "content", "dtype"} & fields.keys()
 
 
-def test_other_lists_are_refused_with_the_form_of_a_history() -> None:
-    refused = imported(b"[1, 2]").refusal
+@pytest.mark.parametrize("data", [b"[1, 2]", b"[]"])
+def test_other_lists_are_refused_with_the_form_of_a_history(data: bytes) -> None:
+    refused = imported(data).refusal
     assert refused is not None
     assert refused.code == "document-unknown"
     assert "[command, parameters]" in refused.detail

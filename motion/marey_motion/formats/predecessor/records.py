@@ -16,9 +16,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from marey_schemas.documents.predecessor_records import HIDDEN, LONGEST_TEXT, MOST_SHOWN, RecordForm
-
-FieldValue = str | bool | int | float | None
+from marey_motion.formats.predecessor.credentials import has_text, is_secret_list, is_secret_name, tells_credential
+from marey_motion.formats.texts import cut_text, plain_text
+from marey_schemas.documents.predecessor_records import HIDDEN, LONGEST_TEXT, MOST_SHOWN, FieldValue, RecordForm
 
 _MEMBERS: dict[RecordForm, tuple[str, ...]] = {
     "job": ("image_name", "job_desc"),
@@ -26,7 +26,6 @@ _MEMBERS: dict[RecordForm, tuple[str, ...]] = {
     "synthesis input": ("elementaryActions",),
 }
 """Members by which a document of each form is recognised; a history of edits is a list."""
-_CREDENTIALS = ("token", "password", "secret", "access_key", "api_key")
 _GREATEST_WHOLE = 2**53  # greater ones are not exact in all readers of JSON
 
 
@@ -58,7 +57,7 @@ def form_of_record(content: Any) -> RecordForm | None:
     str or None    the form; None if the content is no record
     """
     if isinstance(content, list):
-        return "edit history" if all(map(_is_command, content)) else None
+        return "edit history" if content and all(map(_is_command, content)) else None
     if not isinstance(content, Mapping):
         return None
     return next((form for form, names in _MEMBERS.items() if all(name in content for name in names)), None)
@@ -94,27 +93,49 @@ def _is_command(entry: Any) -> bool:
 
 def _values(content: Any) -> Iterator[tuple[str, Any, bool]]:
     """Yield pointer and value of each field in the order of the document, and whether it is a credential."""
-    waiting: list[tuple[str, Any, bool]] = [("", content, False)]
+    waiting: list[tuple[str, Any, bool | None]] = [("", content, False)]
     while waiting:
-        pointer, value, is_secret = waiting.pop()
+        pointer, value, is_named = waiting.pop()
+        if is_named and not has_text(value):
+            is_named = None  # nor has what is in it, which is not searched again
+        is_secret = is_named or (is_named is False and _is_secret(value))
         if not value or is_secret or not isinstance(value, (Mapping, list)) or _is_row(value):
-            yield pointer, value, is_secret and bool(value)
+            yield pointer, value, is_secret
             continue
         members = value.items() if isinstance(value, Mapping) else enumerate(value)
-        below = [(_pointer_to(pointer, key), member, _is_credential(key)) for key, member in members]
+        secrets = _secrets_of(value) if isinstance(value, Mapping) else ()
+        below = [
+            (_pointer_to(pointer, key), member, None if is_named is None else key in secrets) for key, member in members
+        ]
         waiting.extend(reversed(below))
+
+
+def _secrets_of(value: Mapping[str, Any]) -> set[str]:
+    """Return the keys of credentials; in `{"name": "DB_PASSWORD", "value": ...}`, it is the value."""
+    names = {key.lower(): one for key, one in value.items() if isinstance(one, str)}
+    is_variable = is_secret_name(names.get("name")) or is_secret_name(names.get("key"))
+    return {key for key in value if is_secret_name(key) or (is_variable and key.lower() == "value")}
+
+
+def _is_secret(value: Any) -> bool:
+    """Return whether a text, or a list of plain values or of a name and values, contains a credential."""
+    if isinstance(value, str):
+        return tells_credential(value)
+    if not isinstance(value, list):
+        return False
+    return is_secret_list(value) or (
+        _is_row(value) and any(isinstance(one, str) and tells_credential(one) for one in value)
+    )
 
 
 def _is_row(value: Any) -> bool:
     return isinstance(value, list) and not any(isinstance(one, (Mapping, list)) for one in value)
 
 
-def _is_credential(key: object) -> bool:
-    return isinstance(key, str) and any(word in key.lower() for word in _CREDENTIALS)
-
-
 def _pointer_to(pointer: str, key: object) -> str:
-    return f"{pointer}/{_plain(str(key)).replace('~', '~0').replace('/', '~1')}"
+    """Return the pointer of a member; it is cut off where it is too long to be shown."""
+    name = plain_text(str(key)[:LONGEST_TEXT]).replace("~", "~0").replace("/", "~1")
+    return f"{pointer}/{name}"[: LONGEST_TEXT + 1]
 
 
 def _shown(value: Any) -> FieldValue:
@@ -127,10 +148,4 @@ def _shown(value: Any) -> FieldValue:
         return value
     if isinstance(value, (Mapping, list)):
         value = json.dumps(value, ensure_ascii=False, default=str)
-    text = _plain(str(value))
-    return text if len(text) <= LONGEST_TEXT else f"{text[: LONGEST_TEXT - 1]}…"
-
-
-def _plain(text: str) -> str:
-    """Replace halves of surrogate pairs, which JSON can name but UTF-8 cannot contain."""
-    return text.encode("utf-8", "replace").decode()
+    return cut_text(str(value), LONGEST_TEXT)
