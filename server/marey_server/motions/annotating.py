@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from pydantic import ValidationError
+
 from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.originals import original_of
 from marey_schemas.documents.references import RevisionRef
@@ -35,6 +37,8 @@ MOST_WORK = 30_000_000
 The work of a command is the number of segments and keyframes of the annotation; the work of a request is the sum over
 its commands.
 """
+
+_LONGEST_REASON = 4000
 
 
 def apply_commands(
@@ -167,16 +171,24 @@ def _imported(
         from marey_motion.errors import MotionError
         from marey_motion.formats.predecessor.annotation import layer_of_document
 
+    pointer = "/document" if given.file is None else "/file"
     try:
         layer = layer_of_document(document, name, frame_count, end_index=given.end_index, labels=given.labels)
+        annotation = documents.layer_to_document(layer, RevisionRef(item=clip, revision=revision), given.layer)
     except MotionError as error:
-        raise _not_an_annotation(error, "/document" if given.file is None else "/file") from error
-    annotation = documents.layer_to_document(layer, RevisionRef(item=clip, revision=revision), given.layer)
+        raise _not_an_annotation(error, pointer) from error
+    except ValidationError as error:  # of a label that no document may contain
+        reason = error.errors(include_url=False, include_context=False, include_input=False)[0]["msg"]
+        raise _not_an_annotation(MotionError(f"{name}: {reason}", code="value-range"), pointer) from error
     return annotation.model_dump(mode="json", by_alias=True, exclude_none=True)
 
 
 def _not_an_annotation(error: MotionError, pointer: str) -> InvalidProblem:
-    wrong = FieldError(pointer=pointer, code=error.code, detail=str(error))
-    return InvalidProblem(
-        f"The document is not a valid annotation of the clip: {error}", code=error.code, errors=[wrong]
+    """Return the refusal; the place has the same text, so that programs for people show it once."""
+    with LOADING:
+        from marey_motion.formats.texts import cut_text
+
+    detail = cut_text(
+        f"The {pointer.removeprefix('/')} is not a valid annotation of the clip: {error}", _LONGEST_REASON
     )
+    return InvalidProblem(detail, code=error.code, errors=[FieldError(pointer=pointer, code=error.code, detail=detail)])
