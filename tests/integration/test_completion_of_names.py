@@ -134,6 +134,15 @@ def test_many_names_are_bounded(shell: Shell, server: Server, token: str) -> Non
     assert shell("marey ls lab/re") == ["lab/results/"]
 
 
+def test_lists_that_have_no_filter_are_read_to_their_end(shell: Shell, server: Server, token: str) -> None:
+    for number in range(3):
+        ok(server.client(token).post(f"{LAB}/datasets", json={"name": f"g{number}", "collection": "raw"}))
+    with mock.patch("marey_client.cli.completion.asking.MOST_ENTRIES", 2):
+        assert shell("marey dataset log lab/g2") == ["lab/g2"]
+        assert shell("marey dataset log lab/") == ["lab/g0", "lab/g1", "lab/g2", "lab/gaits"]
+        assert shell("marey dataset diff lab/gaits@v") == ["lab/gaits@v1"]
+
+
 @pytest.mark.parametrize(
     "line",
     [

@@ -1,5 +1,6 @@
 """Shell completion without a server: lines, answers for shells, the table of subjects, and failures."""
 
+import json
 import os
 import re
 import socket
@@ -9,8 +10,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from unittest import mock
 
 import pytest
@@ -18,14 +20,12 @@ import typer
 from tests.support.command_line import run_here
 
 from marey_client.cli.app import app
-from marey_client.cli.completion.asking import PATIENCE_S
-from marey_client.cli.completion.found import Suggestion, nothing
+from marey_client.cli.completion.asking import MOST_PAGES, PATIENCE_S
+from marey_client.cli.completion.found import Suggestion, Typed, nothing
 from marey_client.cli.completion.shells import FILES, SCRIPTS, Line, answer_text, read_line
 from marey_client.cli.completion.subjects import SUBJECTS, how_to_complete
+from marey_client.credentials import store_login
 from marey_schemas.kinds import Kind
-
-BREAKS = " \t\n\"'@><=;|&(:"
-"""Characters at which bash splits words by default."""
 
 
 def suggested(line: str, *, shell: str = "bash", **environment: str) -> tuple[int, list[str]]:
@@ -70,20 +70,16 @@ def test_lines_of_earlier_scripts_are_read() -> None:
     assert read_line({"COMP_WORDS": "marey show ", "COMP_CWORD": "2"}).start == ""
 
 
-@pytest.mark.parametrize(
-    ("typed", "text", "shown"),
-    [
-        ("marey show lab/my", "lab/my takes/", r"lab/my\ takes/"),
-        ("marey show 'lab/my", "lab/it's here", r"lab/it'\''s here"),
-        ('marey show "lab/my', "lab/$(reboot) `x`", r"lab/\$(reboot) \`x\`"),
-        ("marey show lab/", "lab/$(reboot)", r"lab/\$\(reboot\)"),
-        ("marey dataset diff lab/gaits@v", "lab/gaits@v1", "v1"),
-        ("marey show lab/walk:", "lab/walk: fast", r"\ fast"),
-        ("marey retarget lab --to=lab/s", "--to=lab/studio", "lab/studio"),
-    ],
-)
-def test_bash_gets_what_it_inserts(typed: str, text: str, shown: str) -> None:
-    assert answer_text("bash", Line.parse(typed), [Suggestion(text)], BREAKS) == shown
+def test_powershell_gets_a_remark_and_quoted_text() -> None:
+    found = [Suggestion("lab/", "Motion lab"), Suggestion("lab/it’s $x;y"), Suggestion("a:::b"), Suggestion("--json")]
+    shown = ["lab/:::Motion lab", "'lab/it’’s $x;y':::lab/it’s $x;y", "--json:::--json"]
+    assert answer_text("powershell", Line.parse("marey show "), found).splitlines() == shown
+
+
+def test_the_space_that_powershell_leaves_out_is_added() -> None:
+    line = {"_TYPER_COMPLETE_ARGS": "marey show", "_TYPER_COMPLETE_WORD_TO_COMPLETE": ""}
+    assert read_line(line) == Line(("show",), "", "")
+    assert read_line({**line, "_TYPER_COMPLETE_WORD_TO_COMPLETE": "show"}) == Line((), "show", "show")
 
 
 def test_other_shells_get_remarks_in_one_line() -> None:
@@ -173,7 +169,7 @@ def _drip(connection: socket.socket) -> None:
         return
 
 
-def test_a_slow_server_is_given_up_within_a_second(silent_server: str, nowhere: dict[str, str]) -> None:
+def test_a_slow_server_is_given_up_after_about_a_second(silent_server: str, nowhere: dict[str, str]) -> None:
     suggested("marey show lab/", **nowhere)  # loads modules
     began = time.monotonic()
     assert suggested("marey show lab/", **{**nowhere, "MAREY_SERVER": silent_server}) == (0, [])
@@ -194,6 +190,71 @@ def test_completion_loads_nothing_heavy(nowhere: dict[str, str]) -> None:
         command = [sys.executable, "-c", probe]
         done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **asked})
         assert (done.stdout, done.stderr) == ("[]\n", ""), line
+
+
+class _Recorder(BaseHTTPRequestHandler):
+    """Answers everything with a page of a list that never ends, and records the tokens."""
+
+    tokens: ClassVar[list[str | None]] = []
+
+    def do_GET(self) -> None:
+        self.tokens.append(self.headers.get("Authorization"))
+        page = json.dumps({"items": [{"name": "lab", "path": "lab"}], "next_cursor": "more"}).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(page)))
+        self.end_headers()
+        self.wfile.write(page)
+
+    def log_message(self, format: str, *args: Any) -> None: ...  # noqa: A002 - the name of the parent
+
+
+@pytest.fixture
+def recorder() -> Iterator[str]:
+    """Address of a server that records the tokens that it gets."""
+    _Recorder.tokens.clear()
+    with ThreadingHTTPServer(("127.0.0.1", 0), _Recorder) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def test_a_list_without_end_is_given_up(recorder: str, nowhere: dict[str, str]) -> None:
+    assert suggested("marey project show l", **{**nowhere, "MAREY_SERVER": recorder}) == (0, ["lab"])
+    assert 0 < len(_Recorder.tokens) <= MOST_PAGES
+
+
+def test_an_address_on_the_line_gets_no_token_of_another(
+    recorder: str, nowhere: dict[str, str], tmp_path: Path
+) -> None:
+    for name in ("token", "admin.token"):
+        (tmp_path / name).write_text("marey_secret")
+        (tmp_path / name).chmod(0o600)
+    for line in (f"--server {recorder}", f"--token-file {tmp_path / 'token'} --server={recorder}"):
+        suggested(f"marey {line} show lab/", **nowhere, MAREY_TOKEN="marey_secret")
+        suggested(f"marey {line} show lab/", **nowhere)
+    assert set(_Recorder.tokens) == {None}
+
+
+def test_an_address_on_the_line_gets_its_own_token(recorder: str, nowhere: dict[str, str], tmp_path: Path) -> None:
+    line = f"marey --server {recorder}/ show lab/"
+    suggested(line, **{**nowhere, "MAREY_SERVER": recorder}, MAREY_TOKEN="marey_of_environment")
+    (tmp_path / "marey").mkdir()
+    store_login(tmp_path / "marey" / "credentials.json", recorder, "marey_saved")
+    suggested(line, **nowhere, MAREY_TOKEN="marey_of_environment")
+    assert set(_Recorder.tokens) == {"Bearer marey_of_environment", "Bearer marey_saved"}
+
+
+def test_an_address_of_ipv6_without_a_port_is_asked_at_port_80(nowhere: dict[str, str]) -> None:
+    with mock.patch("socket.create_connection", side_effect=OSError) as connect:
+        suggested("marey show lab/", **{**nowhere, "MAREY_SERVER": "http://[::1]"})
+    assert {call.args[0] for call in connect.call_args_list} == {("::1", 80)}
+
+
+def test_no_answer_of_the_table_contains_a_text_twice(nowhere: dict[str, str]) -> None:
+    with mock.patch.dict(os.environ, nowhere):
+        for key, how in SUBJECTS.items():
+            texts = [one.text for one in how(Typed("", {}))]
+            assert len(texts) == len(set(texts)), key
 
 
 def _declared() -> Iterator[tuple[tuple[str, ...], str, str]]:

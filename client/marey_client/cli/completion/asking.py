@@ -1,4 +1,4 @@
-"""Questions to the server for shell completion: with the saved token, few at a time, and within a second.
+"""Questions to the server for shell completion: with the saved token, few at a time, and for less than a second.
 
 Uses `http.client` instead of the SDK, because loading the SDK takes longer than all questions together.
 """
@@ -7,26 +7,28 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import ssl
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlencode, urlsplit
 
-from marey_schemas.address import API
+from marey_schemas.address import API, SERVER_VARIABLES
 
 if TYPE_CHECKING:
     from marey_client.credentials import Credential
 
 PATIENCE_S = 0.8
-"""Time in seconds for all answers to one press of the Tab key."""
+"""Time in seconds for all answers to one press of the Tab key, without the start of the program (about 0.4 s)."""
 QUESTIONS_AT_ONCE = 4
 MOST_ENTRIES = 200
-"""Greatest number of entries of one answer."""
-MOST_ANSWER_BYTES = 1 << 20
+"""Greatest number of entries of one page."""
+MOST_PAGES = 50
+MOST_ANSWER_BYTES = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class Question:
 
     path: str
     query: Mapping[str, str | int] = field(default_factory=dict)
+    whole: bool = False
+    """Whether further pages are asked for while time is left."""
 
     @classmethod
     def of(cls, *names: str, **query: str | int | None) -> Question:
@@ -54,12 +58,19 @@ class Desk:
 
     @classmethod
     def opened(cls, server: str | None, token_file: str | None) -> Desk:
-        """Return the desk of the server and the token that commands would use. Raises errors of credentials."""
+        """Return the desk of the server and the token that commands would use. Raises errors of credentials.
+
+        Nobody has confirmed the line yet, so an address on it gets a token only if the token was saved for it, or if
+        commands without this address would use the same one.
+        """
         from pathlib import Path
 
-        from marey_client.credentials import resolve
+        from marey_client.credentials import resolve, resolve_other
 
-        found = resolve(server, None if token_file is None else Path(token_file))
+        if server and server.rstrip("/") != _usual_address():
+            found = resolve_other(server)
+        else:
+            found = resolve(server, None if token_file is None else Path(token_file))
         return cls(found, time.monotonic() + PATIENCE_S)
 
     def ask(self, questions: Sequence[Question]) -> list[list[dict[str, Any]]]:
@@ -74,7 +85,8 @@ class Desk:
                     place, question = next(left, (None, None))
                 if place is None or question is None:
                     return
-                answers[place] = self._answer(question)
+                for page in self._pages(question):
+                    answers[place] += page
 
         threads = [threading.Thread(target=work, daemon=True) for _ in questions[:QUESTIONS_AT_ONCE]]
         for one in threads:
@@ -84,17 +96,28 @@ class Desk:
         return [list(one) for one in answers]
 
     def entries(self, *names: str, **query: str | int | None) -> list[dict[str, Any]]:
-        """Return the entries of one list, as for `Question.of`."""
-        return self.ask([Question.of(*names, **query)])[0]
+        """Return the entries of one list with all pages for which there is time, as for `Question.of`."""
+        return self.ask([replace(Question.of(*names, **query), whole=True)])[0]
 
     @property
     def _left_s(self) -> float:
         return self.until - time.monotonic()
 
-    def _answer(self, question: Question) -> list[dict[str, Any]]:
-        """Return the entries of an answer; none if the server refuses the question, is too slow, or is none of ours."""
+    def _pages(self, question: Question) -> Iterator[list[dict[str, Any]]]:
+        """Yield the entries of the pages of a list."""
+        query = dict(question.query)
+        for _ in range(MOST_PAGES if question.whole else 1):
+            answer = self._answer(question.path, query)
+            yield list(_entries(answer))
+            cursor = answer.get("next_cursor") if isinstance(answer, dict) else None
+            if not isinstance(cursor, str) or self._left_s <= 0:
+                return
+            query["cursor"] = cursor
+
+    def _answer(self, path: str, query: Mapping[str, str | int]) -> object:
+        """Return an answer; None if the server refuses the question, is too slow, or is none of ours."""
         parts = urlsplit(self.credential.url)
-        target = f"{parts.path}{API}{question.path}?{urlencode(question.query)}"
+        target = f"{parts.path}{API}{path}?{urlencode(query)}"
         headers = {"Accept": "application/json"}
         if self.credential.token:
             headers["Authorization"] = f"Bearer {self.credential.token}"
@@ -104,10 +127,10 @@ class Desk:
             answer = connection.getresponse()
             body = answer.read(MOST_ANSWER_BYTES + 1)
             if answer.status != http.HTTPStatus.OK or len(body) > MOST_ANSWER_BYTES:
-                return []
-            return list(_entries(json.loads(body)))
+                return None
+            return json.loads(body)
         except (OSError, http.client.HTTPException, ValueError):
-            return []
+            return None
         finally:
             connection.close()
 
@@ -132,3 +155,11 @@ def _entries(answer: object) -> Iterable[dict[str, Any]]:
     for one in items if isinstance(items, list) else ():
         if isinstance(one, dict):
             yield one
+
+
+def _usual_address() -> str:
+    """Return the address that commands use if there is none on the line."""
+    from marey_client.credentials import DEFAULT_URL, logins_path, read_logins
+
+    by_variable = next(filter(None, map(os.environ.get, SERVER_VARIABLES)), None)
+    return (by_variable or read_logins(logins_path(os.environ)).default or DEFAULT_URL).rstrip("/")

@@ -8,7 +8,7 @@ from functools import cached_property
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from marey_client.cli.completion.asking import Desk, Question
+from marey_client.cli.completion.asking import MOST_ENTRIES, Desk, Question
 from marey_schemas.kinds import Kind
 
 MOST_LISTED = 1000
@@ -242,8 +242,10 @@ def jobs(*states: str) -> How:
     def how(typed: Typed) -> Iterator[Suggestion]:
         desk = typed.desk
         project = typed.value("project")
-        names = [project] if project else [one["name"] for one in desk.entries("projects", sort="-updated_at")]
-        wanted = {"state": ",".join(states) or None, "limit": JOBS_OF_PROJECT}
+        of_projects = Question.of("projects", sort="-updated_at")
+        names = [project] if project else [one["name"] for one in desk.ask([of_projects])[0]]
+        most = MOST_ENTRIES if typed.start else JOBS_OF_PROJECT
+        wanted = {"state": ",".join(states) or None, "limit": most}
         found = desk.ask([Question.of("projects", one, "jobs", **wanted) for one in names[:MOST_PROJECTS_OF_JOBS]])
         newest = sorted((job for some in found for job in some), key=lambda job: job["created_at"], reverse=True)
         yield from (Suggestion(job["id"], f"{job['kind']}, {job['state']}") for job in newest)

@@ -19,7 +19,6 @@ from marey_client.cli.completion.found import How, Suggestion, Typed
 from marey_client.cli.completion.shells import (
     FILES,
     VARIABLE,
-    WORD_BREAKS,
     Line,
     answer_text,
     read_line,
@@ -64,7 +63,7 @@ def answer_shell(
         return 1
     if found is None:
         return FILES
-    text = answer_text(shell, given, found, os.environ.get(WORD_BREAKS, ""))
+    text = answer_text(shell, given, found)
     sys.stdout.write(f"{text}\n" if text else "")
     return 0
 
@@ -137,8 +136,11 @@ class _Asked:
             )
             cut = self.line.start.removesuffix(incomplete)  # `--option=` if the value follows it without a space
             self.found = []
-            suggestions = (one for one in how(typed) if one.text.startswith(incomplete))
-            self.found = [Suggestion(cut + one.text, one.remark) for one in suggestions]
+            first: dict[str, Suggestion] = {}  # a dataset and an item may have the same name
+            for one in how(typed):
+                if one.text.startswith(incomplete):
+                    first.setdefault(one.text, Suggestion(cut + one.text, one.remark))
+            self.found = list(first.values())
             return [one.text for one in self.found]
 
         return answer

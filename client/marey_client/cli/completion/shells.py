@@ -7,27 +7,36 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from marey_client.cli.completion.found import Suggestion
+from marey_client.cli.completion.quoting import for_bash, for_powershell, marks
 
 VARIABLE = "_MAREY_COMPLETE"
 """Environment variable by which a shell asks for completion: `complete_` and the name of the shell."""
 LINE = "_TYPER_COMPLETE_ARGS"
 """Environment variable that contains the command line up to the cursor, as typed."""
-WORD_BREAKS = "_MAREY_WORD_BREAKS"
-"""Environment variable with the characters at which bash splits words for completion, besides white space."""
+REPLACED = "_MAREY_REPLACED"
+"""Environment variable with the end of the line that bash replaces by a suggestion."""
+WORD = "_TYPER_COMPLETE_WORD_TO_COMPLETE"
+"""Environment variable with the word at the cursor in PowerShell, whose line lacks the space before an empty word."""
 FILES = 3
 """Exit status that means: complete with files."""
 
 _BASH = r"""
 _marey_completion() {
-    local IFS=$'\n' state
-    COMPREPLY=( $(_MAREY_COMPLETE=complete_bash _TYPER_COMPLETE_ARGS="${COMP_LINE:0:COMP_POINT}" \
-        _MAREY_WORD_BREAKS="$COMP_WORDBREAKS" marey 2>/dev/null) )
+    local answer state line
+    COMPREPLY=()
+    [[ $COMP_TYPE == 42 ]] && return  # Alt-* inserts all suggestions and removes the quote before them
+    answer=$(_MAREY_COMPLETE=complete_bash _TYPER_COMPLETE_ARGS="${COMP_LINE:0:COMP_POINT}" \
+        _MAREY_REPLACED="$2" marey 2>/dev/null)
     state=$?
+    while IFS= read -r line; do
+        [[ -n $line ]] && COMPREPLY+=("$line")
+    done <<< "$answer"
     if [[ $state -eq 3 ]]; then
-        compopt -o default -o bashdefault
+        compopt -o default -o bashdefault 2>/dev/null
     elif [[ ${#COMPREPLY[@]} -eq 1 && ${COMPREPLY[0]} == *[/=] ]]; then
-        compopt -o nospace
+        compopt -o nospace 2>/dev/null
     fi
+    return 0
 }
 complete -F _marey_completion marey
 """
@@ -76,7 +85,7 @@ complete --command marey --no-files --keep-order --arguments '(__marey_completio
 SCRIPTS = {"bash": _BASH.lstrip(), "zsh": _ZSH.lstrip(), "fish": _FISH.lstrip()}
 """Script by the name of its shell."""
 
-_QUOTED_BY_BASH = " \t\"'\\$`&|;<>()*?[]{}!#~"
+POWERSHELLS = ("powershell", "pwsh")
 
 
 @dataclass(frozen=True)
@@ -92,71 +101,54 @@ class Line:
     options: tuple[str, ...] = ()
     """Global options with their values, which typer needs before all other words."""
 
+    replaced: str | None = None
+    """End of `raw` that bash replaces by a suggestion; None if the shell did not say."""
+
     @classmethod
-    def parse(cls, text: str) -> Line:
+    def parse(cls, text: str, replaced: str | None = None) -> Line:
         """Parse a line as POSIX shells split it; a quote that is still open ends with the line."""
-        words, start, place, begin = [], "", 0, 0
-        quote, inside = "", False
-        while place < len(text):
-            one = text[place]
-            if quote:
-                if one == quote:
-                    quote = ""
-                elif one == "\\" and quote == '"' and text[place + 1 : place + 2] in tuple('"\\$`'):
-                    place += 1
-                    start += text[place]
-                else:
-                    start += one
-            elif one in "'\"":
-                quote, inside, begin = one, True, begin if inside else place
-            elif one.isspace():
-                if inside:
+        words, start, begin = [], "", -1
+        for mark in marks(text):
+            if mark.is_free and mark.typed.isspace():
+                if begin >= 0:
                     words.append(start)
-                start, inside = "", False
-            else:
-                if not inside:
-                    begin, inside = place, True
-                if one == "\\" and place + 1 < len(text):
-                    place += 1
-                start += text[place]
-            place += 1
-        return cls(tuple(words[1:]), start, text[begin:] if inside else "")
+                start, begin = "", -1
+                continue
+            begin = mark.place if begin < 0 else begin
+            start += mark.plain
+        return cls(tuple(words[1:]), start, text[begin:] if begin >= 0 else "", replaced=replaced)
 
 
 def read_line(environment: Mapping[str, str]) -> Line:
     """Return the line that a shell sends, by a script of this module or by an earlier one made by typer."""
     if LINE in environment:
-        return Line.parse(environment[LINE])
+        ends_with_space = environment.get(WORD) == ""
+        return Line.parse(environment[LINE] + " " * ends_with_space, environment.get(REPLACED))
     words = Line.parse(f"{environment.get('COMP_WORDS', '')} ").words
     count = max(0, int(environment.get("COMP_CWORD") or 1) - 1)
     start = words[count] if count < len(words) else ""
     return Line(tuple(words[:count]), start, start)
 
 
-def answer_text(shell: str, line: Line, found: Iterable[Suggestion], word_breaks: str = "") -> str:
+def answer_text(shell: str, line: Line, found: Iterable[Suggestion]) -> str:
     """Return the suggestions in the form that the script of a shell reads: one in each line."""
-    fitting = [one for one in found if one.text.isprintable()]
+    lines = (_shown(shell, line, one.text, _one_line(one.remark)) for one in found if one.text.isprintable())
+    return "\n".join(one for one in lines if one is not None)
+
+
+def _shown(shell: str, line: Line, text: str, remark: str) -> str | None:
+    """Return a suggestion in the form that the script of a shell reads; None if the shell could misread it."""
     if shell == "bash":
-        return "\n".join(_for_bash(one.text, line, word_breaks) for one in fitting)
-    return "\n".join(f"{one.text}\t{_one_line(one.remark)}" if one.remark else one.text for one in fitting)
+        return for_bash(text, line.raw, line.raw if line.replaced is None else line.replaced)
+    if shell in POWERSHELLS:
+        return for_powershell(text, remark)
+    return f"{text}\t{remark}" if remark else text
 
 
 def typed_by_typer(line: Line) -> dict[str, str]:
     """Return the environment in which typer answers a line with one suggestion in each line, without remarks."""
     words = [*line.options, *line.words, line.start]
     return {"COMP_WORDS": shlex.join(["marey", *words]), "COMP_CWORD": str(len(words)), VARIABLE: "complete_bash"}
-
-
-def _for_bash(text: str, line: Line, word_breaks: str) -> str:
-    """Quote a suggestion as the typed word is quoted, without the part before the last character that splits words."""
-    if line.raw.startswith("'"):
-        return text.replace("'", "'\\''")
-    if line.raw.startswith('"'):
-        return "".join(f"\\{one}" if one in '"\\$`' else one for one in text)
-    split = max((line.start.rfind(one) for one in word_breaks if not one.isspace() and one not in "'\""), default=-1)
-    shown = text[split + 1 :] if text.startswith(line.start[: split + 1]) else text
-    special = _QUOTED_BY_BASH + word_breaks.translate(str.maketrans("", "", "@=:"))
-    return "".join(f"\\{one}" if one in special else one for one in shown)
 
 
 def _one_line(remark: str) -> str:
