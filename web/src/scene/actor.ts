@@ -38,6 +38,18 @@ export class Actor {
     return this.clip.skeleton.feet.filter((_, index) => this.contacts[index]![this.frame] === 1);
   }
 
+  /** Return the points of the ground below the hips in all frames, at a height in metres. */
+  groundPath(height: number): Float32Array {
+    const kinematics = new Kinematics(this.clip);
+    const { hips } = this.clip.skeleton;
+    const path = new Float32Array(3 * this.clip.frames);
+    for (let frame = 0; frame < this.clip.frames; frame++) {
+      const positions = kinematics.update(frame);
+      path.set([positions[3 * hips]!, height, positions[3 * hips + 2]!], 3 * frame);
+    }
+    return path;
+  }
+
   /** Point that a camera looks at: below or above the hips, at half the height of the body. */
   centre(follows: boolean): [number, number, number] {
     const [x, z] = follows ? this.place() : this.start;
