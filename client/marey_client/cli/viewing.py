@@ -174,12 +174,13 @@ class Drawing:
 
     def _play_item(self, found: Any, revision: int | None) -> Path:
         from marey_client.poses.player_pages import motions_of_samples, save_page
+        from marey_client.poses.trials import motions_of_worst_trials
 
-        if found.item.kind is not Kind.MODEL:
-            raise WrongUsage(
-                f"{self.out}: worst trials are drawn to .png and .svg files only; pages play clips and samples"
-            )
-        save_page(found.transport, self.out, motions_of_samples(found, revision, self.rows, self.seed))
+        if found.item.kind is Kind.MODEL:
+            motions = motions_of_samples(found, revision, self.rows, self.seed)
+        else:
+            motions = motions_of_worst_trials(found, revision, self.rows)
+        save_page(found.transport, self.out, motions)
         return self.out
 
     def _play_clips(self, pair: Sequence[tuple[Any, int | None]], frames: slice | None) -> Path:

@@ -97,19 +97,20 @@ def _at_times_of(leader: ClipHandle, clip: ClipHandle, frames: slice | None) -> 
 def _read_clip(clip: ClipHandle, revision: int | None, frames: slice | None, *, with_revision: bool) -> ShownMotion:
     number = revision or clip.item.revision
     name = f"{clip.path}, revision {number}" if with_revision else clip.path
-    return _shown(clip, name, clip.motion(frames=frames, revision=number))
+    return shown_motion(clip, name, clip.motion(frames=frames, revision=number))
 
 
 def motions_of_samples(model: ModelHandle, revision: int | None, n: int, seed: int) -> list[ShownMotion]:
     """Draw samples of a model."""
     drawn = model.sample(n, seed, revision=revision)
     return [
-        _shown(model, f"{model.path}, sample {number} of seed {seed}", motion)
+        shown_motion(model, f"{model.path}, sample {number} of seed {seed}", motion)
         for number, motion in enumerate(drawn.motions, 1)
     ]
 
 
-def _shown(item: ItemHandle, name: str, motion: MotionDocument) -> ShownMotion:
+def shown_motion(item: ItemHandle, name: str, motion: MotionDocument) -> ShownMotion:
+    """Return a motion with its skeleton, which is read in the project of an item."""
     reference = motion.skeleton
     assert isinstance(reference, RevisionRef)
     rig = read_rig(item, reference)

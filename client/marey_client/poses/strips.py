@@ -148,12 +148,10 @@ def draw_worst_trials(
     """
     _require_rows(count)
     document = evaluation.document(revision=revision)
-    ranked = sorted((one for one in document["trials"] if "worst_rank" in one), key=lambda one: one["worst_rank"])
-    if not ranked:
-        raise BadArgument(f"{evaluation.path!r} does not say which trials are the worst; evaluate the clips again")
+    ranked = ranked_trials(evaluation, document)
     strips = room("marey_reports.drawing.strips", FIGURES_EXTRA)
     records = evaluation.records(revision=revision)
-    shown = _DisplayedFrames(evaluation, document)
+    shown = DisplayedFrames(evaluation, document)
     rows, times = [], []
     for one in ranked[:count]:
         name = trial_name(one["trial"])
@@ -168,12 +166,30 @@ def draw_worst_trials(
     return _written(figure, file_type, evaluation.path)
 
 
+def ranked_trials(evaluation: EvaluationHandle, document: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the ranked trials of an evaluation's document, the worst first. Raises `BadArgument` if there are none."""
+    ranked = sorted((one for one in document["trials"] if "worst_rank" in one), key=lambda one: one["worst_rank"])
+    if not ranked:
+        raise BadArgument(f"{evaluation.path!r} does not say which trials are the worst; evaluate the clips again")
+    return ranked
+
+
 def trial_name(trial: dict[str, Any]) -> str:
     """Return the name of a trial of an evaluation's document."""
     return f"{trial['family']} v={trial['speed_m_s']:g} w={math.degrees(trial['turn_rate_rad_s']):g}"
 
 
-class _DisplayedFrames:
+@dataclass(frozen=True)
+class RecordedFrame:
+    """A frame of a revision of a clip, and whether a mirrored copy of it was displayed."""
+
+    clip: ClipHandle
+    revision: int
+    frame: int
+    mirrored: bool
+
+
+class DisplayedFrames:
     """Frames of recorded clips, by their rows in the database of an evaluation."""
 
     def __init__(self, evaluation: EvaluationHandle, document: dict[str, Any]) -> None:
@@ -185,17 +201,18 @@ class _DisplayedFrames:
 
     def pose(self, row: int) -> Any:
         """Return the recorded pose of a row, as a clip of one frame; mirrored if the row is of a mirrored copy."""
+        found = self.place(row)
+        (pose,) = ClipOfStrip(found.clip, found.revision).poses([found.frame])
+        return mirrored(pose) if found.mirrored else pose
+
+    def place(self, row: int) -> RecordedFrame:
+        """Return the frame of a recorded clip in which a row was recorded."""
         found = self._clips[int(np.searchsorted(self._starts, row, side="right")) - 1]
         item, _, revision = found["uid"].partition("~")[0].partition("@")  # of a mirrored copy, more follows
         clip = self._clip(item)
         time_s = found["first_s"] + (row - found["start"]) / self.rate_hz
         frame = min(round(time_s * clip.frame_rate_hz), clip.frames - 1)
-        (pose,) = ClipOfStrip(clip, int(revision)).poses([frame])
-        if found["mirrored_from"] is None:
-            return pose
-        rigs = room("marey_motion.rigs", FIGURES_EXTRA)
-        partners = rigs.symmetric_joints(pose.skeleton, rigs.map_joints(pose.skeleton))
-        return room("marey_motion.mirroring", FIGURES_EXTRA).mirror_clip(pose, partners)
+        return RecordedFrame(clip, int(revision), frame, found["mirrored_from"] is not None)
 
     def _clip(self, item: str) -> ClipHandle:
         if item not in self._handles:
@@ -203,6 +220,13 @@ class _DisplayedFrames:
             found = self._evaluation.transport.get(type(self._evaluation.item), path)
             self._handles[item] = ClipHandle(self._evaluation.transport, self._evaluation.project, found)
         return self._handles[item]
+
+
+def mirrored(clip: Any) -> Any:
+    """Return the mirrored copy of a clip of `marey_motion`."""
+    rigs = room("marey_motion.rigs", FIGURES_EXTRA)
+    partners = rigs.symmetric_joints(clip.skeleton, rigs.map_joints(clip.skeleton))
+    return room("marey_motion.mirroring", FIGURES_EXTRA).mirror_clip(clip, partners)
 
 
 def _spread(frames: range, moments: int, name: str) -> list[int]:

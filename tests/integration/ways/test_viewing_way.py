@@ -85,7 +85,7 @@ def _write_pages(run: CommandLine) -> None:
     assert block is not None
     lines = [shlex.split(line, comments=True)[1:] for line in block[1].splitlines()]
     played = {}
-    for words in (one for one in lines if "models" not in one[1]):
+    for words in (one for one in lines if "models" not in one[1] and "eval" not in one[1]):
         name = words[words.index("--out") + 1]
         if not (hatch_build.PAGES / "player.html").is_file():
             assert "offers no page that plays motion" in run(*words, status=1).stderr

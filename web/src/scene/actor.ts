@@ -69,9 +69,14 @@ export interface Cell {
   box: [number, number, number, number];
 }
 
+/** Width by height of the cells of many actors. */
+const UPRIGHT = 0.75;
+
 /** Return cells for actors side by side: in one row, or in two columns if the canvas is higher than wide. */
 export function arrange(count: number, aspect: number): Cell[] {
-  const columns = count <= 1 ? 1 : count <= 3 ? (aspect > 1 ? count : 1) : aspect > 2 ? count : 2;
+  const few = count <= 3 ? (aspect > 1 ? count : 1) : aspect > 2 ? count : 2;
+  const many = Math.max(Math.min(Math.floor(Math.sqrt((count * aspect) / UPRIGHT)), count), 2);
+  const columns = count <= 4 ? Math.max(few, 1) : many;
   const rows = Math.ceil(count / columns);
   return Array.from({ length: count }, (_, index) => ({
     actors: [index],
