@@ -20,6 +20,9 @@ VIEW_PREFIX = "mareyview_"
 VIEW_PATH = "/view"
 """Path, below the address of the server, of the page that shows clips."""
 
+PLAYER_PATH = "/pages/player"
+"""Path, below the root of the API, of the page without motion from which clients make pages that need no server."""
+
 STUDY_PATH = "/studies"
 """Path, below the address of the server, of the page that shows a study to those who carry it out."""
 

@@ -7,6 +7,7 @@ import os
 import subprocess
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from tests.support.tiers import chromium, is_soak
 from tests.support.web_cases import write_cases
 
 from marey_client import Marey
+from marey_client.errors import MareyError
+from marey_client.poses.player_pages import motions_of_clips, read_template, save_page
 from marey_motion import generate_gait, global_positions
 from marey_motion.documents import clip_from_document, skeleton_from_document
 from marey_motion.formats import write_bvh
@@ -30,6 +33,7 @@ from marey_schemas.encoding.codecs import MSGPACK, decode_tree
 from marey_server.handlers.browser import pages
 from marey_server.store.database.connections import Database
 
+HOSTILE_NAME = "</script><img src=x onerror='window.harmed = true'><!--<script>"
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}
 
 
@@ -133,6 +137,9 @@ def test_without_built_pages_a_page_names_the_command_that_builds_them(
     assert (missing.status_code, missing.headers["Content-Type"]) == (404, "text/html; charset=utf-8")
     assert "make web" in missing.text
     assert httpx.get(f"{server.address}/assets/a.js").status_code == 404
+    token = server.client(server.make_project()).headers["Authorization"].removeprefix("Bearer ")
+    with Marey(server.address, token) as marey, pytest.raises(MareyError, match="offers no page that plays motion"):
+        read_template(marey.transport)
 
 
 def test_pages_are_revalidated_their_files_kept_and_their_addresses_relative(
@@ -142,6 +149,7 @@ def test_pages_are_revalidated_their_files_kept_and_their_addresses_relative(
     (folder / "assets").mkdir(parents=True)
     (folder / "index.html").write_text('<base href="./" /><script type="module" src="./assets/a.js"></script>')
     (folder / "assets" / "a.js").write_text("export {};" * 100)
+    (folder / "player.html").write_text("<title>Motion</title>")
     (folder / "secret.txt").write_text("not part of the pages")
     monkeypatch.setattr(pages, "FOLDER", folder)
     for path, base in (("/view?clip=lab/x&unknown=1", "./"), ("/studies?study=lab/x", "./"), ("/s/", "../")):
@@ -154,6 +162,9 @@ def test_pages_are_revalidated_their_files_kept_and_their_addresses_relative(
         assert "unsafe" not in policy
         again = httpx.get(server.address + path, headers={"If-None-Match": page.headers["ETag"]})
         assert again.status_code == 304
+    player = httpx.get(f"{server.api}/pages/player")
+    assert (player.text, player.headers["Content-Type"]) == ("<title>Motion</title>", "text/html; charset=utf-8")
+    assert player.headers["Content-Security-Policy"].startswith("sandbox allow-scripts; default-src 'none'")
     script = httpx.get(f"{server.address}/assets/a.js")
     assert (script.text, script.headers["Content-Encoding"]) == ("export {};" * 100, "gzip")
     assert "immutable" in script.headers["Cache-Control"]
@@ -184,6 +195,30 @@ def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_pat
         "clips": names,
     }
     _run_vitest("browser", "browser/pages.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
+
+
+@pytest.mark.chromium
+def test_a_page_from_disk_plays_its_motions_without_a_request(
+    shown: tuple[Server, httpx.Client], tmp_path: Path
+) -> None:
+    server, owner = shown
+    names = [_upload(owner, file) for file in _takes(tmp_path)]
+    token = owner.headers["Authorization"].removeprefix("Bearer ")
+    with Marey(server.address, token) as marey:
+        clips = [marey.project("lab").clips[name] for name in names]
+        motions = motions_of_clips([(clip, None) for clip in clips], None)
+        hostile = [replace(motions[0], name=HOSTILE_NAME), motions[1]]
+        for name, group in (("alone", motions[:1]), ("pair", hostile), ("five", [*motions, *motions, motions[0]])):
+            save_page(marey.transport, tmp_path / f"{name}.html", group)
+        (tmp_path / "empty.html").write_bytes(read_template(marey.transport))
+    given = {
+        "chromium": chromium(),
+        "folder": tmp_path.as_uri(),
+        "positions": _positions(owner, clips[0].id),
+        "rate": clips[0].frame_rate_hz,
+        "names": [names[0], HOSTILE_NAME, names[1]],
+    }
+    _run_vitest("browser", "browser/player.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
 
 
 @pytest.mark.chromium

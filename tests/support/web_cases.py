@@ -12,10 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.poses.player_pages import ShownMotion
 from marey_motion import foot_contacts, generate_gait, global_positions
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_tree, skeleton_to_document
 from marey_motion.rigs.mapping import map_joints
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 
@@ -72,6 +74,10 @@ def _write_clip(stem: Path, clip: Clip) -> None:
     stem.with_suffix(".hierarchy.json").write_text(hierarchy.model_dump_json(by_alias=True))
     mapping = map_joints(clip.skeleton)
     stem.with_suffix(".mapping.json").write_text(json.dumps({"joints": dict(mapping.joints)}))
+    shown = ShownMotion(
+        stem.name, MotionDocument.model_validate(tree), hierarchy.model_dump(), {"joints": mapping.joints}
+    )
+    (stem.with_suffix(".packed.json")).write_text(json.dumps(shown.packed(), default=dict))
     positions = global_positions(clip, end_sites=True)
     stem.with_suffix(".positions").write_bytes(positions.astype("<f4").tobytes())
     toes = positions[:, [clip.skeleton.index_of(mapping.joints[foot]) for foot in FEET]]

@@ -14,8 +14,8 @@ interface Given {
 
 const GIVEN = JSON.parse(process.env["MAREY_WEB_GIVEN"]!) as Given;
 const TOLERANCE_M = 1e-4;
-/** Draw calls of one figure: ground, its lines twice, limbs and balls with their shadows, and marks of four feet. */
-const MOST_CALLS = 3 + 4 + 4;
+/** Draw calls of one figure: ground, its lines twice, limbs and balls with their shadows, path, and marks of four feet. */
+const MOST_CALLS = 3 + 4 + 1 + 4;
 const MOST_TRIANGLES = 30_000;
 
 let browser: Browser;

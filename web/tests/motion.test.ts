@@ -2,6 +2,7 @@ import { describe, expect, it } from "vitest";
 import { Clip, clipOf, skeletonOf } from "../src/motion/clip";
 import { findContacts } from "../src/motion/contacts";
 import { Kinematics } from "../src/motion/kinematics";
+import { type PackedMotion, unpackMotion, unpackPage } from "../src/motion/packed";
 import { type HierarchyDocument, type MappingDocument, Skeleton } from "../src/motion/skeleton";
 import { Actor } from "../src/scene/actor";
 import { shapeBody } from "../src/scene/body";
@@ -9,6 +10,8 @@ import { decodeMessagePack } from "../src/wire/messagepack";
 import { bytesOf, floatsOf, INDEX, jsonOf } from "./cases";
 
 const TOLERANCE_M = 1e-5;
+/** Greatest distance of a joint from its place if the rotations of all its parents are rounded. */
+const PACKED_TOLERANCE_M = 1e-3;
 
 function loadCase(name: string): Clip {
   const document = decodeMessagePack(bytesOf(`${name}.msgpack`));
@@ -29,6 +32,19 @@ describe.each(INDEX.clips)("the clip %s", (name) => {
       kinematics.update(frame).forEach((value, at) => (largest = Math.max(largest, Math.abs(value - expected[frame * width + at]!))));
     }
     expect(largest).toBeLessThan(TOLERANCE_M);
+  });
+
+  it("is the same after it was packed for a page without a server, but for rounding", async () => {
+    const clip = loadCase(name);
+    const packed = await unpackMotion(jsonOf<PackedMotion>(`${name}.packed.json`));
+    expect([packed.name, packed.frames, packed.frameRate]).toEqual([name, clip.frames, clip.frameRate]);
+    const [exact, rounded] = [new Kinematics(clip), new Kinematics(packed)];
+    for (let frame = 0; frame < clip.frames; frame++) {
+      const places = exact.update(frame);
+      rounded.update(frame).forEach((value, at) => expect(Math.abs(value - places[at]!)).toBeLessThan(PACKED_TOLERANCE_M));
+    }
+    expect(packed.skeleton.sides).toEqual(clip.skeleton.sides);
+    expect(packed.skeleton.feet).toEqual(clip.skeleton.feet);
   });
 
   it("touches the ground in the frames in which the server finds contacts", () => {
@@ -95,5 +111,14 @@ describe("a skeleton whose root carries the body through space", () => {
     actor.seek(1);
     expect(actor.centre(true)).toEqual([5, expect.any(Number), 6]);
     expect(actor.centre(false)).toEqual([1, expect.any(Number), 2]);
+  });
+});
+
+describe("the data of a page without a server", () => {
+  it("are refused if they are missing, of another form, or incomplete", async () => {
+    await expect(unpackPage("\n")).rejects.toThrow("this page contains no motion");
+    await expect(unpackPage('{"format": 2, "title": "x", "motions": []}')).rejects.toThrow("the form 2, but this page reads the form 1");
+    const motion = jsonOf<PackedMotion>(`${INDEX.clips[0]!}.packed.json`);
+    await expect(unpackMotion({ ...motion, frames: motion.frames + 1 })).rejects.toThrow("do not fit the frames");
   });
 });

@@ -29,6 +29,7 @@ InBrowser = Annotated[
     bool, typer.Option("--browser", help="Open the page in a browser of this machine; default: print its address.")
 ]
 DRAWN_KINDS = (Kind.CLIP, Kind.MODEL, Kind.EVALUATION)
+PAGE_ENDING = ".html"
 DEFAULT_MOMENTS = 8
 DEFAULT_ROWS = 3
 SOURCE = "source"
@@ -62,13 +63,17 @@ def view(
     browser: InBrowser = False,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "--output", "-o", help="Draw poses to this file, which ends in .png or .svg."),
+        typer.Option(
+            "--out",
+            "--output",
+            "-o",
+            help="Draw poses to this file, which ends in .png or .svg; or write a page that plays the motion without a "
+            "server or network, if it ends in .html.",
+        ),
     ] = None,
-    frames: Annotated[str | None, typer.Option(help="With --out: frames of the clip to draw, such as 100:200.")] = None,
-    moments: Annotated[int, typer.Option(min=1, help="With --out: number of poses in a row.")] = DEFAULT_MOMENTS,
-    n: Annotated[
-        int, typer.Option("-n", min=1, help="With --out: number of samples or trials to draw.")
-    ] = DEFAULT_ROWS,
+    frames: Annotated[str | None, typer.Option(help="With --out: frames of the clip, such as 100:200.")] = None,
+    moments: Annotated[int, typer.Option(min=1, help="In a picture: number of poses in a row.")] = DEFAULT_MOMENTS,
+    n: Annotated[int, typer.Option("-n", min=1, help="With --out: number of samples or trials.")] = DEFAULT_ROWS,
     seed: Annotated[int, typer.Option(min=0, help="With --out: seed of the samples of a model.")] = 0,
 ) -> None:
     """Show a clip in a browser, or draw it; --out also draws samples of a model, and worst trials of an evaluation.
@@ -84,6 +89,8 @@ def view(
         refuse_ignored(context, "without --out", "frames", "moments", "n", "seed")
     with connect(context) as marey:
         found, number = require_revision(marey, addresses[0], DRAWN_KINDS if out is not None else [Kind.CLIP])
+        if out is not None and out.suffix.lower() == PAGE_ENDING:
+            refuse_ignored(context, "in a page", "moments")
         if out is not None and found.item.kind is not Kind.CLIP:
             refuse_ignored(context, "on a model or an evaluation", "beside", "beside_revision", "frames")
             drawn = Drawing(out, moments, n, seed).of_item(found, number)
@@ -147,6 +154,8 @@ class Drawing:
         """Draw samples of a model, or the worst trials of an evaluation; return the path of the file."""
         from marey_client.poses.strips import draw_samples, draw_worst_trials
 
+        if self._is_page:
+            return self._play_item(found, revision)
         form = self._file_type
         if found.item.kind is Kind.MODEL:
             return self._write(draw_samples(found, revision, self.rows, self.seed, self.moments, form))
@@ -156,16 +165,39 @@ class Drawing:
         """Draw a clip, and the second one of the pair below it; return the path of the file."""
         from marey_client.poses.strips import ClipOfStrip, draw_clips
 
-        form = self._file_type
         chosen = None if frames is None else read_frames(frames)
+        if self._is_page:
+            return self._play_clips(pair, chosen)
+        form = self._file_type
         clips = [ClipOfStrip(clip, revision, chosen) for clip, revision in pair]
         return self._write(draw_clips(clips[0], clips[1] if len(clips) > 1 else None, self.moments, form))
+
+    def _play_item(self, found: Any, revision: int | None) -> Path:
+        from marey_client.poses.player_pages import motions_of_samples, save_page
+        from marey_client.poses.trials import motions_of_worst_trials
+
+        if found.item.kind is Kind.MODEL:
+            motions = motions_of_samples(found, revision, self.rows, self.seed)
+        else:
+            motions = motions_of_worst_trials(found, revision, self.rows)
+        save_page(found.transport, self.out, motions)
+        return self.out
+
+    def _play_clips(self, pair: Sequence[tuple[Any, int | None]], frames: slice | None) -> Path:
+        from marey_client.poses.player_pages import motions_of_clips, save_page
+
+        save_page(pair[0][0].transport, self.out, motions_of_clips(pair, frames))
+        return self.out
+
+    @property
+    def _is_page(self) -> bool:
+        return self.out.suffix.lower() == PAGE_ENDING
 
     @property
     def _file_type(self) -> str:
         file_type = self.out.suffix.lower().lstrip(".")
         if file_type not in PICTURES:
-            raise WrongUsage(f"{self.out} must end in .png or .svg")
+            raise WrongUsage(f"{self.out} must end in .html, .png or .svg")
         return file_type
 
     def _write(self, data: bytes) -> Path:

@@ -164,6 +164,11 @@ class EvaluationHandle(ReportedHandle):
 # -- documents as tables -----------------------------------------------------------------------------------------------
 
 
+def name_of_trial(trial: Mapping[str, Any]) -> str:
+    """Return the name of a trial of an evaluation's document, which its records have, too."""
+    return trial_name(trial["family"], trial["speed_m_s"], trial["turn_rate_rad_s"])
+
+
 def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Return one flat row for each trial of an evaluation's document: its requested motion, verdict and metrics.
 
@@ -173,7 +178,7 @@ def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         asked = one["trial"]
         turn_rate_deg_s = math.degrees(asked["turn_rate_rad_s"])
         yield {
-            "trial": trial_name(asked["family"], asked["speed_m_s"], asked["turn_rate_rad_s"]),
+            "trial": name_of_trial(asked),
             "family": asked["family"],
             "speed_m_s": asked["speed_m_s"],
             "turn_rate_deg_s": turn_rate_deg_s,

@@ -12,12 +12,11 @@ import numpy as np
 from marey_client.errors import BadArgument
 from marey_client.extras import room
 from marey_client.handles.clips import ClipHandle
-from marey_client.handles.evaluations import EvaluationHandle
+from marey_client.handles.evaluations import EvaluationHandle, name_of_trial
 from marey_client.handles.models import ModelHandle
 from marey_client.poses.kinematics import PosedSkeleton, read_rig
 from marey_client.poses.pictures import FIGURES_EXTRA, MOST_MOMENTS, READS_AT_ONCE
 from marey_schemas.documents.clips import MotionDocument
-from marey_schemas.documents.evaluations import trial_name
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
@@ -147,16 +146,13 @@ def draw_worst_trials(
     """
     _require_rows(count)
     document = evaluation.document(revision=revision)
-    ranked = sorted((one for one in document["trials"] if "worst_rank" in one), key=lambda one: one["worst_rank"])
-    if not ranked:
-        raise BadArgument(f"{evaluation.path!r} does not say which trials are the worst; evaluate the clips again")
+    ranked = ranked_trials(evaluation, document)
     strips = room("marey_reports.drawing.strips", FIGURES_EXTRA)
     records = evaluation.records(revision=revision)
-    shown = _DisplayedFrames(evaluation, document)
+    shown = DisplayedFrames(evaluation, document)
     rows, times = [], []
     for one in ranked[:count]:
-        asked = one["trial"]
-        name = trial_name(asked["family"], asked["speed_m_s"], asked["turn_rate_rad_s"])
+        name = name_of_trial(one["trial"])
         record = records[name]
         ticks = _spread(range(len(record["rows"])), moments, name)
         times = [tick / shown.rate_hz for tick in ticks]
@@ -168,7 +164,25 @@ def draw_worst_trials(
     return _written(figure, file_type, evaluation.path)
 
 
-class _DisplayedFrames:
+def ranked_trials(evaluation: EvaluationHandle, document: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the ranked trials of an evaluation's document, the worst first. Raises `BadArgument` if there are none."""
+    ranked = sorted((one for one in document["trials"] if "worst_rank" in one), key=lambda one: one["worst_rank"])
+    if not ranked:
+        raise BadArgument(f"{evaluation.path!r} does not say which trials are the worst; evaluate the clips again")
+    return ranked
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """A frame of a revision of a clip, and whether a mirrored copy of it was displayed."""
+
+    clip: ClipHandle
+    revision: int
+    frame: int
+    mirrored: bool
+
+
+class DisplayedFrames:
     """Frames of recorded clips, by their rows in the database of an evaluation."""
 
     def __init__(self, evaluation: EvaluationHandle, document: dict[str, Any]) -> None:
@@ -180,17 +194,18 @@ class _DisplayedFrames:
 
     def pose(self, row: int) -> Any:
         """Return the recorded pose of a row, as a clip of one frame; mirrored if the row is of a mirrored copy."""
+        found = self.place(row)
+        (pose,) = ClipOfStrip(found.clip, found.revision).poses([found.frame])
+        return mirrored(pose) if found.mirrored else pose
+
+    def place(self, row: int) -> RecordedFrame:
+        """Return the frame of a recorded clip in which a row was recorded."""
         found = self._clips[int(np.searchsorted(self._starts, row, side="right")) - 1]
         item, _, revision = found["uid"].partition("~")[0].partition("@")  # of a mirrored copy, more follows
         clip = self._clip(item)
         time_s = found["first_s"] + (row - found["start"]) / self.rate_hz
         frame = min(round(time_s * clip.frame_rate_hz), clip.frames - 1)
-        (pose,) = ClipOfStrip(clip, int(revision)).poses([frame])
-        if found["mirrored_from"] is None:
-            return pose
-        rigs = room("marey_motion.rigs", FIGURES_EXTRA)
-        partners = rigs.symmetric_joints(pose.skeleton, rigs.map_joints(pose.skeleton))
-        return room("marey_motion.mirroring", FIGURES_EXTRA).mirror_clip(pose, partners)
+        return RecordedFrame(clip, int(revision), frame, found["mirrored_from"] is not None)
 
     def _clip(self, item: str) -> ClipHandle:
         if item not in self._handles:
@@ -198,6 +213,13 @@ class _DisplayedFrames:
             found = self._evaluation.transport.get(type(self._evaluation.item), path)
             self._handles[item] = ClipHandle(self._evaluation.transport, self._evaluation.project, found)
         return self._handles[item]
+
+
+def mirrored(clip: Any) -> Any:
+    """Return the mirrored copy of a clip of `marey_motion`."""
+    rigs = room("marey_motion.rigs", FIGURES_EXTRA)
+    partners = rigs.symmetric_joints(clip.skeleton, rigs.map_joints(clip.skeleton))
+    return room("marey_motion.mirroring", FIGURES_EXTRA).mirror_clip(clip, partners)
 
 
 def _spread(frames: range, moments: int, name: str) -> list[int]:

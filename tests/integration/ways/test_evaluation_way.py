@@ -13,14 +13,20 @@ import pytest
 from tests.support.command_line import CommandLine
 
 from marey_client.errors import JobUnsuccessful
+from marey_client.handles.evaluations import name_of_trial
 from marey_client.imports import find_files
+from marey_client.poses.trials import motions_of_worst_trials
 from marey_client.project import ProjectHandle
+from marey_motion import forward_directions, forward_kinematics
 from marey_motion.clip import Clip
+from marey_motion.documents import skeleton_from_document
 from marey_motion.formats import write_bvh
 from marey_motion.gait import game_skeleton
-from marey_schemas.documents.evaluations import trial_name
+from marey_reports.drawing.stick_figures import body_of
+from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.items import ItemChange
 from marey_schemas.options.imports import ImportOptions
+from marey_schemas.wording import counted
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -64,9 +70,21 @@ def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, ru
     run("view", "lab/walks-eval", "-n", 2, "--moments", 4, "--out", "worst.svg")
     drawn = (tmp_path / "worst.svg").read_text(encoding="utf-8")
     ranked = sorted(found.document()["trials"], key=lambda one: one["worst_rank"])
-    worst = [trial_name(*(one["trial"][key] for key in ("family", "speed_m_s", "turn_rate_rad_s"))) for one in ranked]
+    worst = [name_of_trial(one["trial"]) for one in ranked]
     assert [drawn.count(f">{name}<") for name in worst[:3]] == [1, 1, 0]
-    assert re.search("measures? beyond limits", drawn)
+    assert f"{counted(len(ranked[0]['beyond_limits']), 'measure')} beyond limits" in drawn
+    played = motions_of_worst_trials(found, None, 2)
+    assert [one.name for one in played] == worst[:2]
+    for one in played:
+        record = found.records()[one.name]
+        skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(one.hierarchy))
+        facing, pelvis = body_of(skeleton).facing, body_of(skeleton).pelvis
+        points = forward_kinematics(skeleton, one.motion.poses)
+        assert points[:, pelvis, ::2] == pytest.approx(record["positions"], abs=1e-4)
+        ahead = forward_directions(points, *facing)
+        turned = np.stack((np.sin(record["headings"]), np.cos(record["headings"])), axis=1)
+        assert ahead == pytest.approx(turned, abs=1e-3)
+        assert one.motion.frame_rate_hz * len(one.motion.poses) >= 30
     assert (
         "no effect on a model or an evaluation"
         in run("view", "lab/walks-eval", "--out", "x.svg", "--beside", "source", status=2).stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import stat
@@ -9,6 +10,7 @@ import webbrowser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
+import hatch_build
 import httpx
 import pytest
 from tests.support.command_line import CommandLine
@@ -60,15 +62,43 @@ def test_the_commands_of_the_page_give_addresses_whose_codes_open_the_project(
         name = words[words.index("--out") + 1]
         assert run(*words).stderr == f"wrote {name}\n"
         assert (run.folder / name).read_bytes().startswith(b"<?xml" if name.endswith(".svg") else b"\x89PNG")
+    _write_pages(run)
     two = (run.folder / "change.svg").read_text(encoding="utf-8")
     assert re.findall(r">(revision \d)<", two) == ["revision 1", "revision 1", "revision 2"]  # legend and rows
     wrong = {
-        ("--out", "x.gif"): "must end in .png or .svg", ("--out", "x.png", "--frames", "9000:"): "contains no frame",
+        ("--out", "x.gif"): "must end in .html, .png or .svg",
+        ("--out", "x.png", "--frames", "9000:"): "contains no frame",
         ("--out", "x.png", "--frames", "a:b"): "not a range of frames", ("--frames", "1:2"): "no effect without --out",
         ("--out", "x.png", "--moments", "99"): "shows 1 to 24 moments",
         ("--out", "x.png", "-n", "2"): "no effect on a clip",
+        ("--out", "x.html", "--moments", "2"): "no effect in a page",
     }  # fmt: skip
     for options, told in wrong.items():
         assert told in run("view", "lab/gaits/raw/walk", *options, status=2).stderr
     assert not list(run.folder.glob("x.*"))
     assert "0 clips that exist" in run("view", "lab/gaits/raw/turn", "--beside", "source", status=2).stderr
+
+
+def _write_pages(run: CommandLine) -> None:
+    """Write the pages of the how-to page from clips; a server without built pages refuses each with a remedy."""
+    block = re.search(r"```sh\n(marey view [^`]*?walk[.]html.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert block is not None
+    lines = [shlex.split(line, comments=True)[1:] for line in block[1].splitlines()]
+    played = {}
+    for words in (one for one in lines if "models" not in one[1] and "eval" not in one[1]):
+        name = words[words.index("--out") + 1]
+        if not (hatch_build.PAGES / "player.html").is_file():
+            assert "offers no page that plays motion" in run(*words, status=1).stderr
+            continue
+        assert run(*words).stderr == f"wrote {name}\n"
+        found = re.search(r'id="motion">(.*?)</script>', (run.folder / name).read_text(encoding="utf-8"))
+        assert found is not None
+        motions = json.loads(found[1])["motions"]
+        played[name] = [(one["name"], one["frames"]) for one in motions]
+    if not played:
+        return
+    ((path, frames),) = played["walk.html"]
+    assert path == "gaits/raw/walk"
+    assert played["part.html"] == [(path, 40)]
+    assert played["retargeted.html"] == [(f"studio/{path}", frames), (path, frames)]
+    assert played["change.html"] == [(f"{path}, revision 1", frames), (f"{path}, revision 2", frames)]

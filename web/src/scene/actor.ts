@@ -38,6 +38,18 @@ export class Actor {
     return this.clip.skeleton.feet.filter((_, index) => this.contacts[index]![this.frame] === 1);
   }
 
+  /** Return the points of the ground below the hips in all frames, at a height in metres. */
+  groundPath(height: number): Float32Array {
+    const kinematics = new Kinematics(this.clip);
+    const { hips } = this.clip.skeleton;
+    const path = new Float32Array(3 * this.clip.frames);
+    for (let frame = 0; frame < this.clip.frames; frame++) {
+      const positions = kinematics.update(frame);
+      path.set([positions[3 * hips]!, height, positions[3 * hips + 2]!], 3 * frame);
+    }
+    return path;
+  }
+
   /** Point that a camera looks at: below or above the hips, at half the height of the body. */
   centre(follows: boolean): [number, number, number] {
     const [x, z] = follows ? this.place() : this.start;
@@ -57,9 +69,14 @@ export interface Cell {
   box: [number, number, number, number];
 }
 
+/** Width by height of the cells of many actors. */
+const UPRIGHT = 0.75;
+
 /** Return cells for actors side by side: in one row, or in two columns if the canvas is higher than wide. */
 export function arrange(count: number, aspect: number): Cell[] {
-  const columns = count <= 1 ? 1 : count <= 3 ? (aspect > 1 ? count : 1) : aspect > 2 ? count : 2;
+  const few = count <= 3 ? (aspect > 1 ? count : 1) : aspect > 2 ? count : 2;
+  const many = Math.max(Math.min(Math.floor(Math.sqrt((count * aspect) / UPRIGHT)), count), 2);
+  const columns = count <= 4 ? Math.max(few, 1) : many;
   const rows = Math.ceil(count / columns);
   return Array.from({ length: count }, (_, index) => ({
     actors: [index],

@@ -1,7 +1,8 @@
 /** Meshes of one actor. All limbs are instances of one shape, so the number of draw calls does not depend on the joints. */
 import {
-  Color, CylinderGeometry, Group, InstancedMesh, LatheGeometry, Matrix4, Mesh, MeshBasicMaterial, MeshLambertMaterial,
-  OctahedronGeometry, Quaternion, RingGeometry, SphereGeometry, Vector2, Vector3, type BufferGeometry,
+  BufferGeometry, Color, CylinderGeometry, Float32BufferAttribute, Group, InstancedMesh, LatheGeometry, Line,
+  LineBasicMaterial, Matrix4, Mesh, MeshBasicMaterial, MeshLambertMaterial, OctahedronGeometry, Quaternion, RingGeometry,
+  SphereGeometry, Vector2, Vector3,
 } from "three";
 import type { Side } from "../motion/skeleton";
 import type { Actor, Look } from "./actor";
@@ -12,11 +13,14 @@ const UP = new Vector3(0, 1, 0);
 /** Outline of a wooden limb of length one and radius one: radius by height. */
 const OUTLINE: [number, number][] = [[0.55, 0], [0.86, 0.08], [1, 0.26], [0.88, 0.58], [0.66, 0.9], [0.5, 1]];
 const SHADOW_HEIGHT = 0.0015;
+const PATH_HEIGHT = 0.003;
 
 export class Figure {
   readonly group = new Group();
   private readonly looks: Record<Look, Drawn>;
   private readonly marks: Mesh<RingGeometry, MeshBasicMaterial>[];
+  /** Path of the hips on the ground, over the whole clip. */
+  private readonly path: Line<BufferGeometry, LineBasicMaterial>;
 
   constructor(readonly actor: Actor) {
     this.looks = { skeleton: skeletonOf(actor), mannequin: mannequinOf(actor) };
@@ -25,7 +29,10 @@ export class Figure {
       mark.rotation.x = -Math.PI / 2;
       return mark;
     });
-    this.group.add(this.looks.skeleton.group, this.looks.mannequin.group, ...this.marks);
+    const places = new Float32BufferAttribute(actor.groundPath(PATH_HEIGHT), 3);
+    this.path = new Line(new BufferGeometry().setAttribute("position", places), new LineBasicMaterial());
+    this.path.frustumCulled = false;
+    this.group.add(this.looks.skeleton.group, this.looks.mannequin.group, this.path, ...this.marks);
   }
 
   /** Move all parts to the pose that the actor shows. */
@@ -34,6 +41,7 @@ export class Figure {
       drawn.group.visible = name === look;
       if (name === look) drawn.pose(this.actor.positions);
     }
+    this.path.visible = showsMarks;
     const standing = this.actor.standing();
     this.actor.clip.skeleton.feet.forEach((foot, index) => {
       const mark = this.marks[index]!;
@@ -47,12 +55,13 @@ export class Figure {
     const ofSide = (side: Side) => (side === "left" ? palette.left : side === "right" ? palette.right : palette.bone);
     this.looks.skeleton.paint((point) => ofSide(sides[point]!), palette.shadow);
     this.looks.mannequin.paint(() => (neutral ? palette.context : palette.wood), palette.shadow);
+    this.path.material.color.set(palette.context);
     feet.forEach((foot, index) => this.marks[index]!.material.color.set(ofSide(sides[foot]!)));
   }
 
   dispose(): void {
     for (const drawn of Object.values(this.looks)) drawn.dispose();
-    for (const mark of this.marks) {
+    for (const mark of [...this.marks, this.path]) {
       mark.geometry.dispose();
       mark.material.dispose();
     }

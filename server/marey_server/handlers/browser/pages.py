@@ -17,6 +17,7 @@ from typing import ClassVar
 from pydantic import ConfigDict, Field
 
 from marey_schemas.base import Request
+from marey_schemas.sign_ins import PLAYER_PATH
 from marey_server.errors import NotFoundProblem
 from marey_server.handlers.identities import BROWSER, page
 from marey_server.http.caching import IMMUTABLE, NOT_STORED
@@ -31,6 +32,8 @@ _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; base-uri 'self'; "
     "form-action 'none'; frame-ancestors 'none'"
 )
+_PLAYER_POLICY = "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'"
+"""Policy of a page with inline scripts: it is no page of this server, so it cannot use sessions of browsers."""
 _MISSING = "This installation contains no pages. Install Node 20.19 or newer, and run `make web` in the source tree."
 _TEXTS = ("text/", "application/javascript", "image/svg+xml")
 
@@ -160,6 +163,22 @@ class ParticipantPage(WebPage):
         return await self.document()
 
 
+class PlayerPage(Resource):
+    """Page that plays the motion in it without a server; clients add the motion."""
+
+    path = PLAYER_PATH
+    tag = "Pages"
+
+    @reads(access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("text/html",))
+    async def get(self) -> Reply:
+        """Return the page without motion. A client writes motion into its element `motion`."""
+        found = (await self.compute(built_files)).get("player.html")
+        if found is None:
+            raise NotFoundProblem(_MISSING)
+        rev = hashlib.sha256(found.content).hexdigest()[:16]
+        return Reply(found.content, rev=rev, media_type=BROWSER, headers={"Content-Security-Policy": _PLAYER_POLICY})
+
+
 class PageAsset(Resource):
     """File that the pages load; its name contains a hash of its content."""
 
@@ -180,4 +199,4 @@ class PageAsset(Resource):
         return Reply(found.compressed, media_type=found.media_type, headers=headers)
 
 
-RESOURCES: tuple[type[Resource], ...] = (ViewPage, StudyPage, ParticipantPage, PageAsset)
+RESOURCES: tuple[type[Resource], ...] = (ViewPage, StudyPage, ParticipantPage, PlayerPage, PageAsset)

@@ -14,6 +14,7 @@ from tests.support.command_line import CommandLine
 
 from marey_client.errors import JobUnsuccessful, RequestFailed
 from marey_client.handles.models import ModelHandle
+from marey_client.poses.player_pages import motions_of_samples
 from marey_client.project import ProjectHandle
 from marey_motion.formats import read_motion
 
@@ -179,6 +180,10 @@ def test_from_the_command_line(lab: ProjectHandle, run: CommandLine, tmp_path: P
     assert (tmp_path / "samples" / "cli_1_0002.bvh").read_bytes().startswith(b"HIERARCHY")
     clips = json.loads(run("sample", "lab/models/cli", "--into", "from-cli", "--json").stdout)
     assert clips == {"clips": ["lab/from-cli/cli_0_0001"]}
+    model = lab.models["models/cli"]
+    samples = motions_of_samples(model, None, 2, 1)
+    assert [one.name for one in samples] == [f"models/cli, sample {number} of seed 1" for number in (1, 2)]
+    assert (samples[1].motion.poses == model.sample(2, 1).motions[1].poses).all()
     run("view", "lab/models/cli", "-n", 2, "--seed", 1, "--moments", 3, "--out", "samples.svg")
     drawn = (tmp_path / "samples.svg").read_text(encoding="utf-8")
     assert [drawn.count(f">{text}<") for text in ("sample 1", "sample 2", "sample 3", "50 %")] == [1, 1, 0, 1]

@@ -1,0 +1,121 @@
+"""Pages that play motion without a server or a network: one file with the viewer and packed motion."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from marey_client.downloads import saved_atomically
+from marey_client.errors import BadArgument, MareyError, NotFound
+from marey_client.handles.clips import ClipHandle
+from marey_client.handles.models import ModelHandle
+from marey_client.items import ItemHandle
+from marey_client.poses.kinematics import read_rig
+from marey_client.poses.packing import pack_motion
+from marey_client.transport import Transport
+from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.sign_ins import PLAYER_PATH
+
+FORMAT = 1
+"""Version of the data in a page; `web/src/motion/packed.ts` reads it."""
+MOST_MOTIONS = 12
+_PLACE = b'<script type="application/json" id="motion"></script>'
+
+
+@dataclass(frozen=True)
+class ShownMotion:
+    """A motion with its skeleton, and the name under which a page shows it."""
+
+    name: str
+    motion: MotionDocument
+    hierarchy: dict[str, Any]
+    mapping: dict[str, Any] | None = None
+
+    def packed(self) -> dict[str, Any]:
+        """Return the motion as a member of the data of a page."""
+        skeleton = {"hierarchy": self.hierarchy, "mapping": self.mapping}
+        return {"name": self.name, **skeleton, **pack_motion(self.motion)}
+
+
+def read_template(transport: Transport) -> bytes:
+    """Return the page without motion that the server offers. Raises `MareyError` if it has none."""
+    try:
+        return transport.send("GET", PLAYER_PATH, headers={"Accept": "text/html"}).content
+    except NotFound as error:
+        raise MareyError(
+            f"{transport.url} offers no page that plays motion: it was installed without pages, or is older than this "
+            "command. Run `make web` in its source tree or upgrade it, or draw a picture to a .png file"
+        ) from error
+
+
+def page_with(template: bytes, title: str, motions: Sequence[ShownMotion]) -> bytes:
+    """Return a page that plays motions. Raises `MareyError` if the template has no place for them.
+
+    Names cannot end the element that contains the data, because each `<` in it is escaped.
+    """
+    if template.count(_PLACE) != 1:
+        raise MareyError("the server's page has no place for motion; upgrade the older one of client and server")
+    content = {"format": FORMAT, "title": title, "motions": [one.packed() for one in motions]}
+    data = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return template.replace(_PLACE, _PLACE.replace(b"></", b">" + data.encode() + b"</"))
+
+
+def save_page(transport: Transport, target: Path, motions: Sequence[ShownMotion]) -> None:
+    """Write a page that plays motions beside each other to a file, which is complete or not there."""
+    if not 1 <= len(motions) <= MOST_MOTIONS:
+        raise BadArgument(f"a page plays 1 to {MOST_MOTIONS} motions, not {len(motions)}")
+    title = " beside ".join(one.name for one in motions[:2]) + (" …" if len(motions) > 2 else "")
+    page = page_with(read_template(transport), f"{title} – Marey", motions)
+    with saved_atomically(target) as file:
+        file.write(page)
+
+
+def motions_of_clips(clips: Sequence[tuple[ClipHandle, int | None]], frames: slice | None) -> list[ShownMotion]:
+    """Read clips, each at a revision (None: the one of its handle), and the frames at the times of those of the first.
+
+    Revisions are part of the names if two clips have the same path.
+    """
+    leader = clips[0][0]
+    paths = [clip.path for clip, _ in clips]
+    return [
+        _read_clip(clip, revision, _at_times_of(leader, clip, frames), with_revision=paths.count(clip.path) > 1)
+        for clip, revision in clips
+    ]
+
+
+def _at_times_of(leader: ClipHandle, clip: ClipHandle, frames: slice | None) -> slice | None:
+    if frames is None or clip is leader:
+        return frames
+    ratio = clip.frame_rate_hz / leader.frame_rate_hz
+    return slice(*(None if one is None else round(one * ratio) for one in (frames.start, frames.stop)))
+
+
+def _read_clip(clip: ClipHandle, revision: int | None, frames: slice | None, *, with_revision: bool) -> ShownMotion:
+    number = revision or clip.item.revision
+    name = f"{clip.path}, revision {number}" if with_revision else clip.path
+    return shown_motion(clip, name, clip.motion(frames=frames, revision=number))
+
+
+def motions_of_samples(model: ModelHandle, revision: int | None, n: int, seed: int) -> list[ShownMotion]:
+    """Draw samples of a model."""
+    drawn = model.sample(n, seed, revision=revision)
+    return [
+        shown_motion(model, f"{model.path}, sample {number} of seed {seed}", motion)
+        for number, motion in enumerate(drawn.motions, 1)
+    ]
+
+
+def shown_motion(item: ItemHandle, name: str, motion: MotionDocument) -> ShownMotion:
+    """Return a motion with its skeleton, which is read in the project of an item."""
+    reference = motion.skeleton
+    assert isinstance(reference, RevisionRef)
+    rig = read_rig(item, reference)
+    try:
+        mapping = rig.handle.part("mapping", revision=reference.revision)
+    except NotFound:  # the page then finds sides and feet by the names of joints
+        mapping = None
+    return ShownMotion(name, motion, rig.hierarchy.model_dump(mode="json", by_alias=True, exclude_none=True), mapping)

@@ -1,0 +1,86 @@
+"""Motions that the character displayed in the trials of an evaluation, put together from recorded clips."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_client.errors import BadArgument
+from marey_client.extras import room
+from marey_client.handles.clips import ClipHandle
+from marey_client.handles.evaluations import EvaluationHandle, name_of_trial
+from marey_client.poses.pictures import FIGURES_EXTRA
+from marey_client.poses.player_pages import ShownMotion, shown_motion
+from marey_client.poses.strips import ClipOfStrip, DisplayedFrames, mirrored, ranked_trials
+from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.references import RevisionRef
+
+Floats = NDArray[np.float64]
+
+
+def motions_of_worst_trials(evaluation: EvaluationHandle, revision: int | None, count: int) -> list[ShownMotion]:
+    """Put the motions of the worst trials together, the worst first.
+
+    A frame is the recorded one that the character displayed at a tick, with the pelvis at the place of the character
+    and in its heading. The smoothing after switches between clips is left out, so poses jump there. Raises
+    `BadArgument` without ranks of trials, and for clips in which other joints than the root are translated.
+    """
+    document = evaluation.document(revision=revision)
+    ranked = ranked_trials(evaluation, document)
+    records = evaluation.records(revision=revision)
+    recorded = _RecordedClips(DisplayedFrames(evaluation, document))
+    names = [name_of_trial(one["trial"]) for one in ranked[:count]]
+    return [recorded.motion(name, records[name]) for name in names]
+
+
+class _RecordedClips:
+    """Whole clips that trials displayed, each read once."""
+
+    def __init__(self, shown: DisplayedFrames) -> None:
+        self._shown = shown
+        self._clips: dict[tuple[str, int, bool], Any] = {}
+
+    def motion(self, name: str, record: dict[str, NDArray[Any]]) -> ShownMotion:
+        """Return the motion of a trial from its record."""
+        places = [self._shown.place(int(row)) for row in record["rows"]]
+        clips = [self._whole(one.clip, one.revision, is_mirrored=one.mirrored) for one in places]
+        poses = np.stack([clip.poses[one.frame] for clip, one in zip(clips, places, strict=True)]).astype(np.float64)
+        skeleton = clips[0].skeleton
+        headings = np.asarray(record["headings"], dtype=np.float64)
+        moved = _moved(skeleton, poses, np.asarray(record["positions"], dtype=np.float64), headings)
+        first = places[0]
+        reference = first.clip.motion(frames=slice(0, 1), revision=first.revision).skeleton
+        assert isinstance(reference, RevisionRef)
+        motion = MotionDocument(
+            skeleton=reference, frame_rate_hz=self._shown.rate_hz, joints=skeleton.joint_names, poses=moved
+        )
+        return shown_motion(first.clip, name, motion)
+
+    def _whole(self, clip: ClipHandle, revision: int, *, is_mirrored: bool) -> Any:
+        key = (clip.id, revision, is_mirrored)
+        if key not in self._clips:
+            found = ClipOfStrip(clip, revision).whole()
+            if found.translations is not None:
+                raise BadArgument(f"{clip.path!r} translates joints below the root; draw its trials to a .png file")
+            self._clips[key] = mirrored(found) if is_mirrored else found
+        return self._clips[key]
+
+
+def _moved(skeleton: Any, poses: Floats, positions: Floats, headings: Floats) -> NDArray[np.float32]:
+    """Turn poses (T, 3 + 4 joints) about the vertical to headings (T,), and put the pelvis at positions (T, 2)."""
+    kinematics = room("marey_motion.kinematics", FIGURES_EXTRA)
+    quaternions = room("marey_motion.quaternions", FIGURES_EXTRA)
+    body = room("marey_reports.drawing.stick_figures", FIGURES_EXTRA).body_of(skeleton)
+    points = kinematics.forward_kinematics(skeleton, poses.astype(np.float32)).astype(np.float64)
+    ahead = kinematics.forward_directions(points, *body.facing)
+    angles = headings - np.arctan2(ahead[:, 0], ahead[:, 1])
+    cos, sin = np.cos(angles), np.sin(angles)
+    x, z = (poses[:, :3] - points[:, body.pelvis])[:, (0, 2)].T
+    moved = poses.copy()
+    moved[:, 0] = positions[:, 0] + cos * x + sin * z
+    moved[:, 2] = positions[:, 1] + cos * z - sin * x
+    upright = quaternions.from_axis_angle(np.broadcast_to((0.0, 1.0, 0.0), (len(poses), 3)), angles)
+    moved[:, 3:7] = quaternions.multiply(upright, poses[:, 3:7])
+    return moved.astype(np.float32)
