@@ -67,7 +67,7 @@ class AlignKeywords(TypedDict, total=False):
     reference: str
     """Clip whose time is the canonical time. medoid: the clip nearest to all others (of more than 200 clips, the clip
     of a random sample of 200 that is nearest to all others of the sample); nearest_mean_length: the clip whose length
-    is nearest to the mean; or the id of a clip."""
+    is nearest to the mean; or the id of a clip, of which commands and Python also take the path."""
     rate_hz: float | None
     """Rate of the canonical frames, in hertz; absent: the frame rate of the reference if a clip is given as reference,
     else the most common frame rate of the clips."""
