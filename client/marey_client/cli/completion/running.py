@@ -6,6 +6,7 @@ import contextlib
 import copy
 import inspect
 import io
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,6 +29,7 @@ from marey_client.cli.completion.subjects import how_to_complete
 from marey_client.cli.terminal.schema_options import SchemaCommand, expanded
 
 MOST_SUGGESTIONS = 1000
+log = logging.getLogger(__name__)
 
 
 def complete(app: typer.Typer, line: Line) -> list[Suggestion] | None:
@@ -60,6 +62,7 @@ def answer_shell(
         with contextlib.redirect_stderr(io.StringIO()):
             found = complete(app(next(iter(words), None)), line)
     except Exception:  # noqa: BLE001 - a shell would print it between the prompt and the command
+        log.debug("a question of a shell failed", exc_info=True)
         return 1
     if found is None:
         return FILES
