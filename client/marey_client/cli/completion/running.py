@@ -61,7 +61,7 @@ def answer_shell(
         line = Line(tuple(words), given.start, given.raw, tuple(options))
         with contextlib.redirect_stderr(io.StringIO()):
             found = complete(app(next(iter(words), None)), line)
-    except Exception:
+    except Exception:  # a shell would print it between the prompt and the command
         log.debug("a question of a shell failed", exc_info=True)
         return 1
     if found is None:
