@@ -1,6 +1,8 @@
 /** Clock that all characters of a page share. */
 
 export const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
+/** Longest time that passes at once, in seconds: after a pause of the page, the clips go on from where they were. */
+export const LONGEST_STEP_S = 0.25;
 
 export class Clock {
   /** Time in seconds since the start of the clips. */
@@ -11,7 +13,7 @@ export class Clock {
 
   /** Let time pass; at the end, the clips begin again. */
   advance(elapsed: number): void {
-    if (this.playing) this.seconds = (this.seconds + elapsed * this.speed) % this.duration;
+    if (this.playing) this.seconds = (this.seconds + Math.min(elapsed, LONGEST_STEP_S) * this.speed) % this.duration;
   }
 
   seek(seconds: number): void {
