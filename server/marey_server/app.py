@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import hashlib
-import json
 import logging
 import os
 import shlex
 import signal
 import socket
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import asynccontextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cache, partial
-from importlib.metadata import version
 from typing import Any
 
 from tornado.httpserver import HTTPServer
@@ -40,8 +36,6 @@ from marey_server.http.accepting import (
     listen,
     raise_descriptor_limit,
 )
-from marey_server.http.docs_page import render_page
-from marey_server.http.openapi import build_document
 from marey_server.http.resource import Resource
 from marey_server.http.routes import RouteTable
 from marey_server.launchers.pools import keeping_workers
@@ -54,7 +48,7 @@ from marey_server.process.feed import following_feed
 from marey_server.process.housekeeping import keeping_house
 from marey_server.process.notices import note_ready, note_stopping
 from marey_server.process.observe import access_log, configure_logging
-from marey_server.process.services import Description, Services
+from marey_server.process.services import Services
 from marey_server.process.settings import Settings, misspelt_variables
 from marey_server.store import users
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs, DirectoryBlobs
@@ -76,10 +70,9 @@ FIRST_COMMAND = "marey project create lab"
 class Application(TornadoApplication):
     """Tornado application: routes, and the services that their handlers share."""
 
-    def __init__(self, resources: tuple[type[Resource], ...], make_services: Callable[[RouteTable], Services]) -> None:
-        self.routes = RouteTable(self, resources)
-        self.services = make_services(self.routes)
-        super().__init__([Rule(AnyMatches(), self.routes)], log_function=self.record_request)
+    def __init__(self, resources: Sequence[type[Resource]], services: Services) -> None:
+        self.services = services
+        super().__init__([Rule(AnyMatches(), RouteTable(self, resources))], log_function=self.record_request)
 
     def record_request(self, handler: RequestHandler) -> None:
         """Log and count a request after its answer was written."""
@@ -135,16 +128,7 @@ def create_app(settings: Settings, database: Database, children: Children | None
 
     Several applications may share the child processes `children`.
     """
-    return Application(
-        RESOURCES, lambda routes: Services(settings, database, cache(partial(describe, routes)), children)
-    )
-
-
-def describe(routes: RouteTable) -> Description:
-    """Return the description of the API, as an OpenAPI document and as an HTML page."""
-    document = build_document(routes, version("marey"))
-    text = json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
-    return Description(text, render_page(document), hashlib.sha256(text).hexdigest()[:16])
+    return Application(RESOURCES, Services(settings, database, children))
 
 
 @dataclass(frozen=True)
@@ -192,7 +176,7 @@ async def listening(
 async def showing_metrics(services: Services, sockets: Sequence[socket.socket]) -> AsyncIterator[None]:
     """Answer requests for metrics and health at further sockets while the `async with` block runs."""
     server = HTTPServer(
-        Application(MONITORING, lambda _: services),
+        Application(MONITORING, services),
         idle_connection_timeout=services.settings.header_timeout_s,
         max_header_size=services.settings.max_header_bytes,
     )

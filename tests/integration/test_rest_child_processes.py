@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 import psutil
 import pytest
+from tests.support.api_document import api_document
 from tests.support.edited_takes import make_walk
 from tests.support.rest_server import PATIENCE_S, Server
 
@@ -21,7 +22,10 @@ from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_schemas.access import ProjectChange, Visibility
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_server.handlers import documentation
+from marey_server.handlers.documentation import DESCRIBE_API
 from marey_server.motions import previewing
+from marey_server.process.children import ChildTask
 from marey_server.process.memory import UNKNOWN_CLIENTS
 
 WAITING = "tests.support.child_functions:wait_for"
@@ -103,6 +107,42 @@ def test_all_clients_without_a_user_together_have_the_share_of_one_user(
         assert int(refused.headers["Retry-After"]) > 0
         assert owner.post(preview, json=TRIM).status_code == 200
     assert server.client().post(preview, json=TRIM).status_code == 200
+
+
+def test_requests_for_the_description_of_the_api_compute_it_once_and_not_in_the_server(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    children = server.app.services.children
+    tasks: list[str] = []
+    submit = children.submit
+
+    def submit_noted(caller: str, function: str, *rest: Any) -> ChildTask[Any]:
+        tasks.append(function)
+        return submit(caller, function, *rest)
+
+    monkeypatch.setattr(children, "submit", submit_noted)
+    with ThreadPoolExecutor(4) as threads:
+        document, page, *again = threads.map(server.client().get, ("/openapi.json", "/docs") * 2)
+    assert tasks == [DESCRIBE_API]
+    assert document.json()["paths"].keys() == api_document()["paths"].keys()
+    assert document.content == again[0].content
+    assert page.text.startswith("<!doctype html>")
+    assert page.headers["ETag"] == again[1].headers["ETag"]
+
+
+def test_the_description_of_the_api_is_computed_again_after_its_child_was_killed(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noted = tmp_path / "noted"
+    monkeypatch.setattr(documentation, "DESCRIBE_API", WAITING)
+    monkeypatch.setattr(documentation, "bytes", lambda: str(noted).encode(), raising=False)
+    with ThreadPoolExecutor(1) as threads:
+        asked = threads.submit(server.client().get, "/docs")
+        until(noted.exists)
+        os.kill(int(noted.read_text()), signal.SIGKILL)
+        assert (asked.result().status_code, asked.result().json()["code"]) == (422, "child-died")
+    monkeypatch.undo()
+    assert server.client().get("/docs").status_code == 200
 
 
 def stopped(server: Server, reason: str) -> float:

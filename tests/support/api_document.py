@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Iterator
-from typing import Any, cast
+from typing import Any
 
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.http.openapi import build_document
-from marey_server.http.routes import Route, RouteTable
+from marey_server.http.routes import Route, routes_of
 
 
 @functools.cache
 def api_routes() -> tuple[Route, ...]:
     """Return all routes of the server."""
-    return tuple(RouteTable(cast(Any, None), RESOURCES))
+    return tuple(routes_of(RESOURCES))
 
 
 @functools.cache

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 from sqlalchemy import update
 from tests.support.present import present
@@ -16,14 +16,14 @@ from tests.support.who_may import PEOPLE
 from marey_schemas.encoding.canonical import document_digest
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers.catalogue import RESOURCES
-from marey_server.http.routes import Route, RouteTable
+from marey_server.http.routes import Route, routes_of
 from marey_server.store.tables import job, token
 from marey_versions.records import revision_content
 from marey_versions.tree.building import build
 from marey_versions.tree.chunks import ChunksInMemory
 
 CANARY = "canary-5e0f2b"
-ROUTES = tuple(RouteTable(cast(Any, None), RESOURCES))
+ROUTES = tuple(routes_of(RESOURCES))
 UNKNOWN_LINK = "mareystudy_aaaaaaaaaaaa_" + "b" * 64
 UNKNOWN_CODE = "mareyinvite_aaaaaaaaaaaa_" + "b" * 64
 INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64

@@ -1,4 +1,8 @@
-"""List of all resources of the server, in the order of the documentation."""
+"""List of all resources of the server, in the order of the documentation, and the description of the API."""
+
+import hashlib
+import json
+from importlib.metadata import version
 
 from marey_server.handlers import (
     access,
@@ -30,7 +34,11 @@ from marey_server.handlers.queue import jobs, leases, pipelines, schedules, scri
 from marey_server.handlers.searching import models, similar
 from marey_server.handlers.studies import conducting, participation
 from marey_server.handlers.versions import contents, datasets, differences, proposals
+from marey_server.http.docs_page import render_page
+from marey_server.http.openapi import build_document
 from marey_server.http.resource import Resource
+from marey_server.http.routes import routes_of
+from marey_server.process.services import Description
 
 RESOURCES: tuple[type[Resource], ...] = (
     *access.RESOURCES,
@@ -72,3 +80,11 @@ RESOURCES: tuple[type[Resource], ...] = (
     *pages.RESOURCES,
     *health.RESOURCES,
 )
+
+
+def describe_api(_order: bytes) -> bytes:
+    """Return the packed `Description` of the API. Child processes run this function, because it takes seconds."""
+    document = build_document(routes_of(RESOURCES), version("marey"))
+    text = json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
+    tag = hashlib.sha256(text).hexdigest()[:16]
+    return Description(document=text, page=render_page(document), tag=tag).pack()

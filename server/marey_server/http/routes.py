@@ -55,20 +55,21 @@ class UnknownPath(Resource):
         raise NotFoundProblem("No resource has this address.")
 
 
+def routes_of(resources: Iterable[type[Resource]]) -> Iterator[Route]:
+    """Yield the route of each operation of some resources."""
+    for resource in resources:
+        for operation in resource.operations.values():
+            yield Route(resource.template(), operation, resource)
+
+
 class RouteTable(Router):
     """Search tree of path segments, so that the time to find a resource does not depend on the number of routes."""
 
     def __init__(self, application: Application, resources: Iterable[type[Resource]]) -> None:
         self._application = application
-        self._resources = tuple(resources)
         self._root = _Node()
-        for resource in self._resources:
+        for resource in resources:
             self._add(resource)
-
-    def __iter__(self) -> Iterator[Route]:
-        for resource in self._resources:
-            for operation in resource.operations.values():
-                yield Route(resource.template(), operation, resource)
 
     def _add(self, resource: type[Resource]) -> None:
         node = self._root

@@ -6,9 +6,8 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from typing import Any
@@ -19,6 +18,7 @@ from marey_server.access import scopes
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.secret_tokens import is_sealed, token_hash
 from marey_server.errors import ApiProblem, AuthorLostProblem, UnavailableProblem
+from marey_server.motions.child import Message
 from marey_server.motions.searching import SearchableKey
 from marey_server.process.child_starting import LOADED_FIRST, MODULES_FIRST
 from marey_server.process.children import Children
@@ -59,8 +59,7 @@ TOKENS_REMEMBERED = 10_000
 ADMISSIONS_REMEMBERED = 10_000
 
 
-@dataclass(frozen=True)
-class Description:
+class Description(Message):
     """Description of the API as bytes: the OpenAPI document, the HTML page, and the entity tag of both."""
 
     document: bytes
@@ -88,12 +87,13 @@ class Services:
         self,
         settings: Settings,
         database: Database,
-        description: Callable[[], Description],
         children: Children | None = None,
     ) -> None:
         self.settings = settings
         self.database = database
-        self.description = description
+        self.description: Description | None = None
+        """Description of the API; None until a request for it has computed it."""
+        self.describing = asyncio.Lock()
         self.tracer = settings.open_tracer()
         self.metrics = Metrics()
         self.answers = _answer_cache(settings.answer_cache_bytes)
