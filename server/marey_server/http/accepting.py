@@ -34,7 +34,7 @@ EVICTED_SHARE = 1 / 16
 
 The number is given as a share of the limit on all connections.
 """
-ACCEPTED_AT_ONCE = 4
+ACCEPTED_AT_ONCE = 2
 """Number of connections accepted in one round of the event loop; then requests on open connections get their turn."""
 PAUSE_S = 0.5
 """Time in seconds for which no connection is accepted after a failure for lack of descriptors or memory."""

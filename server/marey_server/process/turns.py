@@ -12,9 +12,9 @@ import asyncio
 
 from marey_server.store.database.lanes import Client, FairLine
 
-BEGUN_PER_ROUND = 4
+BEGUN_PER_ROUND = 2
 """Number of requests that begin in one round of the event loop if more are waiting."""
-RESERVED_PER_ROUND = 2
+RESERVED_PER_ROUND = 1
 """Number of places in a round that are offered to reserved operations, such as heartbeats, before other requests.
 
 The other places are offered to reserved operations only if no other request is waiting.

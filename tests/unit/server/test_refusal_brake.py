@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import sys
 import time
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -17,9 +18,11 @@ from marey_server.process.refusal_brake import (
     FEW_AT_ONCE,
     FORGIVEN_EVERY_S,
     FREE_REFUSALS,
+    GIVES_WAY_S,
     LONGEST_S,
     TOLERATED_OF_CROWD_S,
     TOLERATED_S,
+    USUALLY_GIVES_WAY_S,
     RefusalBrake,
 )
 
@@ -65,6 +68,24 @@ async def test_lateness_is_measured_while_there_are_refusals() -> None:
     while not brake.late_s:
         await asyncio.sleep(0.01)
     assert brake.late_s > 0.1
+
+
+@in_a_loop
+async def test_threads_give_way_sooner_while_refusals_are_measured_and_the_loop_is_late() -> None:
+    usual_s, brake = USUALLY_GIVES_WAY_S, RefusalBrake()
+    brake.delay_s("a")
+    brake.late_s = 10 * TOLERATED_OF_CROWD_S
+    await until(lambda: sys.getswitchinterval() != usual_s)
+    assert sys.getswitchinterval() == pytest.approx(GIVES_WAY_S)
+    with mock.patch.object(refusal_brake, "MEASURED_S", 0.0):
+        await until(lambda: sys.getswitchinterval() == usual_s)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition is true; fail after 20 s."""
+    async with asyncio.timeout(20):
+        while not condition():
+            await asyncio.sleep(0.01)
 
 
 @in_a_loop
