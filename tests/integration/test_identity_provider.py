@@ -310,7 +310,7 @@ def test_a_provider_that_fails_later_ends_the_sign_in(
     assert "access_denied" in denied.text
     provider.error = ""
     provider.claims["aud"] = "another client"
-    assert "its claim aud is not the expected one" in Person(house).finish().text
+    assert "its claim aud does not have the expected value" in Person(house).finish().text
 
 
 @ON_SQLITE

@@ -113,9 +113,9 @@ def _attempt_token(secret: str) -> IssuedToken:
 
 
 def sealed(token: IssuedToken, seal_key: bytes) -> str:
-    """Return the text of an attempt's token with a seal.
+    """Return the text of an attempt's token with a seal, by which `is_sealed` recognizes tokens of this server.
 
-    The seal is not needed for access, and not part of the secret: a token without a seal belongs to the same attempt.
+    The seal is not part of the secret, and not needed for access: the token without its seal is valid, too.
     """
     return f"{token.text}_{_seal(token.text.removeprefix(_ATTEMPT), seal_key)}"
 
