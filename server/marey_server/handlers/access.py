@@ -191,7 +191,7 @@ class TokenQuery(PageQuery):
         description="List only the token with this prefix, which is the text between the two `_` of its secret.",
     )
     ends_within_s: int | None = Field(
-        None, ge=0, le=10 * 365 * 86400, description="List only tokens that expire within this time."
+        None, ge=0, le=10 * 365 * 86400, description="List only tokens that expire within this number of seconds."
     )
 
 

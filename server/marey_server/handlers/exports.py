@@ -59,7 +59,7 @@ class ExportQuery(MotionFileOptions, ConsentOverride):
     )
     time: ExportTime = Field(
         "canonical",
-        description="For aligned clips: canonical time, or the time and place of the source clip.",
+        description="For aligned clips: `canonical` time, or the time and position of the `source` clip.",
     )
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to export; absent: the newest.")
 

@@ -1,7 +1,7 @@
 """Resources of the sign-in with an identity provider: for programs, for browsers, and for administrators.
 
 A program begins a sign-in and redeems its code; the browser opens two addresses in between. The browser gets pages,
-also for errors. It is only ever sent to the identity provider of the settings, or to a port of its own machine.
+also for errors. The server redirects it only to the identity provider in the settings, or to a port of its own machine.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ class CallbackQuery(Request):
 
     state: str = Field("", max_length=200, description="The state that the server sent to the provider.")
     code: str = Field("", max_length=8192, description="Authorization code, if the person has signed in.")
-    iss: str | None = Field(None, max_length=512, description="Address of the provider, if it names itself.")
+    iss: str | None = Field(None, max_length=512, description="Address of the provider, if the provider sends it.")
     error: str = Field("", max_length=200, description="Code of the error, if the person has not signed in.")
 
 
@@ -289,7 +289,7 @@ class UserIdentity(Resource):
 
     @writes(access=Access.ADMINISTRATOR, scope="admin")
     async def delete(self, user: str, identity: str) -> Rendered:
-        """End the link of a person at an identity provider with a user; all sign-ins of the user end, too."""
+        """Unlink a person at an identity provider from a user; all sessions of the user end, too."""
         return await self.answer(identities.unlink_identity, user, identity)
 
 

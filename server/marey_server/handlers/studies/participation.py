@@ -117,7 +117,7 @@ class ParticipationTrial(Resource):
 
 
 def read_shown_part(tx: Transaction, clip: int, part: ShownPart) -> Reply:
-    """Return a document of one motion of the caller's study; it never changes."""
+    """Return a document of one motion of the caller's study; the document never changes."""
     found = poses.find_shown_part(tx, clip, part)
     content = Lasting(found.digest, partial(items.load_part, tx, found), found.size_bytes)
     return Reply(content, rev=f"r{found.revision}", headers={"Cache-Control": IMMUTABLE})
