@@ -23,7 +23,7 @@ _OVER_HTTPS = "__Host-"
 _SITE = "Sec-Fetch-Site"
 """Header in which browsers state who has caused a request; they omit it without https, and pages cannot set it."""
 _OWN_SITES = ("same-origin", "none")
-"""Values of this header for requests that other sites have not caused."""
+"""Values of the header `Sec-Fetch-Site` in requests that other sites have not caused."""
 
 
 def cookie_name(project: str, *, https: bool) -> str:
@@ -48,7 +48,7 @@ def sent_cookies(request: HTTPServerRequest, project: str) -> dict[str, str]:
 def require_own_page(request: HTTPServerRequest) -> None:
     """Raise `ForbiddenProblem` if a page of another site has sent the request.
 
-    Programs, which send neither of the two headers, may send it.
+    Requests of programs, which have neither `Sec-Fetch-Site` nor `Origin`, are allowed.
     """
     site, origin = request.headers.get(_SITE), request.headers.get("Origin")
     by_origin = site is None and origin is not None  # a proxy may have changed Host, so the other header goes first

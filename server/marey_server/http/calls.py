@@ -60,7 +60,10 @@ class Caller:
         return not self.operation.shows_project or self._reads(project)
 
     def sees_names(self, project: str | None) -> bool:
-        """Return whether a refusal may name what the caller has not named: only if the caller may read the project."""
+        """Return whether an error may name objects that the request does not name, as in `ApiProblem`.
+
+        A caller who may change the project, but not read it, must not learn the names of its content.
+        """
         changes_project = self.operation.access.role is not None and self.operation.scope != "read"
         return not changes_project or self._reads(project)
 
@@ -156,7 +159,7 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
 
 
 def _require_participation(access: Access, principal: Principal) -> None:
-    """Refuse a participant of a study everything but taking part, and all others who want to take part."""
+    """Refuse operations for participants to all other callers, and all other operations to participants of studies."""
     if access is Access.ANYONE:
         return
     if access is not Access.PARTICIPANT:

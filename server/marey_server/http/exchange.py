@@ -246,7 +246,7 @@ class Exchange(RequestHandler):
 
     @property
     def sees_names(self) -> bool:
-        """Whether the answer may name what the caller has not named; see `ApiProblem`."""
+        """Whether an error may name objects that the request does not name; see `ApiProblem`."""
         return True
 
     def on_finish(self) -> None:
@@ -285,7 +285,7 @@ def problem_code(error: BaseException) -> str:
 def render_problem(error: BaseException, request_id: str, *, names: bool = True) -> Rendered:
     """Return the problem document of an error; for internal errors, it contains only the request id.
 
-    Without `names`, it names nothing that the request does not name.
+    If `names` is false, the document names only objects that the request names.
     """
     if isinstance(error, ApiProblem):
         problem = _of_refusal(error, request_id, names=names)

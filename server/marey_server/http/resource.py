@@ -149,7 +149,7 @@ class Resource(CallingExchange):
 
     @property
     def sees_names(self) -> bool:
-        """Whether the answer may name what the caller has not named; see `ApiProblem`."""
+        """Whether an error may name objects that the request does not name; see `ApiProblem`."""
         return not hasattr(self, "caller") or self.caller.sees_names(self.path_kwargs.get("project"))
 
     def _write_problem(self, error: BaseException) -> None:
@@ -171,7 +171,7 @@ class Resource(CallingExchange):
     async def _wait_for_refusal(self, error: ApiProblem) -> None:
         """Delay the answer to a refused request if the event loop is late and this client was refused several times.
 
-        A busy server is no fault of the client, so its refusals (status 503) do not count.
+        Refusals of a busy server (status 503) do not count, because the client has not caused them.
         """
         if error.status >= 500:
             return
