@@ -27,7 +27,7 @@ def draw_plans(planned: PlannedDraw, count: int) -> list[Plan]:
 
 
 def find_differences(collected: CollectedAnswers) -> StudyDifferences:
-    """Return the differences of the motions that the answers show, and the order of the motions."""
+    """Compute from the answers of a study how different its motions look, and the order of the motions."""
     count = collected.motion_count
     if not collected.answers:
         none = ((0,) * count,) * count
