@@ -108,7 +108,7 @@ def share_of(settings: Settings) -> Settings:
 
 
 async def _follow(reader: asyncio.StreamReader, stop: asyncio.Event, keep_workers: asyncio.Event) -> None:
-    """Read what the parent sends; when it has ended, stop."""
+    """Read the messages of the parent process, and stop this process when the parent has ended."""
     while line := await reader.readline():
         if line == KEEP_WORKERS:
             keep_workers.set()

@@ -1,8 +1,8 @@
 """Metrics about the queue, workers and stored data, for operators.
 
-Counters count what this process did. Numbers from the database are the same in every process that shares it. A request
-to /metrics starts a read of these numbers, but not before at least `REFRESH_S` have passed, and 20 times the duration
-of the last read. The request does not wait for this read: it shows the numbers of the last one, with their age.
+Counters count events in this process. Numbers from the database are the same in all processes that share the database.
+A request to /metrics starts a new read of these numbers if at least `REFRESH_S` seconds, and 20 times the duration of
+the last read, have passed since that read. The request does not wait: it shows the last numbers, with their age.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class OperatorMetrics(Observer):
         self.attempts_lost.inc()
 
     def observe_claims(self, delays_s: Sequence[float]) -> None:
-        """Record for how many seconds each job of a claim could have run before."""
+        """Record for each claimed job how many seconds it had waited since the time from which it could run."""
         for delay_s in delays_s:
             self.claim_delay.observe(delay_s)
 

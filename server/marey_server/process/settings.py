@@ -360,7 +360,7 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
 
     @property
     def quotas(self) -> Quotas:
-        """Return the limits of what one user, or one project, may hold."""
+        """Return the limits on the stored data and the unfinished work of one user or one project."""
         return Quotas(**{field.name: getattr(self, field.name) for field in fields(Quotas)})
 
     @property
