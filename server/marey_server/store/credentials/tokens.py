@@ -147,8 +147,8 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
 def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """Create a token of the caller; its secret is shown once.
 
-    The new token may have no rights that the caller's own token lacks: no further scope, no further label of workers,
-    and no longer validity. Otherwise, raises `ForbiddenProblem`. Raises `InvalidProblem` for labels without the scope
+    The new token may not have more rights than the caller's own token: no other scopes, no other labels of workers,
+    and no later expiry. Otherwise, raises `ForbiddenProblem`. Raises `InvalidProblem` for labels without the scope
     `work`.
     """
     user_id = _require_user(tx.principal, "write")
