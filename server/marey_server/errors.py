@@ -171,7 +171,7 @@ class AuthorLostProblem(LeaseLostProblem):
 
 
 AUTHOR_LOST = "author-lost-access"
-"""Reason why an attempt is stopped, and code of the failure of its job."""
+"""Code of the reason why an attempt is stopped if its author may not run jobs any more; also of the job's failure."""
 
 
 class PreconditionFailedProblem(ApiProblem):
