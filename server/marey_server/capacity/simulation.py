@@ -89,7 +89,10 @@ class JobHistory:
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """Result of a simulation: the history of each job, in the order of the jobs, and the server's occupied share."""
+    """Result of a simulation: the history of each job, in the order of the jobs, and its duration in `seconds`.
+
+    `busy_share` is the share of this time in which the server was occupied.
+    """
 
     jobs: list[JobHistory]
     busy_share: float

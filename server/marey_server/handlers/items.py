@@ -40,10 +40,10 @@ class ItemsQuery(CountedPageQuery):
     skeleton: str | None = Field(None, max_length=64, description="Return clips that use this skeleton.")
     clip: str | None = Field(None, max_length=64, description="Return annotations of this clip.")
     frames_gte: int | None = Field(
-        None, alias="frames.gte", ge=0, le=MAX_INTEGER, description="Least number of frames."
+        None, alias="frames.gte", ge=0, le=MAX_INTEGER, description="Return items with at least this number of frames."
     )
     frames_lte: int | None = Field(
-        None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="Greatest number of frames."
+        None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="Return items with at most this number of frames."
     )
     q: str | None = Field(
         None, max_length=255, description="Return items whose name contains this text, in upper or lower case."

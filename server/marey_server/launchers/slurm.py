@@ -130,7 +130,7 @@ class SlurmLauncher:
         """Times at which running workers were asked to stop, by name."""
 
     async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
-        """Submit an array job, unless Slurm knows one of this name. Names of workers are those of the tasks."""
+        """Submit an array job, unless Slurm has a job with this name. Each worker is a task of the array job."""
         job_name = f"{self._context.pool}-{key}"
         names = tuple(f"{job_name}-{number}" for number in range(1, count + 1))
         if not await self._tasks(f"--name={job_name}"):

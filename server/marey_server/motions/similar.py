@@ -45,7 +45,10 @@ _CLIPS_CACHE_BYTES = 64 * MIB
 
 @dataclass(frozen=True, slots=True)
 class FoundExample:
-    """Example, with some context, and the skeleton of its clip; `first` is the example's first frame in `motion`."""
+    """Example of a search: its frames with some context in `motion`, and the skeleton of the clip.
+
+    `first` is the index in `motion` of the first frame of the example.
+    """
 
     clip: str
     revision: int

@@ -45,7 +45,7 @@ class StartOrder:
         while not line.endswith(b"\n"):
             received = control.recv(1)  # so that nothing that follows the line is taken
             if not received or len(line) > MOST_LINE_BYTES:
-                raise EOFError("no order has come")
+                raise EOFError("the parent process has sent no complete order")
             line += received
         read = json.loads(line)
         return cls(read["settings"], tuple(read["sockets"]), tuple(read["metrics_sockets"]), read["first"])

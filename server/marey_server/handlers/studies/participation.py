@@ -112,7 +112,7 @@ class ParticipationTrial(Resource):
 
     @writes(access=Access.PARTICIPANT, scope=None, body=TrialAnswer, answer=TrialOutcome)
     async def put(self, trial: int, body: TrialAnswer) -> Rendered:
-        """Answer a trial. The first answer counts; repeated and other answers get the recorded outcome."""
+        """Answer a trial. Only the first answer counts; all later answers get the recorded outcome."""
         return await self.answer(trials.answer_trial, trial, body)
 
 

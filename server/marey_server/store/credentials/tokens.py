@@ -210,7 +210,7 @@ def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | Non
 
 
 def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
-    """Return the time at which a new token expires, or None if the token never expires.
+    """Return the time in microseconds since 1970 at which a new token expires, or None if it never expires.
 
     By default, the new token expires no later than the caller's own token. Raises `ForbiddenProblem` if the request
     explicitly sets a later time.
