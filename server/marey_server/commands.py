@@ -115,7 +115,7 @@ def read_settings(**given: Any) -> Settings:
 
 
 def _setting_at(steps: Sequence[int | str], given: Mapping[str, Any]) -> str:
-    """Return the name of a setting; if the settings file sets it, the name follows the file and the line."""
+    """Return the name of a setting; if the settings file sets it, the text begins with the file and the line."""
     name, whole = str(steps[0]) if steps else "", ".".join(map(str, steps))
     if given.get(name) is not None or f"{PREFIX}{name}".upper() in map(str.upper, os.environ):
         return whole

@@ -14,9 +14,9 @@ from marey_schemas.problems import FieldError
 class ApiProblem(Exception):
     """The request could not be carried out.
 
-    If the error names something that the request does not name, such as the path of another item, `unnamed` is the text
-    for callers who may change the project but not read it. They get it in place of `detail`, also in `errors`, and they
-    get no `context`. If only the context names something, `unnamed` is True.
+    If `detail` names something that the request does not name, such as the path of another item, `unnamed` is the text
+    for callers who may change the project but not read it. These callers get this text in place of `detail`, also in
+    `errors`, and no `context`. If only `context` names such things, `unnamed` is True.
     """
 
     status: ClassVar[int] = 500

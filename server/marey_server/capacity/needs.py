@@ -62,7 +62,7 @@ class Needs:
 
 
 def compute_needs(costs: MeasuredCosts, demand: PlannedWork, policy: QueuePolicy = DEFAULT_POLICY) -> Needs:
-    """Compute what `demand` needs. All work is assumed to be spread evenly over the days.
+    """Compute the needs of the work in `demand`, which is assumed to be spread evenly over its days.
 
     `clips_per_day` of the result is the number of clips per day at which the first part is saturated. Heartbeats are
     counted only while workers run jobs.

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 
 FIRST_HEARTBEAT_S = 1.0
-"""Time in seconds from the start of an attempt to its first heartbeat; a lost attempt without one is not counted."""
+"""Time in seconds from the start of an attempt to its first heartbeat; an attempt lost before does not count."""
 
 
 @dataclass(frozen=True)

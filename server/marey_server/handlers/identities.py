@@ -101,7 +101,7 @@ class BrowserResource(ProviderResource):
 
     @property
     def page_headers(self) -> dict[str, str]:
-        """The headers of a page, which contains no scripts and must not be kept."""
+        """The headers of a page: browsers run no scripts in the page, and do not store it."""
         policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'"
         return {**WITH_SECRET, "Content-Security-Policy": policy}
 
@@ -174,7 +174,7 @@ class OpenedSignIn(BrowserResource):
 
 
 class CallbackQuery(Request):
-    """Query parameters with which an identity provider sends a browser back; it may send others."""
+    """Query parameters with which an identity provider sends a browser back; other parameters are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 

@@ -103,7 +103,7 @@ def default_connections() -> int:
 class _Connection(IOStream):
     """Connection that counts the bytes received by its client since the last call of `start_count`.
 
-    It also knows for which fault of its client it is closed.
+    The connection also records the fault of the client for which it is closed.
     """
 
     def __init__(

@@ -106,7 +106,7 @@ def admission_of(caller: Caller, target: BodyTarget) -> Admission:
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
-    """Refuse callers who may not perform the operation on any object.
+    """Refuse callers who may never perform the operation, regardless of its object.
 
     Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
     """

@@ -157,7 +157,7 @@ _WHO = {
 
 
 def conditions_of(operation: Operation) -> str:
-    """Return sentences that say who may use an operation, and what repeated requests and pages do."""
+    """Return sentences about who may use an operation, the effect of repeated requests, and the pages of lists."""
     role = operation.access.role
     who = _WHO[operation.access] if role is None else f"Needs at least the role {role.value} in the project"
     if operation.in_folders:

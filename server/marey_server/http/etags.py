@@ -27,7 +27,7 @@ _REV = re.compile("[0-9]{1,9}")
 
 @dataclass(frozen=True, slots=True)
 class Precondition:
-    """Precondition of a write: the resource is in one of some states, in any state (`*`), or does not exist."""
+    """Precondition of a write: the resource is in one of the given states, in any state (`*`), or does not exist."""
 
     expected_rev: ExpectedRev = None
     """The `rev` that the UPDATE requires, or None."""

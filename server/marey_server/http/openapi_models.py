@@ -143,7 +143,7 @@ def _name_inner_objects(model: str, schema: Schema, components: dict[str, Schema
 
 
 def _inner_schemas(schema: Schema) -> Iterator[Schema]:
-    """Yield a schema and the schemas in it, but not those to which it refers."""
+    """Yield a schema and all schemas inside it; schemas that are only referenced (`$ref`) are left out."""
     yield schema
     below = [*schema.get("properties", {}).values(), *schema.get("prefixItems", ())]
     below += [one for key in ("anyOf", "oneOf", "allOf") for one in schema.get(key, ())]

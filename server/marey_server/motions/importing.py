@@ -142,7 +142,7 @@ def file_order(
 
 
 def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> PreparedImport:
-    """Return what a child process read from a file, ready to be stored."""
+    """Return the content that a child process has read from a file, ready to be stored."""
     with LOADING:
         from marey_server.motions.reading import ReadFile
 
@@ -171,7 +171,7 @@ class PutAside:
         self._findings: list[AxisFinding] = []
 
     def take(self, place: int, file: PreparedImport) -> bool:
-        """Note what a file shows; return whether the file, at this place in the import, has to wait."""
+        """Record the upward axis found in a file; return whether the file, at this place in the import, must wait."""
         if file.axis is None:
             return False
         self._findings.append(file.axis)

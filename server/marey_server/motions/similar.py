@@ -39,7 +39,7 @@ SEARCH_INDEX = "marey_server.motions.similar:search_index"
 """Function that child processes run."""
 THREADS = 2
 CONTEXT_READ_S = 1.5
-"""Seconds before and after the example that are read, too; one of them influences the features of the example."""
+"""Seconds that are read before and after the example; the nearest second influences the features of the example."""
 _CLIPS_CACHE_BYTES = 64 * MIB
 
 

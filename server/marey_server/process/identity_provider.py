@@ -65,7 +65,7 @@ class Endpoints:
 
 
 class Remembered(Generic[T]):
-    """Document of the provider that is read when it is needed and then kept; concurrent requests read it once."""
+    """Cached document of the provider, read when it is first needed; concurrent requests cause a single read."""
 
     def __init__(self, load: Callable[[], Awaitable[T]]) -> None:
         self._load = load
