@@ -38,7 +38,7 @@ with loading_modules():
 log = logging.getLogger(PROGRAM)  # `__name__` is `__main__`, since this module is run as a program
 
 LINGER_S = 1.0
-"""Seconds in which a process that will end still answers requests on open connections, so that none is lost."""
+"""Seconds for which a stopping process still answers requests on open connections, so that no request is lost."""
 FEWEST_CONNECTIONS = 16
 FEWEST_THREADS = 2
 FEWEST_CHILDREN = 2

@@ -88,7 +88,7 @@ def _require_image(image: str, rules: PodRules | None, beyond: list[str], at: st
         raise _invalid(f"{at}/params/script", "no-own-pods", detail)
     require_allowed_image(image, rules, f"{at}/params/script")
     if beyond:
-        detail = f"The script runs in a pod of its own, and no pod has the label {beyond[0]!r}; leave it out."
+        detail = f"The script runs in a pod of its own, and no pod has the label {beyond[0]!r}; remove the label."
         raise _invalid(f"{at}/labels", "no-own-pods", detail)
 
 

@@ -115,7 +115,7 @@ def _drawn(
 
 
 def _counted(found: Sequence[RunToCompare]) -> set[str]:
-    """Return the jobs that means include: for each setting and seed, the job of the newest run."""
+    """Return the ids of the jobs from which means are computed: for each setting and seed, the newest run."""
     newest: dict[tuple[str, int], RunToCompare] = {}
     for run in found:
         known = newest.setdefault((run.setting, run.seed), run)

@@ -138,7 +138,7 @@ class Dispatcher:
         stuck = stuck_jobs(jobs, self._jobs.view.pods.values())
         pause_s = self._rules.patience_s
         for name in self._plan.step_back(self._clock_s(), {name: jobs[name] for name in stuck}):
-            reason = f"no node ran the pod within {pause_s} s, so that it made place for other jobs: {stuck[name]}"
+            reason = f"no node ran the pod within {pause_s} s, so it was deleted in favour of other jobs: {stuck[name]}"
             if await self._postpone(jobs[name], reason, pause_s):
                 await ask(self._jobs.delete(name))
 

@@ -129,8 +129,8 @@ def _name_of(claim: str | None) -> str:
     name = (claim or "").partition("@")[0].lower()
     if not _USER_NAME.fullmatch(name):
         raise ForbiddenProblem(
-            "No user name can be made from what the identity provider says about you: the name has at most 64 letters, "
-            "digits, `.`, `_` and `-`. Ask an administrator to create your user and to link it.",
+            "The identity provider sent no valid user name for you: a user name has at most 64 letters, digits, `.`, "
+            "`_` and `-`. Ask an administrator to create a user and to link you with this user.",
             code="no-user-name",
         )
     return name
