@@ -206,7 +206,7 @@ class TooManyRequestsProblem(ApiProblem):
 
 
 class ClientGoneProblem(ApiProblem):
-    """The client closed the connection before it was answered."""
+    """The client closed the connection before the request was answered."""
 
     status = 499
     code = "client-gone"

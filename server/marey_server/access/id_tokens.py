@@ -88,7 +88,7 @@ def read_keys(document: Mapping[str, Any]) -> tuple[SigningKey, ...]:
         raise ValueError(f"the member `keys` is not a list of at most {MOST_KEYS} keys")
     found = tuple(key for key in map(_read_key, keys) if key is not None)
     if not found:
-        raise ValueError("no key in it can check signatures")
+        raise ValueError("no key of the set can check signatures")
     return found
 
 

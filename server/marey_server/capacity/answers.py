@@ -18,7 +18,7 @@ JOBS_PER_WORKER = 100
 
 
 class NotComputable(Exception):
-    """Costs or amounts are not valid; the text gives the reason."""
+    """Error of costs or amounts that are not valid; the text gives the reason."""
 
 
 def capacity(*, costs: Path | None = None, **demand: Any) -> dict[str, Any]:

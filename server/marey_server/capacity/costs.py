@@ -18,7 +18,7 @@ MEASURED = Path(__file__).with_name("measured_costs.toml")
 
 
 class UnusableCosts(Exception):
-    """A file of costs cannot be read; the text gives the place and the reason."""
+    """Error of a file of costs that cannot be read; the text gives the place and the reason."""
 
 
 class _Table(BaseModel):

@@ -2,8 +2,8 @@
 
 The order of claims, the lock by concurrency keys, labels, leases, lost attempts, and retries after failures follow
 `marey_server.store.jobs`; durations and limits are those of its `QueuePolicy`. The server is a number of equal stations
-with one waiting line: each request occupies a station for some time, and takes the worker some further time. Time is in
-seconds from the start of the simulation.
+with one waiting line: each request occupies a station for some time, and the worker waits some further time for the
+answer. Time is in seconds from the start of the simulation.
 """
 
 from __future__ import annotations

@@ -144,8 +144,8 @@ class SkeletonMerges(Resource):
     async def post(self, project: str, body: SkeletonMergeRequest) -> Rendered:
         """Merge duplicate skeletons of each rig into one skeleton, or preview the merge.
 
-        Clips, aligned clips and models that use a merged skeleton get a revision with the same motion that uses the
-        remaining skeleton. The merged skeletons are deleted. Results computed from the clips do not become stale.
+        Each clip, aligned clip or model with a merged skeleton gets a revision with the remaining skeleton and the same
+        motion. The merged skeletons are deleted. Results computed from the clips do not become stale.
         """
         if body.dry_run:
             return await self.render_document(Reply(await self.look_up(items.merge_skeletons, project, body)))

@@ -3,7 +3,7 @@
 A cookie contains the token of a session, which has only the scope `read` in its project. Other sites can neither send
 the cookie (`SameSite=Strict`) nor read answers (`Cross-Origin-Resource-Policy`, and no CORS). Pages cannot read it
 (`HttpOnly`). It is accepted only for declared GET operations of its project, so a forged request could change nothing.
-The one exception ends the session, and is refused to other sites.
+The only other request with the cookie ends the session; it is refused if another site has sent it.
 """
 
 from __future__ import annotations

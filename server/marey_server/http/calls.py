@@ -70,7 +70,7 @@ class Caller:
     def _reads(self, project: str | None) -> bool:
         """Return whether the caller has the scope `read` in a project.
 
-        Without a project in the address, the caller needs it in every project in which the operation is possible.
+        Without a project in the address, the caller needs the scope in all projects in which the operation is possible.
         """
         held = self.principal.scopes if self.principal is not None else ()
         if project is not None:

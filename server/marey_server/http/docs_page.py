@@ -93,7 +93,7 @@ def _operation(path: str, method: str, operation: Schema, shared: list[Schema]) 
 
 
 def _with_code(text: str) -> str:
-    """Return a text as HTML, with what is between backquotes as code."""
+    """Return a text as HTML; text between backquotes becomes code."""
     return re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text)))
 
 

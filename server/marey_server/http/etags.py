@@ -30,7 +30,7 @@ class Precondition:
     """Precondition of a write: the resource is in one of the given states, in any state (`*`), or does not exist."""
 
     expected_rev: ExpectedRev = None
-    """The `rev` that the UPDATE requires, or None."""
+    """The `rev` that the UPDATE requires, or a set of revs of which it requires one; None for any state."""
     absent: bool = False
 
 

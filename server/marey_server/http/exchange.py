@@ -123,7 +123,7 @@ class Exchange(RequestHandler):
         return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     def drop(self) -> None:
-        """Discard the part of a refused request's body that was received.
+        """Discard the received part of the body of a refused request.
 
         Closes the connection if the body is too long.
         """

@@ -278,7 +278,7 @@ class Resource(CallingExchange):
             self.services.admitted.put(admission, now)
 
     def _declared(self) -> Operation | None:
-        """Return the declaration of the request's method, or None if it is not declared; HEAD has that of GET."""
+        """Return the declaration of the request's method, or None for an undeclared method; HEAD counts as GET."""
         method = "GET" if self.request.method == "HEAD" else self.request.method
         return self.operations.get(method or "")
 

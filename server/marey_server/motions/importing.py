@@ -115,7 +115,7 @@ def file_order(
     skeleton: GivenSkeleton | None,
     sibling_axis: UpAxis | None,
 ) -> bytes:
-    """Return the packed message that asks a child process to read a file, with the files that are read with it.
+    """Return the packed message that asks a child process to read a file together with the files that accompany it.
 
     `sources` are the files that `PlannedFile.together` names. `sibling_axis` is the upward axis that other files with
     the same skeleton show.

@@ -52,7 +52,7 @@ class PredecessorOptions:
     """Options of the file formats of Marey's predecessor.
 
     `end_index` and `form` apply to annotations, `layout` to models and skeletons. If none of them is given, an item
-    that is unchanged since its import is exported as the imported file. A changed model is written in the layout that
+    that is unchanged since its import is exported as the imported file. Any other model is written in the layout that
     contains its time function exactly, or else in layout 3. `part` selects the part of the item to export: for a
     model, its tree; for an aligned clip, its alignment; for a skeleton, its skeleton model. By default, the model, the
     motion of the clip or the skeleton is exported.

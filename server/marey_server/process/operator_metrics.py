@@ -95,7 +95,7 @@ class OperatorMetrics(Observer):
         )  # fmt: skip
 
     def watch_disk(self, folder: Path, floor_bytes: int) -> None:
-        """Show the free space of the disk that holds `folder`, and the least free space."""
+        """Show the free space of the disk that holds `folder`, and the free space below which nothing is stored."""
         self.disk_floor.set(floor_bytes)
         self.disk_free.set_function(lambda: shutil.disk_usage(folder).free if folder.exists() else 0)
 

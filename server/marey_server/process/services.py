@@ -165,7 +165,7 @@ class Services:
         return key or None
 
     def forget_client(self, token: str) -> None:
-        """Treat a token that is no longer valid like an invented one, until a request with it is accepted again."""
+        """Treat a token that is no longer valid like an unknown token, until a request with it is accepted again."""
         if self.client_key(token) is not None:  # invented tokens must not displace others
             self._client_keys.put(token_hash(token), "")
 

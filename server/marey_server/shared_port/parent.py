@@ -33,7 +33,7 @@ PAUSES = Backoff(first_s=0.5, longest_s=30.0, jitter=0.25)
 async def serve_in_processes(settings: Settings, given: dict[str, Any]) -> None:
     """Run the processes of a server until SIGTERM or SIGINT; SIGHUP replaces all of them, one after another.
 
-    `given` are the settings that the processes get; they read the others themselves, so that new processes use changed
+    The processes get the settings `given`. They read all other settings themselves, so that new processes use changed
     settings. Raises `CannotListen` and `ProcessesFailed`.
     """
     configure_logging(settings.log_form, settings.log_level)

@@ -58,8 +58,8 @@ class StudyParticipants(Resource):
     async def post(self, project: str, kind: str, item: str, body: StudyLinksCreate) -> Rendered:
         """Create links, each for one participant without an account; the codes are shown only once.
 
-        The participants see the newest revision of the study. Their trials are drawn from its seed, such that every
-        participant sees every motion equally often, and that pairs of motions are balanced over participants.
+        The participants see the newest revision of the study. The trials are drawn with the seed of the study, so that
+        every participant sees every motion equally often, and all pairs of motions are shown about equally often.
         """
         planned = await self.look_up(conducting.plan_links, project, kind_of(kind), item, body)
         plans = await self.compute(draw_plans, planned, body.count)
@@ -127,7 +127,7 @@ class StudyDifferencesResource(Resource):
 
     @reads(access=Access.MAINTAINER, query=DifferencesQuery, answer=StudyDifferences, public=False)
     async def get(self, project: str, kind: str, item: str, query: DifferencesQuery) -> Reply:
-        """Return the differences of a study's motions by the answers so far, without anything about participants.
+        """Return how different the motions of a study look by the answers so far, without data of participants.
 
         The job kind `analyse_study` computes the same differences, groups of the motions, and metrics.
         """

@@ -163,7 +163,7 @@ class Cluster:
     async def _response(
         self, send: Callable[[client.ApiClient], Awaitable[aiohttp.ClientResponse]]
     ) -> AsyncIterator[aiohttp.ClientResponse]:
-        """Send a request and yield the successful answer; raise `EngineError` for errors, also while it is read."""
+        """Send a request and yield the successful answer. Raises `EngineError`, also while the answer is read."""
         try:
             response = await send(await self._connected())
             async with response:

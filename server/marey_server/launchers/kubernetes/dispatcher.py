@@ -81,7 +81,7 @@ class Dispatcher:
         self._ended_at_s: dict[str, float] = {}
         """Time at which this process first saw that the job of a Job has ended, by the name of the Job."""
         self._explained: set[str] | None = None
-        """Names of the Jobs whose ends are logged; None: all that have ended before."""
+        """Names of the Jobs whose ends need not be logged again; None: those of all Jobs that have already ended."""
         self._refused: set[str] = set()
 
     async def keep(self) -> None:

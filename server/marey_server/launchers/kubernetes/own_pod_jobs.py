@@ -13,7 +13,7 @@ from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.kubernetes.states import ended_indexes, is_over
 
 OWN_PODS = "OWN-PODS"
-"""Value of the label for the pool; names of pools have only lower-case letters, so no pool has this name."""
+"""Value of the label for the pool; names of pools have no capital letters, so no pool has this name."""
 JOB_ID_LABEL = "marey-job"
 DISPATCH_ANNOTATION = "marey-dispatch"
 PULL_S = 1800
