@@ -45,8 +45,8 @@ class WorkerPool(BaseModel):
         None,
         ge=SHORTEST_DEADLINE_S,
         le=30 * 86400,
-        description="Seconds after which the engine ends a worker. Choose much more than the longest job takes, because "
-        "a job that is running then starts again. Absent: as the engine decides.",
+        description="Seconds after which the engine ends a worker. Choose much more than the longest job takes, "
+        "because a job that is running then starts again. Absent: as the engine decides.",
     )
     idle_s: float = Field(
         300.0, ge=1, description="Seconds for which a worker must be superfluous before it is stopped."

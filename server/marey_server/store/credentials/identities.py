@@ -68,7 +68,7 @@ def link_identity(tx: Transaction, name: str, issuer: str | None, subject: str) 
 
 
 def find_identity(tx: Transaction, issuer: str, subject: str) -> Row[Any] | None:
-    """Return the row of an identity, or None if nobody has linked it."""
+    """Return the row of an identity, or None if no user is linked with it."""
     return tx.execute(select(identity).where(identity.c.issuer == issuer, identity.c.subject == subject)).first()
 
 

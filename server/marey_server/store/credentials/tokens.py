@@ -286,9 +286,9 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     With `with_created`, also revoke the successors and predecessors of this token, all tokens that were created with
     any of these, and so on.
 
-    Without `with_created`, only this token is revoked, and its links are joined. For example, if A created the revoked
-    token B, and B created C, then C is recorded as created by A. The successor of B is recorded as the successor of B's
-    predecessor. A token may always revoke itself.
+    Without `with_created`, only this token is revoked, and the tokens connected by it are connected directly. For
+    example, if A created the revoked token B, and B created C, then C is recorded as created by A. The successor of B
+    is recorded as the successor of B's predecessor. A token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:
