@@ -80,7 +80,7 @@ class MeasuredCosts(_Table):
 
     date: str
     machine: str
-    load: str = Field(description="How busy the machine was with other programs.")
+    load: str = Field(description="Load of the machine by other programs.")
     job: JobCosts
     clip: ClipCosts
     byte: ByteCosts

@@ -84,7 +84,7 @@ class BrowserResource(ProviderResource):
 
     @property
     def is_https(self) -> bool:
-        """Whether browsers reach the server over https."""
+        """True if browsers reach the server over https."""
         return urlsplit(self.services.settings.public_url or "").scheme == "https"
 
     async def shown(self, method: Callable[[], Coroutine[Any, Any, Reply]]) -> Reply:

@@ -113,7 +113,7 @@ class _Connection(IOStream):
         self.address = address
         self.taken_bytes, self.since_s = 0, 0.0
         self.is_counted = False
-        """Whether the connection is closed for a reason that `Connections` counts itself."""
+        """True if the connection is closed for a reason that `Connections` counts itself."""
         self._forget = forget
         self._requests = 0
         self._reads_head = self._ended_by_client = self._malformed = self._answered = self._sends = False

@@ -246,7 +246,7 @@ class Exchange(RequestHandler):
 
     @property
     def sees_names(self) -> bool:
-        """Whether an error may name objects that the request does not name; see `ApiProblem`."""
+        """True if an error may name objects that the request does not name; see `ApiProblem`."""
         return True
 
     def on_finish(self) -> None:

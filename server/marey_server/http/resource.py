@@ -80,7 +80,7 @@ class Resource(CallingExchange):
 
     tag: ClassVar[str]
     uneventful = False
-    """Whether a success is too frequent to be logged, such as an empty claim or a readiness check."""
+    """True if a success is too frequent to be logged, such as an empty claim or a readiness check."""
 
     media: negotiation.MediaType
     query: BaseModel | None = None
@@ -149,7 +149,7 @@ class Resource(CallingExchange):
 
     @property
     def sees_names(self) -> bool:
-        """Whether an error may name objects that the request does not name; see `ApiProblem`."""
+        """True if an error may name objects that the request does not name; see `ApiProblem`."""
         return not hasattr(self, "caller") or self.caller.sees_names(self.path_kwargs.get("project"))
 
     def _write_problem(self, error: BaseException) -> None:
@@ -165,7 +165,7 @@ class Resource(CallingExchange):
 
     @property
     def awaits_guest(self) -> bool:
-        """Whether the request waits for a body from a caller without a token, who may never send it."""
+        """True if the request waits for a body from a caller without a token, who may never send it."""
         return not self.performing and hasattr(self, "caller") and self.caller.token is None and self.expects_body()
 
     async def _wait_for_refusal(self, error: ApiProblem) -> None:

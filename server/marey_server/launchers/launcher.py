@@ -137,7 +137,7 @@ class Launcher(Protocol):
     """Engine that runs the workers of one pool. All methods raise `EngineError`."""
 
     outlives_server: bool
-    """Whether workers continue when the server ends. If so, only the leader among several servers uses the launcher."""
+    """True if workers continue when the server ends. If so, only the leader among several servers uses the launcher."""
 
     async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
         """Start `count` workers, and return their names, which contain `key`.

@@ -38,7 +38,7 @@ class Compared:
     limit : greatest number of runs
     fields : logged fields to compare; empty: all
     goals : whether the highest or the lowest value is the best, by field
-    curves : whether to return curves: of the given fields, or else of the fields that most runs logged
+    curves : whether to return the curves of the given fields, or else of the fields that most runs logged
     """
 
     sort: str

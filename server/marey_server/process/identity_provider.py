@@ -61,7 +61,7 @@ class Endpoints:
     keys: str
     secret_in_body: bool
     names_issuer: bool
-    """Whether the provider always sends its issuer (parameter `iss`, RFC 9207) when it sends a browser back."""
+    """True if the provider always sends its issuer (parameter `iss`, RFC 9207) when it sends a browser back."""
 
 
 class Remembered(Generic[T]):

@@ -38,7 +38,7 @@ class OperatorMetrics(Observer):
             "A request for metrics shows the numbers that were read for an earlier request.", registry=registry,
         )  # fmt: skip
         self.has_figures = False
-        """Whether numbers were read from the database since the start."""
+        """True if numbers were read from the database since the start."""
         self._feed_read_s = self._figures_read_s = time.monotonic()
         self._next_read_s = 0.0
         self.feed_age.set_function(lambda: time.monotonic() - self._feed_read_s)
@@ -105,7 +105,7 @@ class OperatorMetrics(Observer):
 
     @property
     def is_due(self) -> bool:
-        """Whether the numbers are so old that they may be read again."""
+        """True if the numbers are so old that they may be read again."""
         return time.monotonic() >= self._next_read_s
 
     def rest(self, duration_s: float) -> None:

@@ -80,7 +80,7 @@ class Services:
     """Shared parts of a server process: database, threads, metrics, and whether the server is draining."""
 
     parting = False
-    """Whether the process accepts no more connections; then its answers ask clients to close their connections."""
+    """True if the process accepts no more connections; then its answers ask clients to close their connections."""
     tracer: Tracer | None
     """Sender of the spans of requests; None if no collector is configured."""
 

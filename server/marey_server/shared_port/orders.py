@@ -32,7 +32,7 @@ class StartOrder:
     sockets: tuple[int, ...]
     metrics_sockets: tuple[int, ...]
     first: bool
-    """Whether this is the first process of a server that starts: it prints the greeting and runs the workers."""
+    """True if this is the first process of a server that starts: it prints the greeting and runs the workers."""
 
     def to_line(self) -> bytes:
         """Return the order as one line of JSON."""
