@@ -254,7 +254,7 @@ class Exchange(RequestHandler):
         self.services.in_flight.discard(self)
 
     def on_connection_close(self) -> None:
-        """Note that the client has closed the connection."""
+        """Record that the client has closed the connection."""
         super().on_connection_close()
         self.departure.gone = True
         if not self.performing:  # a method that runs ends by itself, and a draining server waits for it

@@ -158,7 +158,7 @@ class Resource(CallingExchange):
             self.services.end_attempt(error)
 
     def on_finish(self) -> None:
-        """Note the use of the caller's token after the answer was written."""
+        """Record the use of the caller's token after the answer was written."""
         super().on_finish()
         if self.principal is not None and self.caller.token is not None:
             self.services.note_use(self.caller.token, self.principal)

@@ -136,7 +136,7 @@ async def _reap_pages(services: Services) -> None:
 
 
 async def _share_results(services: Services, holder: str) -> None:
-    """Give waiting jobs the results of identical jobs that have succeeded."""
+    """Complete waiting jobs with the results of identical jobs that have succeeded."""
     if await _write(services, _leads, holder):
         while await _write(services, reaper.share_waiting) > 0:
             pass

@@ -100,7 +100,7 @@ class OperatorMetrics(Observer):
         self.disk_free.set_function(lambda: shutil.disk_usage(folder).free if folder.exists() else 0)
 
     def note_feed(self) -> None:
-        """Note that this process has read the feed of events to its end."""
+        """Record the time at which this process has read the feed of events to its end."""
         self._feed_read_s = time.monotonic()
 
     @property
@@ -109,11 +109,11 @@ class OperatorMetrics(Observer):
         return time.monotonic() >= self._next_read_s
 
     def rest(self, duration_s: float) -> None:
-        """Put off the next read of the numbers, after a read that took `duration_s`."""
+        """Postpone the next read of the numbers, after a read that took `duration_s` seconds."""
         self._next_read_s = time.monotonic() + max(REFRESH_S, REST * duration_s)
 
     def show(self, figures: Figures, backing: str) -> None:
-        """Show numbers that were read from the database."""
+        """Set the metrics to numbers that were read from the database."""
         self.has_figures, self._figures_read_s = True, time.monotonic()
         _replace(self.jobs_queued, {key: one.count for key, one in figures.queued.items()})
         _replace(self.oldest_age, {key: one.oldest_age_s for key, one in figures.queued.items()})

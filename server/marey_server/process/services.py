@@ -131,7 +131,7 @@ class Services:
         self._watch()
 
     def _watch(self) -> None:
-        """Show the sizes of queues and pools in the metrics."""
+        """Add the sizes of queues and pools to the metrics."""
         passwords = {"passwords": self.password_lane, "passwords-unknown": self.unknown_lane}
         self.metrics.watch({**self.database.lanes, **self.compute_threads.lanes, **passwords})
         self.database.observer = self.metrics.operator

@@ -86,7 +86,7 @@ class Parent:
         self._failures = 0
         self._announced = False
         self._wanted = asyncio.Event()
-        """Set when the processes must be replaced."""
+        """Event that is set when the processes must be replaced."""
         self.stopping = asyncio.Event()
 
     async def run(self) -> None:

@@ -95,7 +95,7 @@ def use_state(tx: Transaction, state: str, cookie: str) -> tuple[str, int | None
 
 
 def confirm(tx: Transaction, sign_in_id: str, code: str, person: Person, *, creates_users: bool) -> str:
-    """Note that the provider has identified a person, who gets `code`; return the name of the person's user.
+    """Record that the provider has identified a person, who gets `code`; return the name of the person's user.
 
     An unknown person becomes a new user if `creates_users` is true. Raises `ForbiddenProblem` if the person has no
     user or a disabled one, `ConflictProblem` if the name of the new user is taken, and `NotFoundProblem`.
