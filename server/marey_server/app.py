@@ -207,7 +207,7 @@ def accept_connections(app: Application, server: HTTPServer, sockets: Sequence[s
 
 
 async def _part(services: Services, connections: Connections, linger_s: float) -> None:
-    """Accept no more connections; wait until clients have closed theirs, but at most `linger_s` seconds."""
+    """Stop accepting connections; wait until clients have closed all connections, but at most `linger_s` seconds."""
     services.parting = True
     connections.stop()
     deadline = time.monotonic() + linger_s
@@ -311,9 +311,9 @@ def stop_event() -> asyncio.Event:
 
 
 def settle(running: Running, *, greet: bool = True) -> None:
-    """Finish the start of a server that accepts connections: print the greeting, and exempt its objects from searches.
+    """Print the greeting of a server that accepts connections, and exclude its objects from garbage collection.
 
-    A search of all modules for garbage would stop the server for 0.1 s again and again.
+    Otherwise, each full garbage collection would examine the objects of all modules, and stop the server for 0.1 s.
     """
     gc.freeze()
     if greet:

@@ -50,7 +50,7 @@ def serve(**settings: Any) -> None:
 
 
 def _serve_in_processes(given: dict[str, Any]) -> None:
-    """Run several server processes at one port; `given` are the settings that they must not read themselves."""
+    """Run several server processes that share a port; they do not read the settings in `given` themselves."""
     from marey_server.shared_port.parent import serve_in_processes
 
     chosen = read_settings(**given)
@@ -115,7 +115,7 @@ def read_settings(**given: Any) -> Settings:
 
 
 def _setting_at(steps: Sequence[int | str], given: Mapping[str, Any]) -> str:
-    """Return the name of a setting, after the file and the line that set it unless a flag or a variable did."""
+    """Return the name of a setting; if the settings file sets it, the text begins with the file and the line."""
     name, whole = str(steps[0]) if steps else "", ".".join(map(str, steps))
     if given.get(name) is not None or f"{PREFIX}{name}".upper() in map(str.upper, os.environ):
         return whole
@@ -131,7 +131,8 @@ def _setting_at(steps: Sequence[int | str], given: Mapping[str, Any]) -> str:
 def upgrade(*, while_serving: bool = False, finish: bool = False, **settings: Any) -> None:
     """Upgrade the tables to the schema of this version; with `finish`, also remove what only earlier versions used.
 
-    Raises `CommandFailed`; with `while_serving` also if servers of the earlier version could not go on.
+    Raises `CommandFailed` if the upgrade fails; with `while_serving`, also if running servers of the earlier version
+    could not use the upgraded tables.
     """
     from marey_server.process.data_folder import prepare_data_folder
     from marey_server.store.database.schema import upgrade_schema

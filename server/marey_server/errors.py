@@ -14,9 +14,9 @@ from marey_schemas.problems import FieldError
 class ApiProblem(Exception):
     """The request could not be carried out.
 
-    If the error names something that the request does not name, such as the path of another item, `unnamed` is the text
-    for callers who may change the project but not read it. They get it in place of `detail`, also in `errors`, and they
-    get no `context`. If only the context names something, `unnamed` is True.
+    If `detail` names something that the request does not name, such as the path of another item, `unnamed` is the text
+    for callers who may change the project but not read it. These callers get this text in place of `detail`, also in
+    `errors`, and no `context`. If only `context` names such things, `unnamed` is True.
     """
 
     status: ClassVar[int] = 500
@@ -171,7 +171,7 @@ class AuthorLostProblem(LeaseLostProblem):
 
 
 AUTHOR_LOST = "author-lost-access"
-"""Reason why an attempt is stopped, and code of the failure of its job."""
+"""Code of the reason why an attempt is stopped if its author may not run jobs any more; also of the job's failure."""
 
 
 class PreconditionFailedProblem(ApiProblem):
@@ -206,7 +206,7 @@ class TooManyRequestsProblem(ApiProblem):
 
 
 class ClientGoneProblem(ApiProblem):
-    """The client closed the connection before it was answered."""
+    """The client closed the connection before the request was answered."""
 
     status = 499
     code = "client-gone"

@@ -1,4 +1,4 @@
-"""Documents that are checked and encoded, and can be stored: this needs no database.
+"""Documents that are checked, encoded and ready to be stored; preparing them needs no database.
 
 In a prepared document, the JSON contains `{"dtype", "shape", "content"}` in place of an array.
 """

@@ -38,7 +38,7 @@ with loading_modules():
 log = logging.getLogger(PROGRAM)  # `__name__` is `__main__`, since this module is run as a program
 
 LINGER_S = 1.0
-"""Seconds in which a process that will end still answers requests on open connections, so that none is lost."""
+"""Seconds for which a stopping process still answers requests on open connections, so that no request is lost."""
 FEWEST_CONNECTIONS = 16
 FEWEST_THREADS = 2
 FEWEST_CHILDREN = 2
@@ -108,7 +108,7 @@ def share_of(settings: Settings) -> Settings:
 
 
 async def _follow(reader: asyncio.StreamReader, stop: asyncio.Event, keep_workers: asyncio.Event) -> None:
-    """Read what the parent sends; when it has ended, stop."""
+    """Read the messages of the parent process, and stop this process when the parent has ended."""
     while line := await reader.readline():
         if line == KEEP_WORKERS:
             keep_workers.set()

@@ -40,9 +40,10 @@ class FolderRights:
     def role_in(self, path: str, deleted_us: FolderState = None) -> Role:
         """Return the role in the folder `path`; `deleted_us` is the time at which the folder was deleted, or None.
 
-        A folder above a deleted folder may have been deleted later, and a new folder may now have its path. So for a
-        deleted folder, two roles are computed: one from the overrides of folders that were deleted at this time or
-        later, and one from these overrides together with those of existing folders. The lower role is returned.
+        The folders above a deleted folder may have been deleted later, and new folders may have been created at their
+        paths. So for a deleted folder, two roles are computed: one from the overrides of folders that were deleted at
+        this time or later, and one from these overrides together with those of existing folders. The lower role is
+        returned.
         """
         existing = self.overrides.get(None, {})
         if deleted_us is None:
@@ -103,9 +104,10 @@ class FolderRights:
 
 
 def _nearest(path: str, overrides: Sequence[Mapping[str, Role]]) -> Role | None:
-    """Return the lowest role that overrides give in the folder `path`, or None if there are no overrides.
+    """Return the role that overrides give in the folder `path`, or None if there are no overrides.
 
-    If the folder itself has no override, the nearest folder above it with an override counts.
+    If the folder itself has no override, the nearest folder above it with an override counts. If several mappings in
+    `overrides` contain this folder, the lowest of their roles is returned.
     """
     for folder in with_ancestors(path):
         found = [roles[folder] for roles in overrides if folder in roles]

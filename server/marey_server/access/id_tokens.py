@@ -28,13 +28,13 @@ MOST_EXPONENT_DIGITS = 8
 """Greatest number of base64 digits of a public RSA exponent, because a long exponent makes each check slow."""
 _SUBJECT = re.compile(r"[\x20-\x7e]{1,255}")
 _TYPES: dict[str, str] = {"R": "RSA", "P": "RSA", "E": "EC"}
-"""Type of the keys for an algorithm, by the first letter of its name."""
+"""Key type (`kty`) that an algorithm needs, by the first letter of the algorithm's name."""
 _MEMBERS = {"RSA": ("kty", "n", "e"), "EC": ("kty", "crv", "x", "y")}
 """Members of a public key that are used; others, such as the private ones, are left out."""
 
 
 class InvalidIdToken(Exception):
-    """ID token that must not be accepted; the message is a sentence part such as "it has expired"."""
+    """ID token that must not be accepted; the message is a clause, such as "the token has expired"."""
 
 
 class UnknownSigningKey(InvalidIdToken):
@@ -70,9 +70,9 @@ class Expectation:
 
 @dataclass(frozen=True)
 class Person:
-    """Person whom an identity provider has signed in; issuer and subject say who it is.
+    """Person whom an identity provider has signed in; `issuer` and `subject` together identify the person.
 
-    The names are only suggestions for a new user.
+    `name` and `display_name` are only suggestions for a new user.
     """
 
     issuer: str
@@ -85,10 +85,10 @@ def read_keys(document: Mapping[str, Any]) -> tuple[SigningKey, ...]:
     """Return the usable signing keys of a JSON Web Key Set; other keys are left out. Raises `ValueError`."""
     keys = document.get("keys")
     if not isinstance(keys, list) or len(keys) > MOST_KEYS:
-        raise ValueError(f"it has no list `keys` of at most {MOST_KEYS} keys")
+        raise ValueError(f"the member `keys` is not a list of at most {MOST_KEYS} keys")
     found = tuple(key for key in map(_read_key, keys) if key is not None)
     if not found:
-        raise ValueError("it has no key that can check signatures")
+        raise ValueError("no key of the set can check signatures")
     return found
 
 
@@ -124,7 +124,7 @@ def verify(token: str, keys: Sequence[SigningKey], expected: Expectation, now_s:
     reason.
     """
     if len(token) > MOST_TOKEN_BYTES:
-        raise InvalidIdToken(f"it is longer than {MOST_TOKEN_BYTES} bytes")
+        raise InvalidIdToken(f"the token is longer than {MOST_TOKEN_BYTES} bytes")
     # Unknown members of the header are ignored (RFC 7515, section 4), but those that it declares critical are not.
     registry = jws.JWSRegistry(algorithms=ALGORITHMS, strict_check_header=False)
     registry.max_header_length, registry.max_payload_length = MOST_HEADER_BYTES, MOST_TOKEN_BYTES
@@ -132,7 +132,7 @@ def verify(token: str, keys: Sequence[SigningKey], expected: Expectation, now_s:
         key = _key_of(token, keys, registry)
         claims = jwt.decode(token, key, ALGORITHMS, registry).claims
     except (JoseError, ValueError, TypeError, RecursionError) as error:
-        raise InvalidIdToken("its signature is not valid") from error
+        raise InvalidIdToken("the signature is not valid") from error
     _check_claims(claims, expected, now_s)
     return claims
 
@@ -141,17 +141,17 @@ def _key_of(token: str, keys: Sequence[SigningKey], registry: jws.JWSRegistry) -
     """Return the one key that fits the header of a token."""
     header = jws.extract_compact(token.encode("ascii"), registry=registry).headers()
     if not isinstance(header, dict):
-        raise InvalidIdToken("its header is no JSON object")
+        raise InvalidIdToken("the header is not a JSON object")
     algorithm, key_id = header.get("alg"), header.get("kid")
     if algorithm not in ALGORITHMS:
-        raise InvalidIdToken("it is not signed with an accepted algorithm")
+        raise InvalidIdToken("the token is not signed with an accepted algorithm")
     if key_id is not None and not isinstance(key_id, str):
-        raise InvalidIdToken("the id of its key is no text")
+        raise InvalidIdToken("the key id (`kid`) in the header is not a string")
     fitting = [one.key for one in keys if one.fits(algorithm, key_id)]
     if not fitting:
-        raise UnknownSigningKey("it is signed with a key that the provider does not list")
+        raise UnknownSigningKey("the token is signed with a key that the provider does not list")
     if len(fitting) > 1:
-        raise InvalidIdToken("it does not name one of the provider's keys")
+        raise InvalidIdToken("several keys of the provider fit the header, which does not name one of them")
     return fitting[0]
 
 
@@ -168,15 +168,15 @@ def _check_claims(claims: dict[str, Any], expected: Expectation, now_s: int) -> 
     try:
         registry.validate(claims)
     except ExpiredTokenError:
-        raise InvalidIdToken("it has expired; if it is new, the clocks of the machines differ") from None
+        raise InvalidIdToken("the token has expired; if it is new, the clocks of the machines differ") from None
     except MissingClaimError as error:
-        raise InvalidIdToken(f"it has no claim {error.claim}") from None
+        raise InvalidIdToken(f"the token has no claim {error.claim}") from None
     except InvalidClaimError as error:
-        raise InvalidIdToken(f"its claim {error.claim} is not the expected one") from None
+        raise InvalidIdToken(f"the claim {error.claim} does not have the expected value") from None
     if claims.get("nonce") != expected.nonce:
-        raise InvalidIdToken("its claim nonce is not the expected one")
+        raise InvalidIdToken("the claim nonce does not have the expected value")
     audiences = claims["aud"] if isinstance(claims["aud"], list) else [claims["aud"]]
     if ("azp" in claims or len(audiences) > 1) and claims.get("azp") != expected.client_id:
-        raise InvalidIdToken("its claim azp is not the expected one")
+        raise InvalidIdToken("the claim azp does not have the expected value")
     if not _SUBJECT.fullmatch(claims["sub"]):
-        raise InvalidIdToken("its claim sub is not the expected one")
+        raise InvalidIdToken("the claim sub does not consist of 1 to 255 printable ASCII characters")

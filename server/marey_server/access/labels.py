@@ -28,7 +28,7 @@ def labels_key(labels: Mapping[str, str]) -> str:
 
 
 def labels_of(key: str) -> dict[str, str]:
-    """Return the labels of which `labels_key` made the text `key`."""
+    """Return the labels that `labels_key` has encoded as the text `key`."""
     pairs = (pair.partition("=") for pair in key.split(",") if pair)
     return {unquote(name): unquote(value) for name, _, value in pairs}
 
@@ -43,7 +43,10 @@ def keys_within(labels: Mapping[str, str]) -> list[str]:
 
 
 def is_within(key: str, other: str) -> bool:
-    """Return whether the labels of one key are among those of another, so that the same workers satisfy them."""
+    """Return whether all labels in `key` are also in `other`.
+
+    If so, every worker that may run jobs with the labels in `other` may also run jobs with the labels in `key`.
+    """
     return key == "" or set(key.split(",")) <= set(other.split(","))
 
 

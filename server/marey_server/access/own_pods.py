@@ -17,11 +17,12 @@ from marey_server.errors import InvalidProblem
 
 @dataclass(frozen=True)
 class PodRules:
-    """Properties of a job for each of which it gets a pod of its own.
+    """Rules that decide whether a job gets a pod of its own.
 
     Parameters
     ----------
-    memory_mb, expected_s : a job with a greater memory limit in MiB, or a longer expected duration, gets one
+    memory_mb : memory limit in MiB; a job with a greater limit gets a pod of its own
+    expected_s : duration in seconds; a job with a longer expected duration gets a pod of its own
     labels : labels, as name=value, that pods can have; a job with other labels gets no pod of its own
     images : images that scripts may name, see `is_allowed_image`
     """
@@ -42,7 +43,7 @@ def labels_of_job(request: JobCreate, image: str | None, rules: PodRules | None,
 
     Parameters
     ----------
-    request : request at the place `at` of a document
+    request : request to submit the job; `at` is its JSON Pointer in the body, for errors
     image : image that the script of the job names, if any
     rules : None if the server starts no pods for single jobs
 
@@ -87,7 +88,7 @@ def _require_image(image: str, rules: PodRules | None, beyond: list[str], at: st
         raise _invalid(f"{at}/params/script", "no-own-pods", detail)
     require_allowed_image(image, rules, f"{at}/params/script")
     if beyond:
-        detail = f"The script runs in a pod of its own, and no pod has the label {beyond[0]!r}; leave it out."
+        detail = f"The script runs in a pod of its own, and no pod has the label {beyond[0]!r}; remove the label."
         raise _invalid(f"{at}/labels", "no-own-pods", detail)
 
 

@@ -52,4 +52,4 @@ class Principal:
 
 ANONYMOUS = Principal("anonymous")
 SYSTEM = Principal("system", administrator=True, scopes=tuple(scope.value for scope in Scope))
-"""Principal of the server itself: reaper, garbage collection, first start."""
+"""Principal of work that the server does for itself, such as garbage collection or the first start."""

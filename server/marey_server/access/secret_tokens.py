@@ -61,7 +61,7 @@ def derive_participant_token(link_secret: str, key: str, prefix: str) -> IssuedT
     """Derive the token of a participant of a study; the same arguments always give the same token.
 
     `link_secret` is the secret of the link's code, and `key` was made by the participant's browser. So a repeated
-    exchange of the link by the same browser returns the same token, and nobody with the link alone gets it.
+    exchange of the link by the same browser returns the same token, and the link alone is not enough to get the token.
     """
     secret = hmac.digest(link_secret.encode("utf-8", "surrogatepass"), f"participant {key}".encode(), "sha256").hex()
     return IssuedToken(f"{PARTICIPANT_PREFIX}{prefix}_{secret}", prefix, hash_secret(secret))
@@ -113,9 +113,9 @@ def _attempt_token(secret: str) -> IssuedToken:
 
 
 def sealed(token: IssuedToken, seal_key: bytes) -> str:
-    """Return the text of an attempt's token with a seal.
+    """Return the text of an attempt's token with a seal, by which `is_sealed` recognizes tokens of this server.
 
-    The seal is not needed for access, and not part of the secret: a token without a seal belongs to the same attempt.
+    The seal is not part of the secret, and not needed for access: the token without its seal is valid, too.
     """
     return f"{token.text}_{_seal(token.text.removeprefix(_ATTEMPT), seal_key)}"
 

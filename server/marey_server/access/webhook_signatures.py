@@ -21,7 +21,7 @@ _SIGNING_KEY_BYTES = 32
 
 
 def issue_secret() -> str:
-    """Return a new random secret."""
+    """Return a new random secret of a webhook."""
     return KEY_PREFIX + base64.b64encode(secrets.token_bytes(_SIGNING_KEY_BYTES)).decode("ascii")
 
 

@@ -1,1 +1,1 @@
-"""Capacity on paper: measured costs, what a given amount of work needs, and a simulation of the queue of jobs."""
+"""Capacity planning: measured costs, the needs of an amount of work, and a simulation of the queue of jobs."""

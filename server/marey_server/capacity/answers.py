@@ -14,11 +14,11 @@ from marey_server.capacity.simulation import SimulatedJob, simulate
 
 IDLE_STEPS = 20
 JOBS_PER_WORKER = 100
-"""Number of simulated jobs per worker of a prediction, so that start and end hardly count."""
+"""Number of jobs that a prediction simulates per worker: so many that start and end hardly change the result."""
 
 
 class NotComputable(Exception):
-    """Costs or amounts are not valid; the text gives the reason."""
+    """Error of costs or amounts that are not valid; the text gives the reason."""
 
 
 def capacity(*, costs: Path | None = None, **demand: Any) -> dict[str, Any]:
@@ -44,18 +44,20 @@ def capacity(*, costs: Path | None = None, **demand: Any) -> dict[str, Any]:
 
 
 def fit_idle(job: dict[str, float], workers: int, per_s: float, work_s: float, seed: int = 0) -> dict[str, float]:
-    """Return the costs of a job with the share `idle` for which the prediction is nearest to measured jobs per second.
+    """Return the costs of a job with the value of `idle` that fits a measurement of jobs per second best.
 
-    `workers` is the number of workers of this measurement. Raises `NotComputable` if the costs are not valid.
+    `workers` workers completed `per_s` jobs per second in the measurement, and `work_s` is the computation time of a
+    job in seconds. Raises `NotComputable` if the costs are not valid.
     """
     candidates = [job | {"idle": step / IDLE_STEPS} for step in range(IDLE_STEPS)]
     return min(candidates, key=lambda costs: abs(predict(costs, (workers,), work_s, seed)[workers] - per_s))
 
 
 def predict(job: dict[str, float], workers: tuple[int, ...], work_s: float, seed: int = 0) -> dict[int, float]:
-    """Return the jobs per second that a simulation predicts for each number of workers that drain a backlog.
+    """Return the jobs per second that a simulation predicts, by the number of workers that run a backlog of jobs.
 
-    `job` contains the fields of `JobCosts`. Raises `NotComputable` if they are not valid.
+    `job` contains the fields of `JobCosts`; `work_s` is the computation time of a job in seconds. Raises
+    `NotComputable` if the fields are not valid.
     """
     try:
         costs = JobCosts.model_validate(job).in_queue()

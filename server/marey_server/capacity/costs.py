@@ -1,6 +1,6 @@
 """Measured costs per job, clip and byte, with the date and the machine of the measurement.
 
-`measured_costs.toml` in this folder is the only place of these numbers. `marey bench costs` measures those of jobs.
+The numbers are stored only in `measured_costs.toml` in this folder. `marey bench costs` measures the costs of jobs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MEASURED = Path(__file__).with_name("measured_costs.toml")
 
 
 class UnusableCosts(Exception):
-    """A file of costs cannot be read; the text gives the place and the reason."""
+    """Error of a file of costs that cannot be read; the text gives the place and the reason."""
 
 
 class _Table(BaseModel):
@@ -28,25 +28,25 @@ class _Table(BaseModel):
 class JobCosts(_Table):
     """Costs of one job without its computation.
 
-    `claim_s` and `complete_s` are the durations of the two requests of a worker that is alone. `busy_s` is the time per
-    job with so many workers (`crowded`) that the server is always occupied. It is shorter than the two requests of a
-    worker that is alone, because the server commits writes together that arrive at the same time.
+    `claim_s` and `complete_s` are the durations of the two requests of a single worker. `busy_s` is the time per job
+    if `crowded` workers keep the server busy all the time. `busy_s` is shorter than the two requests of a single
+    worker, because the server commits writes that arrive at the same time together.
     """
 
     claim_s: float = Field(gt=0)
     complete_s: float = Field(gt=0)
     busy_s: float = Field(gt=0)
     crowded: int = Field(16, ge=3)
-    idle: float = Field(0.0, ge=0, lt=1, description="Share of a request of a worker alone, without use of the server.")
-    variation: float = Field(0.0, ge=0, le=10, description="Standard deviation of requests, divided by their mean.")
+    idle: float = Field(0.0, ge=0, lt=1, description="Share of a request's duration that does not occupy the server.")
+    variation: float = Field(0.0, ge=0, le=10, description="Standard deviation of request times, divided by the mean.")
     database_s: float = Field(ge=0, description="Processor time of a Postgres database for one job, in seconds.")
     database_bytes: float = Field(ge=0)
 
     def in_queue(self) -> QueueCosts:
-        """Return the costs for a simulation: those of each request, and those of each common commit.
+        """Return the costs for a simulation: the time of each request, and the time of each commit.
 
-        They follow from two equations. Alone, a job takes the times of two requests and two commits. Crowded, half of
-        the workers wait for the next commit while the other half shares one.
+        Both times are the solution of two equations. With a single worker, a job takes two requests and two commits.
+        With `crowded` workers, half of the workers share one commit, while the other half waits for the next commit.
         """
         alone_s = self.claim_s + self.complete_s
         used_s, shared = alone_s * (1 - self.idle), 2 / self.crowded
@@ -80,7 +80,7 @@ class MeasuredCosts(_Table):
 
     date: str
     machine: str
-    load: str = Field(description="How busy the machine was with other programs.")
+    load: str = Field(description="Load of the machine by other programs.")
     job: JobCosts
     clip: ClipCosts
     byte: ByteCosts

@@ -8,14 +8,14 @@ from marey_server.capacity.costs import MeasuredCosts
 from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
 
 HEARTBEAT_SHARE = 0.5
-"""Share of the server's occupied time of a job that a heartbeat takes: one write of the two of a job."""
+"""Server time of a heartbeat, as a share of the server time of a job: a heartbeat is one write, a job needs two."""
 
 
 @dataclass(frozen=True)
 class PlannedWork:
-    """Work and machines: clips to import and process within a number of days, and what is there for it.
+    """Planned work and available machines: clips to import and process within a number of days.
 
-    Each worker runs one job at a time. Servers share one Postgres database.
+    Each worker runs one job at a time. All servers use the same Postgres database.
     """
 
     clips: int = 10_000_000
@@ -34,7 +34,7 @@ class PlannedWork:
 
 @dataclass(frozen=True)
 class InstalledPart:
-    """Part of an installation: seconds of work that it needs, and the seconds that it has; both of one processor."""
+    """Part of an installation, with the processor seconds that the work needs and those that are available."""
 
     name: str
     needed_s: float
@@ -62,9 +62,10 @@ class Needs:
 
 
 def compute_needs(costs: MeasuredCosts, demand: PlannedWork, policy: QueuePolicy = DEFAULT_POLICY) -> Needs:
-    """Compute what `demand` needs. All work is assumed to be spread evenly over the days.
+    """Compute the needs of the work in `demand`, which is assumed to be spread evenly over its days.
 
-    `clips_per_day` is the number at which the first part is saturated; heartbeats are counted for working workers only.
+    `clips_per_day` of the result is the number of clips per day at which the first part is saturated. Heartbeats are
+    counted only while workers run jobs.
     """
     period_s = demand.days * 24 * 3600
     jobs = demand.clips * demand.jobs_per_clip

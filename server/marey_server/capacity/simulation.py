@@ -2,8 +2,8 @@
 
 The order of claims, the lock by concurrency keys, labels, leases, lost attempts, and retries after failures follow
 `marey_server.store.jobs`; durations and limits are those of its `QueuePolicy`. The server is a number of equal stations
-with one waiting line: each request occupies a station for some time, and takes the worker some further time. Time is in
-seconds from the start of the simulation.
+with one waiting line: each request occupies a station for some time, and the worker waits some further time for the
+answer. Time is in seconds from the start of the simulation.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 
 FIRST_HEARTBEAT_S = 1.0
-"""Time after the claim at which a worker sends its first heartbeat, from which an attempt counts."""
+"""Time in seconds from the start of an attempt to its first heartbeat; an attempt lost before does not count."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ FREE = RequestCosts()
 class QueueCosts:
     """Costs of the requests of workers, and the number of stations of the server.
 
-    A station takes all waiting requests together if `batch_s` is not 0: they take `batch_s` once, and the occupied time
-    of each, as writes that are committed together. `variation` is the coefficient of variation (standard deviation over
-    mean) of all times of requests, which have a gamma distribution; 0: they are constant.
+    If `batch_s` is not 0, a station processes all waiting requests together, like writes with a common commit: the
+    batch occupies the station for `batch_s` plus the `busy_s` of each request. The times of requests have a gamma
+    distribution with the coefficient of variation (standard deviation over mean) `variation`; 0: they are constant.
     """
 
     claim: RequestCosts = FREE
@@ -89,7 +89,10 @@ class JobHistory:
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """Result of a simulation: the history of each job, in the order of the jobs, and the server's occupied share."""
+    """Result of a simulation: the history of each job, in the order of the jobs, and its duration in `seconds`.
+
+    `busy_share` is the share of this time in which the server was occupied.
+    """
 
     jobs: list[JobHistory]
     busy_share: float
@@ -159,7 +162,7 @@ class _Simulation:
     # -- the server --
 
     def _request(self, costs: RequestCosts, answered: Callable[[], None]) -> None:
-        """Send a request; `answered` is called when the server has done it, before the answer arrives."""
+        """Send a request; `answered` is called when the server has processed it, before the answer arrives."""
         if not costs.busy_s:
             answered()
             return
@@ -200,7 +203,7 @@ class _Simulation:
         self._wake()
 
     def _wake(self) -> None:
-        """Let as many idle workers ask again as there are queued jobs; only workers that may run one of them."""
+        """Let idle workers that may run a queued job claim again, but at most as many workers as jobs are queued."""
         fit = (
             worker
             for worker in list(self._idle)

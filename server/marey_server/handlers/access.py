@@ -125,7 +125,7 @@ class PasswordResource(Resource):
             raise
 
     async def count_code(self, code: SecretStr, try_of: Callable[[str, str, int], SignInTry]) -> SignInTry:
-        """Count a try to use the code of a link or an invitation, whether or not it is valid, and return the try.
+        """Count a try to use the code of a link or an invitation, even if the code is not valid, and return the try.
 
         `try_of` returns the try for the code, the address of the client, and the number of tries per minute. Raises
         `TooManyRequestsProblem`.
@@ -191,7 +191,7 @@ class TokenQuery(PageQuery):
         description="List only the token with this prefix, which is the text between the two `_` of its secret.",
     )
     ends_within_s: int | None = Field(
-        None, ge=0, le=10 * 365 * 86400, description="List only tokens that expire within this time."
+        None, ge=0, le=10 * 365 * 86400, description="List only tokens that expire within this number of seconds."
     )
 
 

@@ -76,7 +76,7 @@ class ClipAnnotations(Resource):
         in_folders=True,
     )
     async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
-        """Create an annotation of a clip from a document of Marey's predecessor, or from the file of one.
+        """Create an annotation of a clip from a document or a file in the format of Marey's predecessor.
 
         The path parameter `kind` must be `clips`. The annotation is created in the clip's folder.
         """

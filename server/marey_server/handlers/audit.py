@@ -24,8 +24,8 @@ class AuditQuery(PageQuery):
     subject: str | None = Field(
         None, min_length=1, max_length=1024, description="Name or id of the user or of the object that was changed."
     )
-    since: AwareDatetime | None = Field(None, description="Earliest time, with a UTC offset such as Z.")
-    until: AwareDatetime | None = Field(None, description="Time before which entries were made, with a UTC offset.")
+    since: AwareDatetime | None = Field(None, description="List entries from this time on, with an offset such as Z.")
+    until: AwareDatetime | None = Field(None, description="List entries before this time, with an offset such as Z.")
 
     @property
     def filter(self) -> AuditFilter:

@@ -71,8 +71,8 @@ class Blob(BlobSender):
     async def get(self, digest: str) -> Rendered | None:
         """Return the bytes of a blob, or a range of them.
 
-        The answer to a request for a large blob may be 307 with an address at the object storage, where the same
-        headers are valid, but no token must be sent.
+        The answer to a request for a large blob may be 307 with an address at the object storage. Send the same headers
+        to this address, but not the token.
         """
         return await self.send_blob(require_digest(digest), may_redirect=True)
 

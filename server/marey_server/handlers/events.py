@@ -20,7 +20,7 @@ from marey_server.store.wakeups import Listener, events_topic, wakeups
 
 KEEP_ALIVE_S = 15.0
 LOOK_AGAIN_EVERY = 4
-"""Number of keep-alive comments after which the feed is read even without a notification, because one may be lost."""
+"""Number of keep-alive comments after which the feed is read without a notification, in case one was lost."""
 
 
 class EventsQuery(Request):

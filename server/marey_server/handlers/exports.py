@@ -47,19 +47,19 @@ class ExportQuery(MotionFileOptions, ConsentOverride):
     )
     part: ExportPart | None = Field(
         None,
-        description="Part to export. For models: `tree`. In the predecessor's format also, for aligned clips: "
-        "`alignment`, which contains the source frame at each canonical frame, and the sections; for skeletons: "
-        "`skeleton_model`, which contains the joint mapping and the axes. Absent: the model, clip or skeleton itself.",
+        description="Part to export: `tree` of a model. In the predecessor's format, also `alignment` of an aligned "
+        "clip (the source frame at each canonical frame, and the sections), and `skeleton_model` of a skeleton (the "
+        "joint mapping and the axes). Absent: the model, clip or skeleton itself.",
     )
     layout: ExportLayout | None = Field(
         None,
-        description="In the predecessor's format, for models: version of the layout, 2 or 3; for skeletons: `database` "
-        "or `file`. Absent: the imported file, if the item was not changed since; otherwise the layout that contains "
-        "the model's time function exactly, or 3; for skeletons `database`.",
+        description="Layout of a file in the predecessor's format: 2 or 3 for models, `database` or `file` for "
+        "skeletons. Absent: the imported file, if the item was not changed since; otherwise, for skeletons `database`, "
+        "and for models the layout that contains the time function exactly, or else 3.",
     )
     time: ExportTime = Field(
         "canonical",
-        description="For aligned clips: canonical time, or the time and place of the source clip.",
+        description="For aligned clips: `canonical` time, or the time and position of the `source` clip.",
     )
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to export; absent: the newest.")
 

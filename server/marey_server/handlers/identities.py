@@ -1,7 +1,7 @@
 """Resources of the sign-in with an identity provider: for programs, for browsers, and for administrators.
 
 A program begins a sign-in and redeems its code; the browser opens two addresses in between. The browser gets pages,
-also for errors. It is only ever sent to the identity provider of the settings, or to a port of its own machine.
+also for errors. The server redirects it only to the identity provider in the settings, or to a port of its own machine.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class BrowserResource(ProviderResource):
 
     @property
     def is_https(self) -> bool:
-        """Whether browsers reach the server over https."""
+        """True if browsers reach the server over https."""
         return urlsplit(self.services.settings.public_url or "").scheme == "https"
 
     async def shown(self, method: Callable[[], Coroutine[Any, Any, Reply]]) -> Reply:
@@ -101,7 +101,7 @@ class BrowserResource(ProviderResource):
 
     @property
     def page_headers(self) -> dict[str, str]:
-        """The headers of a page, which contains no scripts and must not be kept."""
+        """The headers of a page: browsers run no scripts in the page, and do not store it."""
         policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'"
         return {**WITH_SECRET, "Content-Security-Policy": policy}
 
@@ -174,13 +174,13 @@ class OpenedSignIn(BrowserResource):
 
 
 class CallbackQuery(Request):
-    """Query parameters with which an identity provider sends a browser back; it may send others."""
+    """Query parameters with which an identity provider sends a browser back; other parameters are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
     state: str = Field("", max_length=200, description="The state that the server sent to the provider.")
     code: str = Field("", max_length=8192, description="Authorization code, if the person has signed in.")
-    iss: str | None = Field(None, max_length=512, description="Address of the provider, if it names itself.")
+    iss: str | None = Field(None, max_length=512, description="Address of the provider, if the provider sends it.")
     error: str = Field("", max_length=200, description="Code of the error, if the person has not signed in.")
 
 
@@ -289,7 +289,7 @@ class UserIdentity(Resource):
 
     @writes(access=Access.ADMINISTRATOR, scope="admin")
     async def delete(self, user: str, identity: str) -> Rendered:
-        """End the link of a person at an identity provider with a user; all sign-ins of the user end, too."""
+        """Unlink a person at an identity provider from a user; all sessions of the user end, too."""
         return await self.answer(identities.unlink_identity, user, identity)
 
 

@@ -40,10 +40,10 @@ class ItemsQuery(CountedPageQuery):
     skeleton: str | None = Field(None, max_length=64, description="Return clips that use this skeleton.")
     clip: str | None = Field(None, max_length=64, description="Return annotations of this clip.")
     frames_gte: int | None = Field(
-        None, alias="frames.gte", ge=0, le=MAX_INTEGER, description="Least number of frames."
+        None, alias="frames.gte", ge=0, le=MAX_INTEGER, description="Return items with at least this number of frames."
     )
     frames_lte: int | None = Field(
-        None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="Greatest number of frames."
+        None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="Return items with at most this number of frames."
     )
     q: str | None = Field(
         None, max_length=255, description="Return items whose name contains this text, in upper or lower case."
@@ -142,10 +142,10 @@ class SkeletonMerges(Resource):
         access=Access.MAINTAINER, body=SkeletonMergeRequest, answer=SkeletonMergeAnswer, idempotency="key", names=True
     )
     async def post(self, project: str, body: SkeletonMergeRequest) -> Rendered:
-        """Merge skeletons of one rig that differ only in ways that mean nothing, or preview the merge.
+        """Merge duplicate skeletons of each rig into one skeleton, or preview the merge.
 
-        Clips, aligned clips and models of a merged skeleton get a revision that uses the kept one and has the same
-        motion; the merged skeletons are deleted. Results computed from the clips do not become stale.
+        Each clip, aligned clip or model with a merged skeleton gets a revision with the remaining skeleton and the same
+        motion. The merged skeletons are deleted. Results computed from the clips do not become stale.
         """
         if body.dry_run:
             return await self.render_document(Reply(await self.look_up(items.merge_skeletons, project, body)))
@@ -297,9 +297,10 @@ class StaleItems(Resource):
 
     @reads(access=Access.READER, query=StalenessQuery, answer=Staleness, paged=True)
     async def get(self, project: str, kind: str, query: StalenessQuery) -> Rendered:
-        """List the items of which an input has a newer revision, with these inputs.
+        """List the items that have an input with a newer revision, and these inputs.
 
-        A page examines as many items as `limit` says, so it may contain fewer, or none; `next_cursor` leads on.
+        For each page, `limit` items are examined. So a page may list fewer items, or none, although `next_cursor`
+        leads to another page.
         """
         filters = ItemFilters(collection=query.collection)
         return await self.answer(

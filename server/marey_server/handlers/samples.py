@@ -48,7 +48,7 @@ class ModelUser(Resource):
     """Base of resources that let a model generate motion."""
 
     async def packed_model(self, project: str, found: FoundSearchable) -> bytes:
-        """Return the documents of a model as bytes for a child process; the most recently used ones are cached."""
+        """Return the documents of a model as bytes for a child process; recently used documents are cached."""
         known = self.services.models.get(found.key)
         if known is None:
             loaded = await self.look_up(searching.load_searchable, project, found)

@@ -1,4 +1,4 @@
-"""Resumable uploads: how they are created, receive pieces, show their state, and are stored as blobs.
+"""Resources of resumable uploads: they create an upload, receive its pieces, show its state, and store it as a blob.
 
 Long bodies of other requests are also stored piece by piece. Otherwise, one transaction for all bytes of a body would
 delay the writes of other requests.

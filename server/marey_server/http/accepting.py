@@ -103,7 +103,7 @@ def default_connections() -> int:
 class _Connection(IOStream):
     """Connection that counts the bytes received by its client since the last call of `start_count`.
 
-    It also knows for which fault of its client it is closed.
+    The connection also records the fault of the client for which it is closed.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class _Connection(IOStream):
         self.address = address
         self.taken_bytes, self.since_s = 0, 0.0
         self.is_counted = False
-        """Whether the connection is closed for a reason that `Connections` counts itself."""
+        """True if the connection is closed for a reason that `Connections` counts itself."""
         self._forget = forget
         self._requests = 0
         self._reads_head = self._ended_by_client = self._malformed = self._answered = self._sends = False

@@ -3,7 +3,7 @@
 A cookie contains the token of a session, which has only the scope `read` in its project. Other sites can neither send
 the cookie (`SameSite=Strict`) nor read answers (`Cross-Origin-Resource-Policy`, and no CORS). Pages cannot read it
 (`HttpOnly`). It is accepted only for declared GET operations of its project, so a forged request could change nothing.
-The one exception ends the session, and is refused to other sites.
+The only other request with the cookie ends the session; it is refused if another site has sent it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _OVER_HTTPS = "__Host-"
 _SITE = "Sec-Fetch-Site"
 """Header in which browsers state who has caused a request; they omit it without https, and pages cannot set it."""
 _OWN_SITES = ("same-origin", "none")
-"""Values of this header for requests that other sites have not caused."""
+"""Values of the header `Sec-Fetch-Site` in requests that other sites have not caused."""
 
 
 def cookie_name(project: str, *, https: bool) -> str:
@@ -48,7 +48,7 @@ def sent_cookies(request: HTTPServerRequest, project: str) -> dict[str, str]:
 def require_own_page(request: HTTPServerRequest) -> None:
     """Raise `ForbiddenProblem` if a page of another site has sent the request.
 
-    Programs, which send neither of the two headers, may send it.
+    Requests of programs, which have neither `Sec-Fetch-Site` nor `Origin`, are allowed.
     """
     site, origin = request.headers.get(_SITE), request.headers.get("Origin")
     by_origin = site is None and origin is not None  # a proxy may have changed Host, so the other header goes first

@@ -25,7 +25,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _TOKEN_ENDED = (UnauthenticatedProblem, LeaseLostProblem)
-"""Errors of requests whose token may be no longer valid."""
+"""Errors which show that the token of a request is perhaps not valid any more."""
 CLIENT_GONE = "The client closed the connection before the answer was computed."
 
 

@@ -60,14 +60,17 @@ class Caller:
         return not self.operation.shows_project or self._reads(project)
 
     def sees_names(self, project: str | None) -> bool:
-        """Return whether a refusal may name what the caller has not named: only if the caller may read the project."""
+        """Return whether an error may name objects that the request does not name, as in `ApiProblem`.
+
+        A caller who may change the project, but not read it, must not learn the names of its content.
+        """
         changes_project = self.operation.access.role is not None and self.operation.scope != "read"
         return not changes_project or self._reads(project)
 
     def _reads(self, project: str | None) -> bool:
         """Return whether the caller has the scope `read` in a project.
 
-        Without a project in the address, the caller needs it in every project in which the operation is possible.
+        Without a project in the address, the caller needs the scope in all projects in which the operation is possible.
         """
         held = self.principal.scopes if self.principal is not None else ()
         if project is not None:
@@ -103,7 +106,7 @@ def admission_of(caller: Caller, target: BodyTarget) -> Admission:
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
-    """Refuse callers who may not perform the operation on any object.
+    """Refuse callers who may never perform the operation, regardless of its object.
 
     Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
     """
@@ -156,7 +159,7 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
 
 
 def _require_participation(access: Access, principal: Principal) -> None:
-    """Refuse a participant of a study everything but taking part, and all others who want to take part."""
+    """Refuse operations for participants to all other callers, and all other operations to participants of studies."""
     if access is Access.ANYONE:
         return
     if access is not Access.PARTICIPANT:

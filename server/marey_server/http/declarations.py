@@ -106,15 +106,15 @@ class Operation:
     stream: bool
     reserved: bool
     attempts: bool
-    """Whether running attempts of jobs may use the operation, in addition to the callers that `access` admits."""
+    """True if running attempts of jobs may use the operation, in addition to the callers that `access` admits."""
     replays: bool
-    """Whether an attempt of a job may repeat the request after the attempt has ended."""
+    """True if an attempt of a job may repeat the request after the attempt has ended."""
     in_folders: bool = False
-    """Whether members who have the declared role only in some folders may use the operation in these folders."""
+    """True if members who have the declared role only in some folders may use the operation in these folders."""
     names: bool = False
-    """Whether a change answers with names of the project's content, such as those of conflicts of a merge."""
+    """True if a change answers with names of the project's content, such as those of conflicts of a merge."""
     for_browsers: bool = False
-    """Whether people open the address in a browser, so that errors are pages, too."""
+    """True if people open the address in a browser, so that errors are pages, too."""
 
     @property
     def required_role(self) -> RequiredRole:
@@ -126,7 +126,7 @@ class Operation:
 
     @property
     def stores(self) -> bool:
-        """Whether the operation stores a request body, which may need much disk space.
+        """True if the operation stores a request body, which may need much disk space.
 
         False for `reserved` operations.
         """
@@ -135,13 +135,13 @@ class Operation:
 
     @property
     def shows_project(self) -> bool:
-        """Whether the operation changes a project and shows its content, so that callers need the scope `read`, too."""
+        """True if the operation changes a project and shows its content, so that callers need the scope `read`, too."""
         shows = self.etag or self.names
         return self.scope in ("write", "jobs") and self.access.role is not None and shows and self.answer is not None
 
     @property
     def may_create(self) -> bool:
-        """Whether the operation accepts `If-None-Match: *`."""
+        """True if the operation accepts `If-None-Match: *`."""
         return self.precondition in ("create", "optional")
 
 
@@ -157,7 +157,7 @@ _WHO = {
 
 
 def conditions_of(operation: Operation) -> str:
-    """Return sentences that say who may use an operation, and what repeated requests and pages do."""
+    """Return sentences about who may use an operation, the effect of repeated requests, and the pages of lists."""
     role = operation.access.role
     who = _WHO[operation.access] if role is None else f"Needs at least the role {role.value} in the project"
     if operation.in_folders:

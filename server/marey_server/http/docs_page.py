@@ -1,7 +1,7 @@
 """Documentation page of the API: the OpenAPI document as one HTML page without external resources.
 
-A script adds forms that send requests with a token, which only the page's memory keeps. Without the script, the page
-can be read, too.
+A script adds forms that send requests with a token; the token is kept only in the memory of the page. The page can be
+read without the script, too.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _operation(path: str, method: str, operation: Schema, shared: list[Schema]) 
 
 
 def _with_code(text: str) -> str:
-    """Return a text as HTML, with what is between backquotes as code."""
+    """Return a text as HTML; text between backquotes becomes code."""
     return re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text)))
 
 

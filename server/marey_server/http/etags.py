@@ -2,9 +2,8 @@
 
 A tag is `"<state>.<form>"`: the state of a resource, and the form (media type) in which it was sent. If the resource
 can be changed, the state begins with the `rev` of the resource. If the resource is described by a model, a dot and a
-digest of the answer follow, because the answer can change without a new `rev`. For example, the caller gets another
-role, a job publishes facets, or a folder above an item is moved. Or a deleted branch is created again with the same
-name.
+digest of the answer follow, because the answer can change without a new `rev`. Examples: the caller gets another role,
+a job publishes facets, a folder above an item is moved, or a deleted branch is created again with the same name.
 
 Preconditions of writes compare only the `rev`. So a resource that was read as MessagePack can be changed with JSON, and
 a client that knows only the `rev` can send it. If-Match also accepts a tag of a deleted resource if the new resource of
@@ -28,10 +27,10 @@ _REV = re.compile("[0-9]{1,9}")
 
 @dataclass(frozen=True, slots=True)
 class Precondition:
-    """Precondition of a write: the resource is in one of some states, in any state (`*`), or does not exist."""
+    """Precondition of a write: the resource is in one of the given states, in any state (`*`), or does not exist."""
 
     expected_rev: ExpectedRev = None
-    """The `rev` that the UPDATE requires, or None."""
+    """The `rev` that the UPDATE requires, or a set of revs of which it requires one; None for any state."""
     absent: bool = False
 
 

@@ -22,7 +22,7 @@ _TEXTS = (
     "0123456789abcdef0123456789abcdef", "worker-1", "5 4 * * *", "UTC", "1:30",
     "marey/document@1", '"7.json"', "v1.0", "job.failed", "https://example.org/hook", "python walk.py", "*", "a" * 43,
 )  # fmt: skip
-"""Texts of which an example is the first that the pattern and the length of a member allow."""
+"""Texts for members without a name in `_BY_NAME`: the example is the first text with an allowed form and length."""
 _BY_NAME = {
     "project": "lab", "user": "ada", "name": "walk", "kind": "clips", "part": "motion", "item": "clip_01k8example",
     "job": "job_01k8example", "skeleton": "skeleton_01k8example", "clip": "clip_01k8example", "collection": "raw",
@@ -34,7 +34,7 @@ _BY_NAME = {
     "item_name": "walk",
     "fields": "id,name", "sort": "name", "q": "walk", "schedule": "nightly", "script": "train", "figure": "speeds",
 }  # fmt: skip
-"""Texts for members and parameters, by name."""
+"""Example texts for members and parameters, by name."""
 _DOCUMENTS = {
     "hierarchy": {"schema": "marey/skeleton@1", "joints": [{"name": "Hips", "parent": -1, "offset": [0, 0.9, 0]}]}
 }

@@ -123,7 +123,7 @@ class Exchange(RequestHandler):
         return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     def drop(self) -> None:
-        """Discard the part of a refused request's body that was received.
+        """Discard the received part of the body of a refused request.
 
         Closes the connection if the body is too long.
         """
@@ -246,7 +246,7 @@ class Exchange(RequestHandler):
 
     @property
     def sees_names(self) -> bool:
-        """Whether the answer may name what the caller has not named; see `ApiProblem`."""
+        """True if an error may name objects that the request does not name; see `ApiProblem`."""
         return True
 
     def on_finish(self) -> None:
@@ -254,7 +254,7 @@ class Exchange(RequestHandler):
         self.services.in_flight.discard(self)
 
     def on_connection_close(self) -> None:
-        """Note that the client has closed the connection."""
+        """Record that the client has closed the connection."""
         super().on_connection_close()
         self.departure.gone = True
         if not self.performing:  # a method that runs ends by itself, and a draining server waits for it
@@ -285,7 +285,7 @@ def problem_code(error: BaseException) -> str:
 def render_problem(error: BaseException, request_id: str, *, names: bool = True) -> Rendered:
     """Return the problem document of an error; for internal errors, it contains only the request id.
 
-    Without `names`, it names nothing that the request does not name.
+    If `names` is false, the document names only objects that the request names.
     """
     if isinstance(error, ApiProblem):
         problem = _of_refusal(error, request_id, names=names)

@@ -147,7 +147,7 @@ def require_plain_encoding(content_encoding: str | None) -> None:
 
 
 def bearer_token(authorization: str | None) -> str | None:
-    """Return the token of an Authorization header, or None without one.
+    """Return the token of an Authorization header, or None without a header.
 
     Raises `UnauthenticatedProblem` if the header is malformed.
     """

@@ -131,7 +131,10 @@ def _operation(route: Route, models: ApiModels) -> Schema:
 
 
 def _add_examples(paths: dict[str, Schema], components: dict[str, Schema]) -> None:
-    """Give each parameter, each body and each answer in JSON an example, and each operation a command that sends it."""
+    """Add an example to each parameter, and each body and answer in JSON; add a command to each operation.
+
+    The command of an operation sends its example.
+    """
     for path, entry in paths.items():
         shared = entry["parameters"]
         for method, operation in entry.items():

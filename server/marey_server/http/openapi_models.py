@@ -113,10 +113,10 @@ def without_null(schema: Schema) -> Schema:
 
 
 def _describe_default(schema: Schema) -> None:
-    """Write the default of a member into its description.
+    """Move the default of a member from the schema into the description of the member.
 
-    Generated clients send a default that they know, and an absent member can mean more than its default. The default of
-    a constant remains: it names the kind of a document, which clients must send.
+    Otherwise, generated clients would send the default, although an absent member can mean more than its default. A
+    constant keeps its default: it names the kind of a document, which clients must send.
     """
     if "const" in schema or "default" not in schema:
         return
@@ -143,7 +143,7 @@ def _name_inner_objects(model: str, schema: Schema, components: dict[str, Schema
 
 
 def _inner_schemas(schema: Schema) -> Iterator[Schema]:
-    """Yield a schema and the schemas in it, but not those to which it refers."""
+    """Yield a schema and all schemas inside it; schemas that are only referenced (`$ref`) are left out."""
     yield schema
     below = [*schema.get("properties", {}).values(), *schema.get("prefixItems", ())]
     below += [one for key in ("anyOf", "oneOf", "allOf") for one in schema.get(key, ())]

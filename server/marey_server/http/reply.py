@@ -85,7 +85,7 @@ class Rendered:
     def without_content(self) -> Rendered:
         """Return this answer without its body, for a caller who may make the change, but may not read its result.
 
-        The ETag contains no digest of the body, because the caller could check guesses of the content with it.
+        The ETag contains no digest of the body. With a digest, the caller could check guesses of the content.
         """
         headers = {name: value for name, value in self.headers.items() if name != "Content-Type"}
         if "ETag" in headers:

@@ -80,7 +80,7 @@ class Resource(CallingExchange):
 
     tag: ClassVar[str]
     uneventful = False
-    """Whether a success is too frequent to be logged, such as an empty claim or a readiness check."""
+    """True if a success is too frequent to be logged, such as an empty claim or a readiness check."""
 
     media: negotiation.MediaType
     query: BaseModel | None = None
@@ -149,7 +149,7 @@ class Resource(CallingExchange):
 
     @property
     def sees_names(self) -> bool:
-        """Whether the answer may name what the caller has not named; see `ApiProblem`."""
+        """True if an error may name objects that the request does not name; see `ApiProblem`."""
         return not hasattr(self, "caller") or self.caller.sees_names(self.path_kwargs.get("project"))
 
     def _write_problem(self, error: BaseException) -> None:
@@ -158,20 +158,20 @@ class Resource(CallingExchange):
             self.services.end_attempt(error)
 
     def on_finish(self) -> None:
-        """Note the use of the caller's token after the answer was written."""
+        """Record the use of the caller's token after the answer was written."""
         super().on_finish()
         if self.principal is not None and self.caller.token is not None:
             self.services.note_use(self.caller.token, self.principal)
 
     @property
     def awaits_guest(self) -> bool:
-        """Whether the request waits for a body from a caller without a token, who may never send it."""
+        """True if the request waits for a body from a caller without a token, who may never send it."""
         return not self.performing and hasattr(self, "caller") and self.caller.token is None and self.expects_body()
 
     async def _wait_for_refusal(self, error: ApiProblem) -> None:
         """Delay the answer to a refused request if the event loop is late and this client was refused several times.
 
-        A busy server is no fault of the client, so its refusals (status 503) do not count.
+        Refusals of a busy server (status 503) do not count, because the client has not caused them.
         """
         if error.status >= 500:
             return
@@ -278,7 +278,7 @@ class Resource(CallingExchange):
             self.services.admitted.put(admission, now)
 
     def _declared(self) -> Operation | None:
-        """Return the declaration of the method, or None without one; HEAD is declared as GET."""
+        """Return the declaration of the request's method, or None for an undeclared method; HEAD counts as GET."""
         method = "GET" if self.request.method == "HEAD" else self.request.method
         return self.operations.get(method or "")
 

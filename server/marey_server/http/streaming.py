@@ -25,7 +25,7 @@ PIECE_BYTES = MIB
 SIGNED_FOR_S = 60
 """Seconds for which anybody who has a signed URL can read the blob; a download that has begun may take longer."""
 _REDIRECTED = {"Cache-Control": NOT_STORED, "Vary": "*"}
-"""Headers of an answer that refers a client, which may read the blob, to object storage."""
+"""Headers of an answer that redirects an authorized client to object storage."""
 HELD_BYTES = 2 * PIECE_BYTES
 """Memory that a long blob needs while it is sent: one piece is being sent, and the next one is being read."""
 
@@ -95,7 +95,7 @@ def _open_blob(
 ) -> _Opened:
     """Find the requested range of a blob, and read its first piece unless only the headers are requested.
 
-    The piece is not read either if the blob has at least `redirect_bytes` and is in object storage.
+    No piece is read if the blob is in object storage and has at least `redirect_bytes` bytes.
     """
     size = blobs.require_readable(tx, digest)
     start, stop = wanted.within(size) if wanted is not None else (0, size)

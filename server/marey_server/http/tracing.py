@@ -1,8 +1,8 @@
-"""Spans of a request. They are kept until its end, because only then it is known whether its caller is trusted.
+"""Spans of a request, kept until the request ends, because its caller may be identified only then.
 
-A header `traceparent` is input from a stranger. Which callers may continue a trace, and so decide that their requests
-are recorded, is a setting. Other callers with a valid token begin traces of their own, of which a share is recorded.
-Requests without a valid token are recorded only if the setting says so, because anybody can send any number of them.
+The header `traceparent` is untrusted input. A setting lists the callers who may continue a trace, and so decide that
+their requests are recorded. Other callers with a valid token begin new traces, of which a share is recorded. Requests
+without a valid token are recorded only if the setting allows it, because anybody can send any number of them.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class RequestTrace:
         return self._place
 
     def job_parent(self, principal: Principal) -> str | None:
-        """Return the place to which the jobs of this request belong, as a header; None if it is not recorded."""
+        """Return a `traceparent` header for the jobs of this request; None if the request is not recorded."""
         place = self.place(principal)
         return place.header if place.sampled else None
 
@@ -74,7 +74,7 @@ class RequestTrace:
         return Span(declaration, declaration.name, self._span_id, attributes=attributes)
 
     def end(self, span: Span, error: BaseException | None) -> None:
-        """End a span, and keep it unless the request has too many."""
+        """End a span, and keep it unless the request has `MOST_SPANS` spans already."""
         span.ended_ns = time.time_ns()
         if error is not None:
             span.fail(error.error_code if isinstance(error, ApiProblem) else type(error).__name__)
@@ -88,8 +88,8 @@ class RequestTrace:
     ) -> None:
         """Send the spans of the request, which has ended, if they are recorded.
 
-        An uneventful request, such as a readiness check or a claim without jobs, is recorded only if its caller has
-        asked for it.
+        An uneventful request, such as a readiness check or a claim without jobs, is recorded only if it continues a
+        trace of its caller.
         """
         place = self.place(principal)
         if not place.sampled or (uneventful and self._remote is None):
@@ -126,7 +126,7 @@ class TracedTransaction(Generic[T]):
         return self._run(tx)
 
     def recorded(self, future: Future[T]) -> Future[T]:
-        """Return `future`, at whose end the span ends."""
+        """End the span when `future` is done; return `future`."""
         future.add_done_callback(self._end)
         return future
 

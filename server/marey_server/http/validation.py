@@ -75,7 +75,7 @@ def decode_body(
     keep_blocks: bool = False,
     take_bytes: Callable[[int], None] | None = None,
 ) -> Any:
-    """Return the tree in a body; the other arguments are those of `codecs.decode_tree`.
+    """Return the tree in a body; the keyword arguments are passed to `codecs.decode_tree`.
 
     Raises `BadRequestProblem` if the body cannot be decoded, and `InvalidProblem` if the tree contains values that are
     not allowed.

@@ -25,7 +25,7 @@ ENTRY_POINTS = "marey.launchers"
 """Group of entry points in which packages register their launchers."""
 
 HEALTHY_AFTER_S = 30.0
-"""Run time in seconds after which a worker counts as healthy, so that its end is no reason for a long pause."""
+"""Run time in seconds after which a worker counts as healthy; only earlier ends delay the next start."""
 
 WorkerState = Literal["starting", "running", "ended"]
 
@@ -34,9 +34,12 @@ EndReason = Literal[
 ]  # fmt: skip
 """Reason why a worker ended.
 
-finished: it ended by itself with status 0; stopped: the launcher was asked to stop it; failed: it ended by itself with
-another status, or its machine failed; killed: by a signal that the launcher did not ask for; out-of-memory, deadline,
-preempted: ended by the engine; unknown: the engine no longer knows.
+- finished: the worker ended by itself with status 0
+- stopped: the launcher has stopped it
+- failed: it ended by itself with another status, or its machine failed
+- killed: a signal ended it that the launcher had not requested
+- out-of-memory, deadline, preempted: the engine ended it
+- unknown: the engine has forgotten the reason
 """
 
 
@@ -96,10 +99,10 @@ def read_options(model: type[Options], given: Mapping[str, Any], launcher: str) 
 
 @dataclass(frozen=True)
 class WorkerRequest:
-    """Properties of workers that are to be started; None: the engine's default.
+    """Properties of workers to start; a property that is None has the engine's default.
 
-    A worker is ended by the engine after `deadline_s` seconds. `kinds` are the kinds of jobs that it claims; empty: all
-    kinds. `slots` is the number of jobs that it runs at the same time.
+    The engine ends a worker after `deadline_s` seconds. `kinds` are the kinds of jobs that the worker claims; empty:
+    all kinds. `slots` is the number of jobs that the worker runs at the same time.
     """
 
     labels: Mapping[str, str] = field(default_factory=dict)
@@ -113,7 +116,7 @@ class WorkerRequest:
 
 @dataclass(frozen=True)
 class LaunchedWorker:
-    """Worker that the engine knows; `started_at` is None until it runs. The worker claims jobs with the same name."""
+    """Worker that the engine knows; `started_at` is None until it runs. The worker claims jobs under this name."""
 
     name: str
     state: WorkerState
@@ -134,7 +137,7 @@ class Launcher(Protocol):
     """Engine that runs the workers of one pool. All methods raise `EngineError`."""
 
     outlives_server: bool
-    """Whether workers continue when the server ends. If so, only the leader among several servers uses the launcher."""
+    """True if workers continue when the server ends. If so, only the leader among several servers uses the launcher."""
 
     async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
         """Start `count` workers, and return their names, which contain `key`.
@@ -150,7 +153,7 @@ class Launcher(Protocol):
         ...
 
     async def stop(self, names: tuple[str, ...]) -> None:
-        """Let the workers return their jobs to the queue and end; workers that have not started are never started.
+        """Let the workers return their jobs to the queue and end; cancel workers that have not started.
 
         Names of ended or unknown workers are ignored. This method does not wait until the workers have ended.
         """
@@ -161,7 +164,7 @@ class Launcher(Protocol):
         ...
 
     async def close(self) -> None:
-        """Release what the launcher holds in this process; workers that do not outlive the server are stopped."""
+        """Release the resources of the launcher; stop its workers unless they outlive the server."""
         ...
 
 
@@ -170,7 +173,7 @@ MakeLauncher = Callable[[LaunchContext], Launcher]
 
 
 def worker_arguments(request: WorkerRequest, url: str) -> tuple[str, ...]:
-    """Return the arguments of a Python interpreter that runs a worker; name and credential are missing."""
+    """Return the arguments of a Python interpreter that runs a worker, without the name and token of the worker."""
     kinds = (f"--kind={kind}" for kind in request.kinds)
     labels = (f"--label={name}={value}" for name, value in sorted(request.labels.items()))
     return ("-m", "marey_worker", "--server", url, "--slots", str(request.slots), *kinds, *labels)

@@ -74,7 +74,7 @@ class LocalLauncher:
                 worker.stop()
 
     async def why_ended(self, name: str) -> WorkerEnd | None:
-        """Return why a worker ended before its last restart, or when it was stopped."""
+        """Return why a worker ended most recently, before a restart or when it was stopped."""
         worker = self._workers.get(name)
         return None if worker is None else worker.end
 
@@ -126,7 +126,7 @@ class _LocalWorker:
         self._stopping.set()
 
     async def _run(self) -> str:
-        """Run the worker once; return in words how it ended."""
+        """Run the worker once; return a text that says how it ended."""
         try:
             process = await self._start()
         except OSError as error:

@@ -23,14 +23,14 @@ from marey_server.store.monitoring.demand import Demand, JobReach, read_demand
 log = logging.getLogger(__name__)
 
 ROUND_S = 10.0
-"""Seconds between two rounds."""
+"""Seconds between two adjustments of the number of workers."""
 MOST_EXPLAINED = 10
-"""Greatest number of ends in a round for which the engine is asked for the reason."""
+"""Greatest number of ended workers per round for which the engine is asked for the reason."""
 VISIBLE_AFTER_S = 60.0
-"""Seconds after a start for which a worker counts although the engine does not list it yet."""
+"""Seconds after its start for which a worker counts as present although the engine does not list it."""
 START_PAUSES = Backoff(first_s=5.0, longest_s=600.0, jitter=0.25)
 QUIET_ENDS = ("finished", "stopped", "deadline", "preempted")
-"""Reasons of ends that are logged as information, and that do not pause the next start."""
+"""Reasons for ends of workers that are logged as information, and that do not delay the next start."""
 
 
 def _reach(pool: WorkerPool) -> JobReach:
@@ -38,7 +38,13 @@ def _reach(pool: WorkerPool) -> JobReach:
 
 
 class PoolKeeper:
-    """Keeper of one pool, beside the other pools of the server. `clock_s` is a monotonic clock in seconds."""
+    """Task that keeps the number of workers of one pool between its limits.
+
+    Parameters
+    ----------
+    other_pools : the other pools of the server, which may run the same jobs
+    clock_s : monotonic clock in seconds
+    """
 
     def __init__(
         self,
@@ -68,11 +74,11 @@ class PoolKeeper:
         self._start_after_s = 0.0
 
     async def keep(self) -> None:
-        """Adjust the number of workers again and again, until the task is cancelled."""
+        """Adjust the number of workers every `ROUND_S` seconds, until the task is cancelled."""
         await repeat(f"pool {self._pool.name}", self.adjust, ROUND_S)
 
     async def close(self) -> None:
-        """Release the launcher, and let another server keep the pool."""
+        """Close the launcher, and let another server become the leader for this pool."""
         try:
             await self._launcher.close()
             if self._launcher.outlives_server:
@@ -122,7 +128,7 @@ class PoolKeeper:
         log.info("pool %s: started %d workers: %s", pool.name, len(names), ", ".join(names))
 
     def _present(self, listed: tuple[LaunchedWorker, ...]) -> list[str]:
-        """Return the names of the workers that run or will run: those first that have not started yet."""
+        """Return the names of the workers that run or will run, beginning with those that have not started yet."""
         now_s = self._clock_s()
         known = {worker.name for worker in listed}
         self._started = {

@@ -33,12 +33,12 @@ class PoolLimits:
 
 
 class PoolSize:
-    """Decision on the number of workers, from the numbers of the last minutes."""
+    """Decision on the number of workers, from the numbers of jobs in the last minutes."""
 
     def __init__(self, limits: PoolLimits) -> None:
         self._limits = limits
         self._samples: deque[tuple[float, int]] = deque(maxlen=SAMPLES_REMEMBERED)
-        """Times, and the number of workers that the queue needed at each time."""
+        """Samples: a time, and the number of workers that the queue needed at this time."""
         self._since_s: float | None = None
 
     def decide(self, now_s: float, *, queued: int, running: int, present: int) -> int:
@@ -47,7 +47,8 @@ class PoolSize:
         Parameters
         ----------
         now_s : time of a monotonic clock, in seconds
-        queued, running : number of jobs that wait for workers of the pool, and of those that its workers run
+        queued : number of jobs that wait for workers of the pool
+        running : number of jobs that workers of the pool run
         present : number of workers that run or were started
         """
         limits = self._limits
@@ -70,7 +71,7 @@ class PoolSize:
         self._since_s = None
 
     def _recent(self, now_s: float, seconds: float) -> list[int]:
-        """Return the numbers of the last `seconds`; empty if samples do not cover this time."""
+        """Return the needed numbers of workers in the last `seconds`; empty if the samples do not cover this time."""
         if self._since_s is None or now_s - self._since_s < seconds:
             return []
         return [needed for at_s, needed in self._samples if at_s >= now_s - seconds]

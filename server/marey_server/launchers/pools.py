@@ -33,17 +33,17 @@ BUILT_IN = {
 }
 """Launchers of this package, which are imported only if the settings name them."""
 DISPATCHER = "marey_server.launchers.kubernetes.dispatcher:Dispatcher"
-"""Class that starts pods of a job's own; the client of Kubernetes is imported only if the settings need it."""
+"""Class that starts a pod for each job that needs one; imported only if the settings need it."""
 FIXED_POOL, FIXED_KEY = "local", "fixed"
-"""Parts of the names of the workers in `local_workers`."""
+"""Parts of the names of the workers that the setting `local_workers` starts."""
 
 
 @asynccontextmanager
 async def keeping_workers(services: Services, address: str) -> AsyncIterator[None]:
     """Run the workers of a server that listens on `address` while the `async with` block runs.
 
-    Then the workers on this machine are stopped; workers of other engines continue, and the next server finds them.
-    Raises `LauncherUnusable`.
+    At the end of the block, the workers on this machine are stopped. Workers of other engines continue, and the next
+    server finds them. Raises `LauncherUnusable`.
     """
     settings = services.settings
     keepers: list[Keeper] = [
@@ -82,11 +82,11 @@ class Keeper(Protocol):
     """Task of the server that starts and stops workers."""
 
     async def keep(self) -> None:
-        """Adjust the workers again and again, until the task is cancelled."""
+        """Adjust the workers at regular intervals, until the task is cancelled."""
         ...
 
     async def close(self) -> None:
-        """Release what the keeper holds."""
+        """Close the connections of the task, and let another server become the leader."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Task of a server that adjusts workers again and again, by the leader among several servers.
+"""Task that adjusts workers at regular intervals; of several servers, only the leader runs it.
 
 An error of the engine, or of the database, never stops the server: it is logged, and the task tries again later.
 """
@@ -23,7 +23,7 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 ENGINE_S = 60.0
-"""Greatest number of seconds that a call of an engine may take."""
+"""Greatest number of seconds that a call of a method of an engine may take."""
 LEAD_TTL_US = 60_000_000
 FAULT_PAUSES = Backoff(first_s=10.0, longest_s=300.0, jitter=0.25)
 
@@ -56,7 +56,7 @@ async def ask(call: Awaitable[T]) -> T:
 
 
 class ServerLead:
-    """Lead among the servers that share a database, in the form of a lease with a name."""
+    """Leadership among the servers that share a database: a named lease, which one process holds."""
 
     def __init__(self, database: Database, name: str) -> None:
         self._database = database
@@ -64,12 +64,12 @@ class ServerLead:
         self._holder = secrets.token_hex(8)
 
     async def take(self) -> bool:
-        """Take or renew the lead; return whether this process has it."""
+        """Become or remain the leader if possible; return whether this process is the leader."""
         lease = (self._name, self._holder, LEAD_TTL_US)
         taken = self._database.submit_write(SYSTEM, leader.take_lead, *lease)
         return await asyncio.wrap_future(taken) is not None
 
     async def give_up(self) -> None:
-        """Let another server take the lead."""
+        """Stop being the leader, so that another server can become the leader."""
         given = self._database.submit_write(SYSTEM, leader.give_up_lead, self._name, self._holder)
         await asyncio.wrap_future(given)

@@ -58,7 +58,7 @@ FIELDS = ("ArrayJobID", "ArrayTaskID", "Name", "State", "exit_code", "Reason", "
 STARTING = frozenset({"PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_FED", "REQUEUE_HOLD", "SPECIAL_EXIT"})
 RUNNING = frozenset({"RUNNING", "COMPLETING", "SIGNALING", "STAGE_OUT", "STOPPED", "SUSPENDED", "RESIZING"})
 STOPPED_STATUS = (INTERRUPTED_STATUS, -signal.SIGTERM)
-"""Exit statuses of a worker that was asked to stop while it ran a job, or before it could handle the signal."""
+"""Exit statuses of a worker that was stopped while it ran a job, or before it could handle the signal."""
 END_REASONS: Mapping[str, EndReason] = {
     "COMPLETED": "finished",
     "CANCELLED": "stopped",
@@ -71,7 +71,7 @@ END_REASONS: Mapping[str, EndReason] = {
     "NODE_FAIL": "failed",
     "BOOT_FAIL": "failed",
 }
-"""Reasons by the states of Slurm; states that are missing here and above are unknown."""
+"""Reasons why workers ended, by the states of Slurm; other final states have the reason `unknown`."""
 
 
 class SlurmOptions(BaseModel):
@@ -130,7 +130,7 @@ class SlurmLauncher:
         """Times at which running workers were asked to stop, by name."""
 
     async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
-        """Submit an array job, unless Slurm knows one of this name. Names of workers are those of the tasks."""
+        """Submit an array job, unless Slurm has a job with this name. Each worker is a task of the array job."""
         job_name = f"{self._context.pool}-{key}"
         names = tuple(f"{job_name}-{number}" for number in range(1, count + 1))
         if not await self._tasks(f"--name={job_name}"):
@@ -206,7 +206,7 @@ class SlurmLauncher:
 
     @property
     def _job_names(self) -> str:
-        """The pattern of the names of this pool's jobs, and of no other pool's."""
+        """Regular expression that matches only the names of this pool's jobs."""
         return rf"{re.escape(self._context.pool)}-[a-z0-9]+"
 
     def _prepare_logs(self) -> None:
@@ -300,7 +300,10 @@ def _end_of(task: _Task) -> WorkerEnd:
 
 
 def _status_of(exit_code: str) -> int | None:
-    """Return the exit status, or a negative signal: `squeue` shows the status of `wait`, `sacct` status and signal."""
+    """Return the exit status of a task, or the negative number of the signal that ended it; None if it is unknown.
+
+    `squeue` shows the status as `wait` returns it, `sacct` shows exit status and signal, as in `0:15`.
+    """
     status, _, number = exit_code.partition(":")
     if not status.isdecimal() or not (number or "0").isdecimal():
         return None

@@ -60,7 +60,7 @@ def _is_usable(database: Database, token: str, labels: Mapping[str, str]) -> boo
 
 
 def _replace_token(tx: Transaction, name: str, labels: Mapping[str, str], file: Path | None = None) -> str:
-    """Create a token, and revoke those with the same name.
+    """Create a token, and revoke earlier tokens with the same name.
 
     `file` is written before the transaction commits, so that no valid token is lost if the process dies in between.
     """

@@ -97,7 +97,7 @@ def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCrea
 
 
 def created(clip: AnnotatedClip, given: AnnotationImport, parts: dict[str, PreparedDocument]) -> ItemCreate:
-    """Return the request that creates an imported annotation in the folder of its clip."""
+    """Return the request that creates an imported annotation with these parts in the folder of its clip."""
     return ItemCreate(
         name=given.name or f"{clip.item.name} {given.layer}"[:MAX_NAME_LENGTH],
         collection=clip.item.collection,
@@ -165,7 +165,7 @@ def read_annotation(order: bytes) -> bytes:
 def _imported(
     document: Mapping[str, Any], name: str, clip: str, revision: int, frame_count: int, given: AnnotationImport
 ) -> dict[str, Any]:
-    """Return the part `annotation` that a document of the predecessor becomes."""
+    """Convert a document of the predecessor to the part `annotation` of an item. Raises `InvalidProblem`."""
     with LOADING:
         from marey_motion import documents
         from marey_motion.errors import MotionError
@@ -184,7 +184,7 @@ def _imported(
 
 
 def _not_an_annotation(error: MotionError, pointer: str) -> InvalidProblem:
-    """Return the refusal; the place has the same text, so that programs for people show it once."""
+    """Return the error for a document that is not a valid annotation; its field error has the same text."""
     with LOADING:
         from marey_motion.formats.texts import cut_text
 

@@ -48,7 +48,7 @@ CACHED_BODIES = 32
 BEGIN_COVERAGE = "marey_server.motions.coverage:begin_coverage"
 LOOK_AT_COVERAGE = "marey_server.motions.coverage:look_at_coverage"
 ADVANCE_COVERAGE = "marey_server.motions.coverage:advance_coverage"
-"""Function that child processes run, like the functions above."""
+"""Function that child processes run; so are `BEGIN_COVERAGE` and `LOOK_AT_COVERAGE`."""
 
 
 @dataclass(frozen=True, slots=True)

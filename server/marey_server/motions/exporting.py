@@ -128,7 +128,7 @@ def find_original(
     *,
     permitted: bool,
 ) -> OriginalFile:
-    """Return the file that an item was imported from; what is not a clip must be unchanged since.
+    """Return the file that an item was imported from. Items other than clips must be unchanged since the import.
 
     Raises `NotFoundProblem` if the item was not imported from a file, or was changed since. Raises `ConflictProblem` if
     the consent for the clip has ended, unless the caller has `permitted` the export.

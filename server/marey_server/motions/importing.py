@@ -35,11 +35,11 @@ REFUSED_ALTOGETHER = (401, 403, 404, 499, 503, 507)
 """HTTP status codes of errors that concern the whole request and not a single file."""
 
 MAIN_KINDS = (Kind.CLIP, Kind.PROCESSED, Kind.MODEL, Kind.GRAPH, Kind.SKELETON, Kind.RECORD)
-"""Kinds of items of which a file contains at least one."""
+"""Kinds of items that can be imported; each file contains an item of at least one of these kinds."""
 
 READ_FILE = "marey_server.motions.reading:read_file"
 FIND_MAPPING = "marey_server.motions.reading:find_mapping"
-"""Function that child processes run, like the functions above."""
+"""Function that child processes run; so is `READ_FILE`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +61,8 @@ class SourceFile:
 class PreparedImport:
     """File of an import after it was read, ready to be stored.
 
-    If there is nothing to store, `entry` is the answer's entry for the file. `axis` is what the file shows about its
-    upward axis.
+    If there is nothing to store, `entry` is the answer's entry for the file. `axis` is the upward axis that was
+    recognised in the file, and how clearly.
     """
 
     name: str
@@ -97,9 +97,9 @@ def plan(names: Sequence[str]) -> tuple[list[PlannedFile], list[int]]:
 
 
 def planned_entry(planned: PlannedFile) -> PreparedImport | None:
-    """Return the answer's entry for a file that is not read by itself; None for a file to be read.
+    """Return the answer's entry for a file that is not read by itself, or None if the file is to be read.
 
-    Such a file is the companion of another file, and read together with it, or its name is refused.
+    A file is not read by itself if it is read together with the file that it accompanies, or if its name is refused.
     """
     with LOADING:
         from marey_motion.importing.files import planned_entry
@@ -115,7 +115,7 @@ def file_order(
     skeleton: GivenSkeleton | None,
     sibling_axis: UpAxis | None,
 ) -> bytes:
-    """Return the packed message that asks a child process to read a file, with the files that are read with it.
+    """Return the packed message that asks a child process to read a file together with the files that accompany it.
 
     `sources` are the files that `PlannedFile.together` names. `sibling_axis` is the upward axis that other files with
     the same skeleton show.
@@ -142,7 +142,7 @@ def file_order(
 
 
 def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> PreparedImport:
-    """Return what a child process read from a file, ready to be stored."""
+    """Return the content that a child process has read from a file, ready to be stored."""
     with LOADING:
         from marey_server.motions.reading import ReadFile
 
@@ -171,7 +171,7 @@ class PutAside:
         self._findings: list[AxisFinding] = []
 
     def take(self, place: int, file: PreparedImport) -> bool:
-        """Note what a file shows; return whether the file, at this place in the import, has to wait."""
+        """Record the upward axis found in a file; return whether the file, at this place in the import, must wait."""
         if file.axis is None:
             return False
         self._findings.append(file.axis)
@@ -181,7 +181,10 @@ class PutAside:
         return True
 
     def files(self) -> Iterator[tuple[int, PreparedImport, UpAxis | None]]:
-        """Yield place and content of each file, and the axis with which it must be read again; None for none."""
+        """Yield each file with its place in the import, and the upward axis with which to read the file again.
+
+        The axis is None if the file need not be read again.
+        """
         with LOADING:
             from marey_motion.importing.siblings import axes_of_skeletons, axis_of_siblings
 

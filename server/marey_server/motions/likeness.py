@@ -62,12 +62,15 @@ def may_compare_motion(query: str | None) -> bool:
 
 
 def nothing_alike(query: str) -> dict[str, frozenset[str]]:
-    """Return no clips for each condition `like(...)` of a query. Raises `BadRequestProblem` as `read_query`."""
+    """Return an empty set of clips for each condition `like(...)` of a query.
+
+    Raises `BadRequestProblem` for a query that cannot be read.
+    """
     return {one.source: frozenset() for one in likenesses_of(read_query(query))}
 
 
 def read_likenesses(tx: Transaction, project: str, query: str) -> tuple[FoundLikeness, ...]:
-    """Read the examples and metrics of all conditions `like(...)` of a query, one for each text.
+    """Read the examples and metrics of all different conditions `like(...)` of a query.
 
     Raises `BadRequestProblem` for a query that cannot be read, or if an example or a metric does not exist.
     """
@@ -128,7 +131,11 @@ def clips_of(project: str, condition: Likeness, found: AlikeClips) -> frozenset[
 
 
 def search_clips(packed: bytes) -> bytes:
-    """Carry out a `LikenessOrder` and return packed `AlikeClips`. Raises as `similar.opened`."""
+    """Carry out a `LikenessOrder` and return packed `AlikeClips`.
+
+    Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if files of the index are missing
+    or damaged.
+    """
     from marey_motion.similarity import searching
 
     order = LikenessOrder.unpack(packed)

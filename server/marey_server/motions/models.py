@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # numeric modules are loaded by children alone
 
 DRAW_SAMPLES = "marey_server.motions.models:draw_samples"
 WRITE_SAMPLES = "marey_server.motions.models:write_samples"
-"""Function that child processes run, like the functions above."""
+"""Function that child processes run; so is `DRAW_SAMPLES`."""
 MODEL_CACHE_BYTES = 32 * MIB
 """Greatest size of a child's cache of parsed models; models with search trees have a cache of the same size."""
 LARGEST_ANSWER_BYTES = 32 * MIB

@@ -51,9 +51,9 @@ ExportLayout = Literal["2", "3", "database", "file"]
 class PredecessorOptions:
     """Options of the file formats of Marey's predecessor.
 
-    `end_index` and `form` apply to annotations, `layout` to models and skeletons. If none of them is given, what is
-    unchanged since its import is exported as its imported file. Models are otherwise written in the layout that
-    contains their time function exactly, or else in layout 3. `part` selects the part of the item to export: for a
+    `end_index` and `form` apply to annotations, `layout` to models and skeletons. If none of them is given, an item
+    that is unchanged since its import is exported as the imported file. Any other model is written in the layout that
+    contains its time function exactly, or else in layout 3. `part` selects the part of the item to export: for a
     model, its tree; for an aligned clip, its alignment; for a skeleton, its skeleton model. By default, the model, the
     motion of the clip or the skeleton is exported.
     """
@@ -147,8 +147,8 @@ def _written(
     if kind is Kind.RECORD:
         blob = parts["record"]["original"]["blob"]
         raise InvalidProblem(
-            "The fields of this record were changed, so it is no longer the imported file. That file is its first "
-            f"revision, and the blob {blob}.",
+            "The fields of this record were changed, so it is no longer the imported file. Export its first revision, "
+            f"or download the blob {blob}.",
             code="cannot-be-exported",
         )
     if kind is Kind.SKELETON:

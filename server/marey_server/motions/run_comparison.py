@@ -30,15 +30,15 @@ MOST_NAMED = 20
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """Runs, fields and goals of a wanted comparison.
+    """Runs, fields and goals of a requested comparison.
 
     Parameters
     ----------
-    sort : order of the runs, as in their list
+    sort : order of the runs, as in the list of runs; if it names a logged field, it also gives the goal of the field
     limit : greatest number of runs
     fields : logged fields to compare; empty: all
-    goals : which value is the best, by field; the order gives the goal of the field by which it sorts
-    curves : whether to return curves: of the given fields, otherwise of those that most runs logged
+    goals : whether the highest or the lowest value is the best, by field
+    curves : whether to return the curves of the given fields, or else of the fields that most runs logged
     """
 
     sort: str
@@ -97,7 +97,7 @@ def compare_read(
 
 
 def _goals(wanted: Compared) -> dict[str, Goal]:
-    """Return the goal of each field that has one; an ascending order by a field means that its lowest value is best."""
+    """Return the goals by field; in an ascending order by a field, the lowest value of this field is the best."""
     falls, field = wanted.sort.startswith("-"), wanted.sort.removeprefix("-")
     goals: dict[str, Goal] = {}
     if field.startswith("fields.") and (not wanted.fields or field.removeprefix("fields.") in wanted.fields):
@@ -115,7 +115,7 @@ def _drawn(
 
 
 def _counted(found: Sequence[RunToCompare]) -> set[str]:
-    """Return the jobs that count: of the runs with one setting and one seed, the newest."""
+    """Return the ids of the jobs from which means are computed: for each setting and seed, the newest run."""
     newest: dict[tuple[str, int], RunToCompare] = {}
     for run in found:
         known = newest.setdefault((run.setting, run.seed), run)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 ANSWER_SEARCH = "marey_server.motions.search_answers:answer_search"
 WRITE_SEARCH = "marey_server.motions.search_answers:write_search"
-"""Function that child processes run, like the functions above."""
+"""Function that child processes run; so is `ANSWER_SEARCH`."""
 FAR_CM = 5.0
 """Error in cm, before inverse kinematics, above which a position constraint counts as out of the model's reach."""
 

@@ -39,13 +39,16 @@ SEARCH_INDEX = "marey_server.motions.similar:search_index"
 """Function that child processes run."""
 THREADS = 2
 CONTEXT_READ_S = 1.5
-"""Seconds around the example that are read, too; its features depend on one second of them."""
+"""Seconds that are read before and after the example; the nearest second influences the features of the example."""
 _CLIPS_CACHE_BYTES = 64 * MIB
 
 
 @dataclass(frozen=True, slots=True)
 class FoundExample:
-    """Example, with some context, and the skeleton of its clip; `first` is the example's first frame in `motion`."""
+    """Example of a search: its frames with some context in `motion`, and the skeleton of the clip.
+
+    `first` is the index in `motion` of the first frame of the example.
+    """
 
     clip: str
     revision: int
@@ -91,7 +94,7 @@ class FoundWindow(Message):
 
 
 class FoundWindows(Message):
-    """Result of a search: windows, the number of clips searched, and of changed clips that were not searched."""
+    """Result of a search: windows, and the numbers of searched clips, and of changed clips that were not searched."""
 
     windows: tuple[FoundWindow, ...]
     searched_clips: int
@@ -206,7 +209,10 @@ class OpenedSearch:
     metric: PerceptualMetric
 
     def behind(self, heads: dict[str, int]) -> int:
-        """Count the clips that were created or changed since the index was updated, and that it does not have."""
+        """Count the clips that were created or changed since the index was updated; the index lacks their revisions.
+
+        `heads` maps the id of a clip to the number of its newest revision.
+        """
         known = {place for clips in self.lists for place in zip(clips.items, clips.revisions, strict=True)}
         return sum(head > 0 and (clip, head) not in known for clip, head in heads.items())
 
@@ -256,7 +262,7 @@ def _search(order: SimilarOrder, search: OpenedSearch) -> FoundWindows:
 
 
 def _clips_of(files: ShardFiles) -> ShardClips:
-    """Read the list of clips of a shard, which anybody may have written. Raises `NotFoundProblem` if it is no list."""
+    """Read the list of clips of a shard, which may come from any user. Raises `NotFoundProblem` if it is invalid."""
     path = files.clips
     try:
         clips = _CLIPS.get_or_make(path, lambda: ShardClips.model_validate_json(Path(path).read_bytes()))
@@ -309,7 +315,7 @@ def _example(order: SimilarOrder) -> tuple[Example, float]:
 def _searched(
     order: SimilarOrder, files: ShardFiles, clips: ShardClips, ranks: Any, rate_hz: float, example: Example
 ) -> SearchedShard:
-    """Return a shard with what of it is searched: no dropped clips, and none that changed since the index was made."""
+    """Return a shard to search, without its dropped clips and the clips that changed since the index was updated."""
     import numpy as np
 
     from marey_motion.similarity.shard_search import SearchedShard

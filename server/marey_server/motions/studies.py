@@ -16,8 +16,8 @@ from marey_server.store.studies.judgements import CollectedAnswers
 def draw_plans(planned: PlannedDraw, count: int) -> list[Plan]:
     """Return the motions of each trial for the next `count` participants.
 
-    The same study draws the same trials for its first, second and further participants, however many links are created
-    at once.
+    The trials of a participant depend only on the study and on the participant's number in it, not on the number of
+    links that are created at once.
     """
     design = planned.design
     earlier = np.array(planned.earlier, np.int64) if planned.earlier else None
@@ -27,7 +27,7 @@ def draw_plans(planned: PlannedDraw, count: int) -> list[Plan]:
 
 
 def find_differences(collected: CollectedAnswers) -> StudyDifferences:
-    """Return the differences of the motions that the answers show, and the order of the motions."""
+    """Compute from the answers of a study how different its motions look, and the order of the motions."""
     count = collected.motion_count
     if not collected.answers:
         none = ((0,) * count,) * count

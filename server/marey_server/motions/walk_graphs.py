@@ -104,7 +104,7 @@ def write_walk_graph(source: WalkSource, trial: str | None, form: WalkGraphForma
 
 
 def _require_rows(clips: Sequence[DatabaseClip], records: Iterable[TrialRecord]) -> None:
-    """Raise `ValueError` if there are gaps between the rows of clips, or if a trial displayed a row of no clip.
+    """Raise `ValueError` if there are gaps between the rows of clips, or if a trial displayed a row that no clip has.
 
     A row is a frame in the database of all clips.
     """

@@ -110,7 +110,7 @@ class ChildTask(Generic[T]):
             _after(ABANDONED_S, self.stop, "client-gone")
 
     def succeed(self, payload: bytes) -> None:
-        """End the task with what `read` returns for the bytes `payload`, or with the error that `read` raises."""
+        """End the task with the result of `read` for the bytes `payload`, or with the error that `read` raises."""
         try:
             result = self.read(payload)
         except Exception as error:  # noqa: BLE001 - whoever waits for the task gets it

@@ -1,4 +1,4 @@
-"""Wakes waiting requests of this process after new events in the feed, which lists the changes by all processes.
+"""Task that wakes waiting requests of this process after new events in the feed, the list of changes by all processes.
 
 One task per process reads the feed after each commit and after each notification of Postgres. It also reads the feed
 periodically, in case a notification was lost. So even many waiting requests cause no work while nothing changes.
@@ -25,7 +25,7 @@ from marey_server.store.wakeups import COMMITTED_EVENTS, NUMBERED_EVENTS, wakeup
 T = TypeVar("T")
 
 LOOK_EVERY_S = 2.0
-"""Interval in seconds at which the feed is read even without a notification, because one may be lost."""
+"""Interval in seconds at which the feed is read without a notification, in case one was lost."""
 
 PAUSE_S = 0.05
 """Least time in seconds between two reads of the feed; under load, one read covers many commits."""

@@ -136,7 +136,7 @@ async def _reap_pages(services: Services) -> None:
 
 
 async def _share_results(services: Services, holder: str) -> None:
-    """Give waiting jobs the results of identical jobs that have succeeded."""
+    """Complete waiting jobs with the results of identical jobs that have succeeded."""
     if await _write(services, _leads, holder):
         while await _write(services, reaper.share_waiting) > 0:
             pass
@@ -177,7 +177,7 @@ async def _collect_garbage(services: Services, holder: str) -> None:
 
 
 async def _move_uploads(services: Services, holder: str, damaged: set[str]) -> None:
-    """Move finished uploads from the database to object storage, if the settings say so.
+    """Move finished uploads from the database to object storage, if object storage is used for blobs.
 
     The digests of uploads that cannot be moved are added to `damaged`, so that they are not tried again.
     """

@@ -54,18 +54,18 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Addresses from the discovery document of a provider, and how the server shows its secret there."""
+    """Addresses from the discovery document of a provider, and how the server sends its client secret to it."""
 
     authorization: str
     token: str
     keys: str
     secret_in_body: bool
     names_issuer: bool
-    """Whether the provider always names itself when it sends a browser back (RFC 9207)."""
+    """True if the provider always sends its issuer (parameter `iss`, RFC 9207) when it sends a browser back."""
 
 
 class Remembered(Generic[T]):
-    """Document of the provider that is read when it is needed and then kept; concurrent requests read it once."""
+    """Cached document of the provider, read when it is first needed; concurrent requests cause a single read."""
 
     def __init__(self, load: Callable[[], Awaitable[T]]) -> None:
         self._load = load
@@ -207,7 +207,7 @@ class IdentityProvider:
             _fail("key set", str(error))
 
     async def _redeem(self, endpoints: Endpoints, code: str, verifier: str) -> str:
-        """Return the ID token for an authorization code, which is still to be checked."""
+        """Return the ID token for an authorization code; the caller must check the token."""
         form = {
             "grant_type": "authorization_code",
             "code": code,

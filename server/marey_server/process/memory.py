@@ -13,7 +13,7 @@ CLIENT_SHARE = 0.75
 UNKNOWN_SHARE = 0.25
 """Largest fraction of the memory that all clients without a known token together may hold."""
 UNKNOWN_SHARE_EACH = UNKNOWN_SHARE / 2
-"""Largest fraction of the memory that one of these clients, who is known by its address only, may hold."""
+"""Largest fraction of the memory that one client without a known token, identified by its address, may hold."""
 RESERVED_SHARE = 0.125
 """Additional memory for reserved operations, such as heartbeats, as a fraction of the memory for other requests."""
 UNKNOWN_CLIENTS = "unknown-clients"

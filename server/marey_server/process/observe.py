@@ -41,7 +41,7 @@ _MALFORMED = (
     "header line cannot start with whitespace",
     "no colon in header line",
 )
-"""Beginnings of Tornado's messages about malformed requests; the rest of a message may quote what was received."""
+"""Beginnings of Tornado's messages about malformed requests; the rest of a message may quote received text."""
 
 disable_created_metrics()  # times of the first count, which would double the text
 
@@ -62,7 +62,7 @@ def configure_logging(form: LogForm, level: str) -> None:
 
 
 def without_received_text(record: logging.LogRecord) -> bool:
-    """Remove what the client sent from Tornado's message about a malformed request; return True.
+    """Remove received text from Tornado's message about a malformed request; return True, to keep the log record.
 
     Only the kind of the fault is kept and logged. The rest is removed, because it may quote a header that contains a
     token.

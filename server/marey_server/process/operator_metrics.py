@@ -1,8 +1,8 @@
 """Metrics about the queue, workers and stored data, for operators.
 
-Counters count what this process did. Numbers from the database are the same in every process that shares it. A request
-to /metrics starts a read of these numbers, but not before at least `REFRESH_S` have passed, and 20 times the duration
-of the last read. The request does not wait for this read: it shows the numbers of the last one, with their age.
+Counters count events in this process. Numbers from the database are the same in all processes that share the database.
+A request to /metrics starts a new read of these numbers if at least `REFRESH_S` seconds, and 20 times the duration of
+the last read, have passed since that read. The request does not wait: it shows the last numbers, with their age.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class OperatorMetrics(Observer):
             "A request for metrics shows the numbers that were read for an earlier request.", registry=registry,
         )  # fmt: skip
         self.has_figures = False
-        """Whether numbers were read from the database since the start."""
+        """True if numbers were read from the database since the start."""
         self._feed_read_s = self._figures_read_s = time.monotonic()
         self._next_read_s = 0.0
         self.feed_age.set_function(lambda: time.monotonic() - self._feed_read_s)
@@ -95,25 +95,25 @@ class OperatorMetrics(Observer):
         )  # fmt: skip
 
     def watch_disk(self, folder: Path, floor_bytes: int) -> None:
-        """Show the free space of the disk that holds `folder`, and the least free space."""
+        """Show the free space of the disk that holds `folder`, and the free space below which nothing is stored."""
         self.disk_floor.set(floor_bytes)
         self.disk_free.set_function(lambda: shutil.disk_usage(folder).free if folder.exists() else 0)
 
     def note_feed(self) -> None:
-        """Note that this process has read the feed of events to its end."""
+        """Record the time at which this process has read the feed of events to its end."""
         self._feed_read_s = time.monotonic()
 
     @property
     def is_due(self) -> bool:
-        """Whether the numbers are so old that they may be read again."""
+        """True if the numbers are so old that they may be read again."""
         return time.monotonic() >= self._next_read_s
 
     def rest(self, duration_s: float) -> None:
-        """Put off the next read of the numbers, after a read that took `duration_s`."""
+        """Postpone the next read of the numbers, after a read that took `duration_s` seconds."""
         self._next_read_s = time.monotonic() + max(REFRESH_S, REST * duration_s)
 
     def show(self, figures: Figures, backing: str) -> None:
-        """Show numbers that were read from the database."""
+        """Set the metrics to numbers that were read from the database."""
         self.has_figures, self._figures_read_s = True, time.monotonic()
         _replace(self.jobs_queued, {key: one.count for key, one in figures.queued.items()})
         _replace(self.oldest_age, {key: one.oldest_age_s for key, one in figures.queued.items()})
@@ -136,7 +136,7 @@ class OperatorMetrics(Observer):
         self.attempts_lost.inc()
 
     def observe_claims(self, delays_s: Sequence[float]) -> None:
-        """Record for how many seconds each job of a claim could have run before."""
+        """Record for each claimed job how many seconds it had waited since the time from which it could run."""
         for delay_s in delays_s:
             self.claim_delay.observe(delay_s)
 

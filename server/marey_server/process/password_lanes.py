@@ -110,9 +110,9 @@ class RefusedTries:
                 raise too_many_sign_ins(limit, wait_s)
 
     def note(self, attempt: SignInTry, refusal: TooManyRequestsProblem) -> None:
-        """Remember until when tries are refused.
+        """Remember the time until which tries are refused.
 
-        Depending on the limit, these are all tries from this address, or those for this name from this address.
+        Depending on the exceeded limit, either all tries from this address are refused, or only those for this name.
         """
         limit: LimitScope = refusal.context["limit"]
         name = None if limit == "address" else attempt.name

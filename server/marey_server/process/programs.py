@@ -13,7 +13,7 @@ async def start_program(
 ) -> Process:
     """Start a Python interpreter with arguments, which inherits descriptors, and return its process.
 
-    `stdin` is a descriptor, `asyncio.subprocess.PIPE`, or None for that of this process. Raises `OSError`.
+    `stdin` is a descriptor, `asyncio.subprocess.PIPE`, or None to inherit the standard input. Raises `OSError`.
     """
     return await asyncio.create_subprocess_exec(
         sys.executable, *arguments, stdin=stdin, pass_fds=inherited, env=environment

@@ -25,16 +25,16 @@ EVERY_S = 0.05
 KEPT_SHARE = 0.98
 """Smallest ratio of a measured lateness to the previous one, so that the lateness decreases slowly."""
 TOLERATED_S = 0.1
-"""Lateness in seconds up to which no refusal is delayed, unless the client is one of a crowd."""
+"""Lateness in seconds up to which no refusal is delayed, except in a crowd (see `CROWD`)."""
 DELAY_PER_LATENESS = 10.0
 CROWD = 32
-"""Number of requests that wait, for their turn or for a delayed refusal, above which there is a crowd.
+"""Number of requests above which there is a crowd: requests that wait for their turn, and delayed refusals.
 
 In a crowd, refusals of clients with many requests at once are delayed earlier and for longer. Delayed refusals count,
 because otherwise the delays would end the crowd and bring it back at once.
 """
 FEW_AT_ONCE = 3
-"""Number of requests of a client under way up to which the client is not counted to the crowd.
+"""Number of simultaneous requests up to which a client does not belong to a crowd.
 
 A program that sends one request after another hardly makes the event loop late. It may be refused often without being
 hostile: it may ask, for example, which of many items exist.

@@ -79,7 +79,7 @@ class Services:
     """Shared parts of a server process: database, threads, metrics, and whether the server is draining."""
 
     parting = False
-    """Whether the process accepts no more connections; then its answers ask clients to close theirs."""
+    """True if the process accepts no more connections; then its answers ask clients to close their connections."""
     tracer: Tracer | None
     """Sender of the spans of requests; None if no collector is configured."""
 
@@ -131,7 +131,7 @@ class Services:
         self._watch()
 
     def _watch(self) -> None:
-        """Show the sizes of queues and pools in the metrics."""
+        """Add the sizes of queues and pools to the metrics."""
         passwords = {"passwords": self.password_lane, "passwords-unknown": self.unknown_lane}
         self.metrics.watch({**self.database.lanes, **self.compute_threads.lanes, **passwords})
         self.database.observer = self.metrics.operator
@@ -165,7 +165,7 @@ class Services:
         return key or None
 
     def forget_client(self, token: str) -> None:
-        """Treat a token that is no longer valid like an invented one, until a request with it is accepted again."""
+        """Treat a token that is no longer valid like an unknown token, until a request with it is accepted again."""
         if self.client_key(token) is not None:  # invented tokens must not displace others
             self._client_keys.put(token_hash(token), "")
 

@@ -286,7 +286,7 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     pools: WorkerPools = Field((), description="Pools of workers, whose sizes follow the queue; see below.")
     own_pods: OwnPods | None = Field(
         None,
-        description="Pods in which jobs run that need more than a worker of a pool has, see below; only with the "
+        description="Pods for single jobs that need more than a worker of a pool has, see below; only with the "
         "launcher kubernetes. Absent: no job gets a pod of its own.",
     )
     worker_url: str | None = Field(
@@ -360,7 +360,7 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
 
     @property
     def quotas(self) -> Quotas:
-        """Return the limits of what one user, or one project, may hold."""
+        """Return the limits on the stored data and the unfinished work of one user or one project."""
         return Quotas(**{field.name: getattr(self, field.name) for field in fields(Quotas)})
 
     @property

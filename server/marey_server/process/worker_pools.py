@@ -45,8 +45,8 @@ class WorkerPool(BaseModel):
         None,
         ge=SHORTEST_DEADLINE_S,
         le=30 * 86400,
-        description="Seconds after which the engine ends a worker; much more than the longest job takes, because a "
-        "job that runs at this time starts again. Absent: as the engine decides.",
+        description="Seconds after which the engine ends a worker. Choose much more than the longest job takes, "
+        "because a job that is running then starts again. Absent: as the engine decides.",
     )
     idle_s: float = Field(
         300.0, ge=1, description="Seconds for which a worker must be superfluous before it is stopped."
@@ -68,22 +68,25 @@ class WorkerPool(BaseModel):
 
 
 class OwnPods(BaseModel):
-    """Pods in which a server runs one job each."""
+    """Settings of pods that run one job each."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    most: int = Field(20, ge=1, le=1000, description="Greatest number of such pods at the same time.")
+    most: int = Field(20, ge=1, le=1000, description="Greatest number of pods at the same time.")
     most_of_project: int | None = Field(
-        None, ge=1, le=1000, description="Greatest number of such pods of one project. Absent: as most."
+        None, ge=1, le=1000, description="Greatest number of pods of one project at the same time. Absent: most."
     )
     patience_s: int = Field(
         600,
         ge=1,
         le=86_400,
-        description="Seconds after which a pod that no node runs makes place for waiting jobs; its job waits as long.",
+        description="Seconds after which a pod that no node runs is deleted if other jobs wait for a pod. Its job then "
+        "waits for the same number of seconds.",
     )
-    memory_mb: int = Field(4096, ge=64, description="A job whose memory limit in MiB is greater gets a pod of its own.")
-    expected_s: int = Field(60, ge=0, description="A job that is expected to take more seconds gets a pod of its own.")
+    memory_mb: int = Field(
+        4096, ge=64, description="Memory in MiB; a job with a greater memory limit gets a pod of its own."
+    )
+    expected_s: int = Field(60, ge=0, description="Seconds; a job that is expected to take longer gets its own pod.")
     labels: dict[str, dict[str, str]] = Field(
         default_factory=dict,
         max_length=100,
@@ -97,14 +100,14 @@ class OwnPods(BaseModel):
         description="Images that scripts may name: an image with its digest, the name of a repository of images, or a "
         "prefix that ends in /. Empty: none.",
     )
-    cpus: int | None = Field(None, ge=1, le=1024, description="Processors of a pod. Absent: as the launcher's options.")
+    cpus: int | None = Field(None, ge=1, le=1024, description="Processors of a pod. Absent: cpus of the launcher.")
     options: dict[str, Any] = Field(
         default_factory=dict, description="Options of the launcher for these pods, in addition to launcher_options."
     )
 
     @property
     def rules(self) -> PodRules:
-        """The properties of a job that gets such a pod."""
+        """The rules that decide whether a job gets a pod of its own."""
         return PodRules(self.memory_mb, self.expected_s, frozenset(self.labels), self.images)
 
 

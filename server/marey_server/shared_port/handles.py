@@ -66,7 +66,7 @@ class ProcessHandle:
 
     @property
     def runs(self) -> bool:
-        """Whether the process has not ended, and was not asked to end."""
+        """True if the process is running and was not asked to end."""
         return not self.stopping and not self._ended.done()
 
     async def until_ready(self) -> bool:

@@ -32,7 +32,7 @@ class StartOrder:
     sockets: tuple[int, ...]
     metrics_sockets: tuple[int, ...]
     first: bool
-    """Whether this is the first process of a server that starts: it prints the greeting and runs the workers."""
+    """True if this is the first process of a server that starts: it prints the greeting and runs the workers."""
 
     def to_line(self) -> bytes:
         """Return the order as one line of JSON."""
@@ -45,7 +45,7 @@ class StartOrder:
         while not line.endswith(b"\n"):
             received = control.recv(1)  # so that nothing that follows the line is taken
             if not received or len(line) > MOST_LINE_BYTES:
-                raise EOFError("no order has come")
+                raise EOFError("the parent process has sent no complete order")
             line += received
         read = json.loads(line)
         return cls(read["settings"], tuple(read["sockets"]), tuple(read["metrics_sockets"]), read["first"])

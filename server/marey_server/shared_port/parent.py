@@ -24,7 +24,7 @@ from marey_server.shared_port.orders import StartOrder
 log = logging.getLogger(__name__)
 
 HEALTHY_AFTER_S = 10.0
-"""Seconds after which the end of a process does not count as the failure of a start."""
+"""Run time in seconds after which the end of a process does not count as a failed start."""
 MOST_FAILURES = 5
 """Number of failed starts in a row after which the parent gives up, if no other process is healthy."""
 PAUSES = Backoff(first_s=0.5, longest_s=30.0, jitter=0.25)
@@ -33,7 +33,7 @@ PAUSES = Backoff(first_s=0.5, longest_s=30.0, jitter=0.25)
 async def serve_in_processes(settings: Settings, given: dict[str, Any]) -> None:
     """Run the processes of a server until SIGTERM or SIGINT; SIGHUP replaces all of them, one after another.
 
-    `given` are the settings that the processes get; they read the others themselves, so that new processes use changed
+    The processes get the settings `given`. They read all other settings themselves, so that new processes use changed
     settings. Raises `CannotListen` and `ProcessesFailed`.
     """
     configure_logging(settings.log_form, settings.log_level)
@@ -86,7 +86,7 @@ class Parent:
         self._failures = 0
         self._announced = False
         self._wanted = asyncio.Event()
-        """Set when the processes must be replaced."""
+        """Event that is set when the processes must be replaced."""
         self.stopping = asyncio.Event()
 
     async def run(self) -> None:
@@ -208,7 +208,7 @@ class Parent:
     # -- replacement --
 
     async def _replace_when_wanted(self) -> None:
-        """Replace all processes, one after another, whenever that is wanted."""
+        """Replace all processes, one after another, whenever a replacement is requested (SIGHUP)."""
         while True:
             await self._wanted.wait()
             self._wanted.clear()

@@ -85,7 +85,7 @@ class BlobBacking(Protocol):
         ...
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """Yield bytes `start` to `stop` of a blob in pieces of at most `CHUNK_BYTES`.
+        """Yield the bytes `start` to `stop - 1` of a blob in pieces of at most `CHUNK_BYTES`.
 
         If the backing has lost some of the bytes, fewer bytes are yielded.
         """
@@ -141,7 +141,7 @@ _PIECE = Prepared(
 
 
 def read_pieces(connection: Connection, upload_id: str, start: int, stop: int) -> Iterator[bytes]:
-    """Yield bytes `start` to `stop` of an upload as they were received, in pieces of at most `CHUNK_BYTES`."""
+    """Yield the received bytes `start` to `stop - 1` of an upload in pieces of at most `CHUNK_BYTES`."""
     while start < stop and (rows := _PIECE.run(connection, {"upload_id": upload_id, "at": start})):
         base, piece = rows[0].offset, rows[0].data
         part: bytes = piece[start - base : stop - base]
@@ -168,7 +168,7 @@ class DatabaseBlobs:
         _INSERT_CHUNK.run_each(connection, rows)
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """Yield bytes `start` to `stop` of a blob."""
+        """Yield the bytes `start` to `stop - 1` of a blob."""
         for position in range(start // CHUNK_BYTES, -(-stop // CHUNK_BYTES)):
             rows = _CHUNK.run(connection, {"digest": digest, "position": position})
             if not rows:
@@ -253,7 +253,7 @@ class DirectoryBlobs:
         _sync_directory(self.root)
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """Yield bytes `start` to `stop` of a blob's file; without a file, the bytes may still be in the database."""
+        """Yield the bytes `start` to `stop - 1` of a blob from its file, or from the database if there is no file."""
         try:
             file = self._path(digest).open("rb")
         except FileNotFoundError:

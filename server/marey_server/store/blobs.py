@@ -280,20 +280,26 @@ def sizes_of(tx: Transaction, digests: Iterable[str]) -> dict[str, int]:
 
 
 def read_blob(tx: Transaction, digest: str, start: int = 0, stop: int | None = None) -> bytes:
-    """Return bytes `start` to `stop` of a blob. Access must have been checked before."""
+    """Return the bytes `start` to `stop - 1` of a blob; by default, all. Access must have been checked before."""
     if stop is None:
         stop = int(tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one())
     return b"".join(tx.blobs.read(tx.connection, digest, start, stop))
 
 
 def object_of(tx: Transaction, digest: str) -> StoredObject | None:
-    """Return the object with the bytes of a blob; None if they are elsewhere. Access must have been checked before."""
+    """Return the object in the object storage that contains a blob, or None if the blob is stored elsewhere.
+
+    Access must have been checked before.
+    """
     found = tx.execute(select(blob.c.object_id).where(blob.c.digest == digest)).scalar()
     return StoredObject(digest, found) if found else None
 
 
 def read_range(tx: Transaction, digest: str, start: int, stop: int) -> bytes:
-    """Return bytes `start` to `stop`, a few MiB at most, of a blob that the caller may read."""
+    """Return the bytes `start` to `stop - 1` of a blob that the caller may read; pass a range of a few MiB at most.
+
+    Raises `NotFoundProblem` if the blob is missing or the caller may not read it.
+    """
     size = require_readable(tx, digest)
     return read_blob(tx, digest, start, min(stop, size))
 

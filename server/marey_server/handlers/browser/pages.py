@@ -1,7 +1,7 @@
 """Pages of the browser, and the files that they load: built from `web/` and part of the package.
 
-Addresses inside the pages are relative to `<base>`, which is set here to the way from the address of the page back to
-the root of the server. So pages work behind a proxy that serves the server below a path.
+Addresses inside the pages are relative to `<base>`, which this module sets to the relative path from the page to the
+root of the server. So pages work behind a proxy that serves the server below a path.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _POLICY = (
     "form-action 'none'; frame-ancestors 'none'"
 )
 _PLAYER_POLICY = "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'"
-"""Policy of a page with inline scripts: it is no page of this server, so it cannot use sessions of browsers."""
+"""Content security policy of a page with inline scripts; `sandbox` keeps the page from using browser sessions."""
 _MISSING = "This installation contains no pages. Install Node 20.19 or newer, and run `make web` in the source tree."
 _TEXTS = ("text/", "application/javascript", "image/svg+xml")
 
@@ -73,11 +73,11 @@ def _read(file: Path) -> WebFile:
 
 
 class WebPage(Resource):
-    """Base class of pages: all have the same document, whose script chooses the page by the address."""
+    """Base class of pages: all pages are the same HTML document, whose script chooses the page by the address."""
 
     root = ""
     to_root: ClassVar[bytes]
-    """Way from the address of the page to the root of the server."""
+    """Relative path from the address of the page to the root of the server."""
 
     async def document(self) -> Reply:
         """Return the document, or a page that names the command that builds the pages."""
@@ -105,8 +105,8 @@ class ViewQuery(AnyQuery):
     camera: str | None = Field(
         None, description="Yaw and pitch of the camera in degrees, and its distance in body heights, as in `35,12,2.6`."
     )
-    look: str | None = Field(None, description="`mannequin` or `skeleton`.")
-    layout: str | None = Field(None, description="Of two clips: `beside`, `overlaid`, `left` or `right`.")
+    look: str | None = Field(None, description="Look of the characters: `mannequin` (default) or `skeleton`.")
+    layout: str | None = Field(None, description="Layout of two clips: `beside`, `overlaid`, `left` or `right`.")
 
 
 class ViewPage(WebPage):
@@ -164,14 +164,14 @@ class ParticipantPage(WebPage):
 
 
 class PlayerPage(Resource):
-    """Page that plays the motion in it without a server; clients add the motion."""
+    """Page that contains a motion and plays it without a server; clients insert the motion."""
 
     path = PLAYER_PATH
     tag = "Pages"
 
     @reads(access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("text/html",))
     async def get(self) -> Reply:
-        """Return the page without motion. A client writes motion into its element `motion`."""
+        """Return the page without a motion; a client writes a motion into the element `motion` of the page."""
         found = (await self.compute(built_files)).get("player.html")
         if found is None:
             raise NotFoundProblem(_MISSING)

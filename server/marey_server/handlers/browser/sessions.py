@@ -67,7 +67,7 @@ class OneBrowserSession(Resource):
 
     @writes(access=Access.ANYONE, scope=None, reserved=True)
     async def delete(self, project: str) -> Reply:
-        """End the session of the browser that sends this request, named by its cookie; without one, nothing changes."""
+        """End the session that the cookie of the request names; without such a cookie, nothing changes."""
         require_own_page(self.request)
         for name, secret in sent_cookies(self.request, project).items():
             if await self.look_up(browser_links.is_session, secret):

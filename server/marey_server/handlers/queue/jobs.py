@@ -43,7 +43,7 @@ MAX_SUBMISSION_BYTES = 32 * MIB
 RESULT_TYPES = {
     "report": "text/html; charset=utf-8", "document": "application/json", "fitted": "application/json",
 }  # fmt: skip
-"""Media types of files of results, by their names in the result; other files have no known type."""
+"""Media types of the files in a job's result, by the name of the file in the result; other files have no known type."""
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,4})(?:$|[,;\s])")
 
 

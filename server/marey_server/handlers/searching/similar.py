@@ -22,9 +22,10 @@ class IndexSearcher(Resource):
     """Base of resources that search an index of motions."""
 
     async def searched(self, project: str, kind: Kind, filters: ItemFilters) -> ItemFilters:
-        """Return filters with the clips that meet each condition `like(...)` of their query.
+        """Return the filters with the clips that meet each condition `like(...)` of the query in `filters`.
 
-        Items of other kinds have no motion, so they meet none. Lists of deleted items refuse these conditions.
+        Only clips can meet such a condition; items of other kinds have no motion. A query for deleted items may not
+        contain such conditions.
         """
         if not likeness.may_compare_motion(filters.query) or filters.deleted:
             return filters
@@ -44,7 +45,7 @@ class IndexSearcher(Resource):
         return replace(filters, alike=alike)
 
     async def files_of(self, index: FoundIndex) -> tuple[ShardFiles, ...]:
-        """Copy the files of an index to this server, as far as they are not here yet."""
+        """Copy missing files of an index to this server, and return the paths of all files, by shard."""
         files = self.services.index_files
         missing = await self.compute(files.missing, index.document)
         if missing:
@@ -73,7 +74,7 @@ class SimilarMoments(IndexSearcher):
 
         An index of motions is searched, which a job of the kind `index` builds and updates. The result is that of a
         comparison with all windows of all clips in the index. Clips that were deleted or changed since the update are
-        left out; `behind` counts those that the index does not have.
+        left out; `behind` is the number of clips that were created or changed since then.
         """
         example = await self.look_up(similar.read_example, project, body)
         metric = await self.look_up(similar.read_metric, project, body.metric)

@@ -42,7 +42,7 @@ class JudgementsQuery(PageQuery):
 
 
 class StudyParticipants(Resource):
-    """Participants of a study, and links for further ones."""
+    """Participants of a study, and links for further participants."""
 
     path = "/projects/{project}/{kind}/{item}/participants"
     tag = TAG
@@ -58,8 +58,8 @@ class StudyParticipants(Resource):
     async def post(self, project: str, kind: str, item: str, body: StudyLinksCreate) -> Rendered:
         """Create links, each for one participant without an account; the codes are shown only once.
 
-        The participants see the newest revision of the study. Their trials are drawn from its seed, such that every
-        participant sees every motion equally often, and that pairs of motions are balanced over participants.
+        The participants see the newest revision of the study. The trials are drawn with the seed of the study, so that
+        every participant sees every motion equally often, and all pairs of motions are shown about equally often.
         """
         planned = await self.look_up(conducting.plan_links, project, kind_of(kind), item, body)
         plans = await self.compute(draw_plans, planned, body.count)
@@ -83,7 +83,7 @@ class OneStudyParticipant(Resource):
 
     @writes(access=Access.MAINTAINER)
     async def delete(self, project: str, kind: str, item: str, participant: str) -> Rendered:
-        """Delete what is stored about a participant, named by id; the link is not valid any more."""
+        """Delete all stored data about a participant, who is named by id; the participant's link becomes invalid."""
         return await self.answer(conducting.withdraw_participant, project, kind_of(kind), item, participant)
 
 
@@ -107,7 +107,7 @@ class StudyJudgementsResource(Resource):
 
     @reads(access=Access.MAINTAINER, query=JudgementsQuery, answer=JudgingParticipant, paged=True, public=False)
     async def get(self, project: str, kind: str, item: str, query: JudgementsQuery) -> Rendered:
-        """List what the participants who saw a revision of a study answered, under pseudonyms and without dates."""
+        """List the answers of the participants who saw a revision of a study, under pseudonyms and without dates."""
         return await self.answer(
             judgements.list_judgements,
             project,
@@ -127,7 +127,7 @@ class StudyDifferencesResource(Resource):
 
     @reads(access=Access.MAINTAINER, query=DifferencesQuery, answer=StudyDifferences, public=False)
     async def get(self, project: str, kind: str, item: str, query: DifferencesQuery) -> Reply:
-        """Return the differences of a study's motions by the answers so far, without anything about participants.
+        """Return how different the motions of a study look by the answers so far, without data of participants.
 
         The job kind `analyse_study` computes the same differences, groups of the motions, and metrics.
         """
@@ -145,7 +145,7 @@ class AttemptJudgements(Resource):
 
     @reads(access=Access.ATTEMPT, scope=None, query=JudgementsQuery, answer=JudgingParticipant, paged=True)
     async def get(self, job: str, fence: int, item: str, query: JudgementsQuery) -> Rendered:
-        """List what participants of a study answered, for an attempt of a job whose author is a maintainer."""
+        """List the answers of the participants of a study, for an attempt of a job whose author is a maintainer."""
         return await self.answer(
             judgements.list_for_attempt,
             job,

@@ -112,12 +112,12 @@ class ParticipationTrial(Resource):
 
     @writes(access=Access.PARTICIPANT, scope=None, body=TrialAnswer, answer=TrialOutcome)
     async def put(self, trial: int, body: TrialAnswer) -> Rendered:
-        """Answer a trial. The first answer counts; repeated and other answers get the recorded outcome."""
+        """Answer a trial. Only the first answer counts; all later answers get the recorded outcome."""
         return await self.answer(trials.answer_trial, trial, body)
 
 
 def read_shown_part(tx: Transaction, clip: int, part: ShownPart) -> Reply:
-    """Return a document of one motion of the caller's study; it never changes."""
+    """Return a document of one motion of the caller's study; the document never changes."""
     found = poses.find_shown_part(tx, clip, part)
     content = Lasting(found.digest, partial(items.load_part, tx, found), found.size_bytes)
     return Reply(content, rev=f"r{found.revision}", headers={"Cache-Control": IMMUTABLE})

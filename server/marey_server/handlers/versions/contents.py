@@ -101,7 +101,7 @@ class ReceivedCommits(Resource):
         status=201,
     )
     async def post(self, project: str, dataset: str, body: ReceivedCommit) -> Rendered:
-        """Record a commit from an archive or another server, with its author and time, so that it keeps its digest.
+        """Record a commit from an archive or another server with its author, time and digest.
 
         The server applies the changes of the commit to the tree of its first parent. If the result differs from the
         commit's tree, the server refuses the commit. A branch without commits can be set to the commit; no other branch

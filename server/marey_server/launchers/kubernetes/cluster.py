@@ -36,7 +36,7 @@ class VersionGone(EngineError):
 
 
 class ObjectRefused(EngineError):
-    """The cluster refused a request because of its object; other requests may succeed."""
+    """Error of a request whose object the cluster has refused; requests with other objects may succeed."""
 
 
 class NoSuchObject(EngineError):
@@ -163,7 +163,7 @@ class Cluster:
     async def _response(
         self, send: Callable[[client.ApiClient], Awaitable[aiohttp.ClientResponse]]
     ) -> AsyncIterator[aiohttp.ClientResponse]:
-        """Send a request; yield the answer, which is a success, and translate errors while it is read."""
+        """Send a request and yield the successful answer. Raises `EngineError`, also while the answer is read."""
         try:
             response = await send(await self._connected())
             async with response:

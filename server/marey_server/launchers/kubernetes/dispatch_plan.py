@@ -1,4 +1,4 @@
-"""Decision which jobs of the queue get pods now, from the jobs that wait and the Jobs of the cluster."""
+"""Decision which waiting jobs of the queue get pods now, given the Jobs that the cluster has already."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PAUSES = Backoff(first_s=5.0, longest_s=600.0, jitter=0.25)
 
 @dataclass(frozen=True)
 class Started:
-    """Job of the queue, described by a `WaitingJob` of it or of one of its tasks, and its start."""
+    """Start of a job of the queue; `job` describes the job itself or, for a parent job, one of its tasks."""
 
     job: WaitingJob
     dispatch: Dispatch
@@ -36,7 +36,10 @@ class Started:
 
 @dataclass
 class _StartGroup:
-    """A job, or the tasks of a parent with `size` tasks, that start together; `most` is how many pods they can use."""
+    """Single job, or tasks that start together; `size` is the number of all tasks of the parent job.
+
+    The group can use at most `most` pods, and gets `places` of them.
+    """
 
     job: WaitingJob
     size: int | None
@@ -46,19 +49,22 @@ class _StartGroup:
 
 @dataclass
 class DispatchPlan:
-    """Decisions of a dispatcher. It remembers only since when pods wait, and when it saw that they ended unclaimed.
+    """Decisions of a dispatcher, from the times since which pods wait, and at which pods ended without a claim.
 
-    At most `most` pods exist, and at most `most_of_project` of each project. Pods that no node runs for `patience_s`
-    seconds give their places to jobs that wait for places.
+    At most `most` pods exist, and at most `most_of_project` pods of each project. If no node runs a pod for
+    `patience_s` seconds, and other jobs wait for a place, the pod is deleted.
     """
 
     most: int
     most_of_project: int | None = None
     patience_s: float = float("inf")
     _lacking: int = 0
-    """Number of starts for which the last decision had no places."""
+    """Number of starts that had no place in the last decision, without those in `_lacking_of`."""
     _lacking_of: dict[str, int] = field(default_factory=dict)
-    """The same for each project that has as many pods as it may have; only its own pods can make place."""
+    """Number of starts that had no place, for each project with `most_of_project` pods.
+
+    Only the deletion of pods of the same project makes a place for such a start.
+    """
     _stuck_since_s: dict[str, float] = field(default_factory=dict)
     _next_s: dict[str, float] = field(default_factory=dict)
     """Time of the next start of a job, by the name of the Job that ended without a claim."""
@@ -81,7 +87,10 @@ class DispatchPlan:
         return [_start(group, numbers) for group in self._share(_grouped(due, numbers), jobs.values())]
 
     def step_back(self, now_s: float, stuck: Mapping[str, Mapping[str, Any]]) -> list[str]:
-        """Return which of the Jobs that no node runs, given by name, must make place for others; the oldest first."""
+        """Return the names of the Jobs in `stuck` to delete so that waiting jobs get their places; the oldest first.
+
+        `stuck` contains the Jobs that no node runs, by name.
+        """
         self._stuck_since_s = {name: self._stuck_since_s.get(name, now_s) for name in stuck}
         late = [name for name, since_s in self._stuck_since_s.items() if now_s - since_s >= self.patience_s]
         chosen: list[str] = []
@@ -97,7 +106,7 @@ class DispatchPlan:
         return chosen
 
     def _share(self, groups: Iterable[_StartGroup], jobs: Iterable[Mapping[str, Any]]) -> list[_StartGroup]:
-        """Give the free places one by one to the project with the fewest pods; return the groups that got any."""
+        """Give each free place to the project that has the fewest pods; return the groups that got at least one."""
         pods: Counter[str] = Counter()
         for job in jobs:
             pods[project_of(job)] += pods_of(job)
@@ -141,7 +150,7 @@ class DispatchPlan:
 
 
 def _places_of(one: WaitingJob) -> Iterable[PodPlace]:
-    """Yield the places in which a job may run: of its own, and among the tasks of its parent."""
+    """Yield the places in which a job may run: as a single job, and as a task of its parent job."""
     yield PodPlace(one.id)
     if one.parent is not None:
         yield PodPlace(one.parent, one.position)
@@ -162,10 +171,11 @@ def _start(group: _StartGroup, numbers: Mapping[str, int]) -> Started:
 
 
 def _grouped(due: Sequence[WaitingJob], numbers: Mapping[str, int]) -> Iterable[_StartGroup]:
-    """Yield what to start: single jobs, and tasks that start together.
+    """Yield the groups to start: single jobs, and tasks that start together.
 
-    Tasks start together if none of them had a pod before, and at least two of them wait. If their project has a limit,
-    they get only as many pods as may run, because more of them would hold nodes and wait.
+    Tasks start together if they had no pods before, and at least two tasks of the same parent wait. If the number of
+    running tasks is limited, a group gets only as many pods as there are waiting tasks, because further pods would
+    occupy nodes while they wait.
     """
     fresh = [one for one in due if one.parent is not None and one.fence == 0 and one.parent not in numbers]
     counts: dict[str, int] = {}

@@ -1,8 +1,8 @@
 """Dispatcher: starts a pod of its own for each job that needs one, and deletes the pods of jobs that have ended.
 
-The dispatcher stores only until when a job waits, and why, in the job. What it has started, it reads from the cluster;
-the names of Jobs and the tokens of pods are computed from the ids of jobs. So a server that ends at any moment leaves
-nothing that the next one does not find.
+The dispatcher stores only the time until which a job waits, and the reason, both in the job. It reads from the cluster
+which pods it has started, and computes the names of Jobs and the tokens of pods from the ids of jobs. So a server may
+end at any moment: the next server finds all pods.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ T = TypeVar("T")
 
 ROUND_S = 2.0
 RENEW_LEAD_S = 15.0
-"""Seconds after which the lead is renewed, so that not every round writes to the database."""
+"""Seconds after which this process renews its lease as the leader; so not every round writes to the database."""
 WORKER_MB = 512
-"""Memory of a pod in MiB beside the limit of its job, for the process that talks to the server."""
+"""Memory of a pod in MiB in addition to the memory limit of its job, for the process that talks to the server."""
 AFTER_REFUSAL_S = 60.0
-"""Seconds after which a job is started again whose Job the cluster has refused."""
+"""Seconds after which a job of the queue is started again if the cluster has refused its Job."""
 DELETE_AFTER_S = 10.0
-"""Seconds after the end of a job in which its pods can end by themselves and leave their logs."""
+"""Seconds from the end of a job to the deletion of its pods; pods that end by themselves before keep their logs."""
 
 
 class Dispatcher:
@@ -79,13 +79,13 @@ class Dispatcher:
         self._jobs = WorkerJobs(self._options, own_pod_labels(self._options), lambda job: pod_token(key, job_of(job)))
         self._plan = DispatchPlan(self._rules.most, self._rules.most_of_project, self._rules.patience_s)
         self._ended_at_s: dict[str, float] = {}
-        """When this process saw first that the job of a Job has ended, by the name of the Job."""
+        """Time at which this process first saw that the job of a Job has ended, by the name of the Job."""
         self._explained: set[str] | None = None
-        """Names of the Jobs whose ends are logged; None: all that have ended before."""
+        """Names of the Jobs whose ends need not be logged again; None: those of all Jobs that have already ended."""
         self._refused: set[str] = set()
 
     async def keep(self) -> None:
-        """Start and delete pods again and again, until the task is cancelled."""
+        """Start and delete pods every `ROUND_S` seconds, until the task is cancelled."""
         await repeat("own pods", self.adjust, ROUND_S)
 
     async def close(self) -> None:
@@ -133,17 +133,17 @@ class Dispatcher:
             await self._postpone(asked[name], f"the cluster refused the pod: {reason}", AFTER_REFUSAL_S)
 
     async def _step_back(self) -> None:
-        """Delete pods that no node has run for long, if other jobs wait for their places; they are started later."""
+        """Delete pods that no node has run for long if other jobs wait for a place; they are started again later."""
         jobs = dict(self._jobs.view.jobs)
         stuck = stuck_jobs(jobs, self._jobs.view.pods.values())
         pause_s = self._rules.patience_s
         for name in self._plan.step_back(self._clock_s(), {name: jobs[name] for name in stuck}):
-            reason = f"no node ran the pod within {pause_s} s, so that it made place for other jobs: {stuck[name]}"
+            reason = f"no node ran the pod within {pause_s} s, so it was deleted in favour of other jobs: {stuck[name]}"
             if await self._postpone(jobs[name], reason, pause_s):
                 await ask(self._jobs.delete(name))
 
     async def _postpone(self, job: Manifest, reason: str, pause_s: float) -> bool:
-        """Let the job of a Job wait, unless it is claimed already; return whether it waits."""
+        """Let the queued job of a Job wait for `pause_s` seconds; return False if a worker has already claimed it."""
         of_job = partial(postpone, job_id=job_of(job), reason=reason, pause_s=pause_s, tasks=is_split(job))
         postponed = await asyncio.wrap_future(self._database.submit_write(SYSTEM, of_job))
         if postponed:
@@ -179,7 +179,7 @@ class Dispatcher:
         return own_pod_job(pool, start.dispatch, time_limit_s=one.time_limit_s, environment=variables)
 
     def _nodes_for(self, one: WaitingJob) -> dict[str, str]:
-        """Return the labels of nodes that can run a job, by the labels of the job."""
+        """Return the labels that a node must have to run a job, from the options and the labels of the job."""
         selector = dict(self._options.node_selector)
         for name, text in one.labels.items():
             selector |= self._rules.labels.get(f"{name}={text}", {})
@@ -188,7 +188,7 @@ class Dispatcher:
     # -- ends --
 
     async def _delete_finished(self) -> None:
-        """Delete the Jobs that have not ended some seconds after their job has ended, or was purged."""
+        """Delete the Jobs that are still running some seconds after their job of the queue has ended or was purged."""
         alive = {name: job_of(job) for name, job in self._jobs.view.jobs.items() if not is_over(job)}
         unfinished = await self._read(lambda tx: read_unfinished(tx, sorted(set(alive.values()))))
         over = [name for name, job_id in alive.items() if job_id not in unfinished]

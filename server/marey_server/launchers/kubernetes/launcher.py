@@ -136,7 +136,7 @@ class KubernetesLauncher:
         return group_pods(self._view.pods.values()).get(worker, [])
 
     async def _with_log(self, end: WorkerEnd, pod: str) -> WorkerEnd:
-        """Return an end with the last lines of the pod's log, if the cluster still has them."""
+        """Add the last lines of the pod's log to the end of a worker, if the cluster still has them."""
         try:
             lines = await self._cluster.read_log(pod)
         except EngineError as error:

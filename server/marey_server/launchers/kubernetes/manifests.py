@@ -115,7 +115,10 @@ def token_secret(job: Manifest, token: str) -> Manifest:
 
 
 def pool_deployment(pool: Pool, *, replicas: int, secret: str) -> Manifest:
-    """Return a Deployment of workers whose number people or an autoscaler set; `secret` contains their token."""
+    """Return a Deployment of `replicas` workers, which can be scaled later.
+
+    `secret` is the name of the Secret with the token of the workers.
+    """
     options = pool.options
     labels = job_labels(pool.name, options) | {"app.kubernetes.io/managed-by": "kustomize"}
     own_name = {"name": "POD_NAME", "valueFrom": {"fieldRef": {"fieldPath": "metadata.name"}}}
@@ -194,7 +197,7 @@ def _arguments(pool: Pool, worker_name: str) -> list[str]:
 
 
 def _environment(pool: Pool) -> Mapping[str, str]:
-    """Return variables of the container.
+    """Return environment variables of the container.
 
     Kubernetes makes the token file readable for the group `fsGroup`, which only this pod has; `CREDENTIALS_DIRECTORY`
     lets Marey accept this. The numbers of threads are limited, because numeric libraries would start a thread for each
@@ -205,7 +208,7 @@ def _environment(pool: Pool) -> Mapping[str, str]:
 
 
 def _resources(pool: Pool) -> Manifest:
-    """Return requests and limits; they are equal, so the cluster reserves all the memory that a worker may use."""
+    """Return resource requests and equal limits, so that the cluster reserves all memory that a worker may use."""
     amounts = {"cpu": str(pool.cpus), "memory": str(pool.memory_bytes)}
     if pool.request.gpus:
         amounts[pool.options.gpu_resource] = str(pool.request.gpus)

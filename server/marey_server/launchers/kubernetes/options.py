@@ -34,23 +34,23 @@ class ClusterOptions(BaseModel):
     queue: Name | None = Field(
         None, description="LocalQueue of Kueue that admits the workers. Absent: Kueue is not used."
     )
-    cpus: int = Field(1, ge=1, le=1024, description="Processors of a worker whose pool sets none.")
-    memory_mb: int = Field(2048, ge=256, description="Memory in MiB of a worker whose pool sets none.")
+    cpus: int = Field(1, ge=1, le=1024, description="Processors of a worker if its pool does not set `cpus`.")
+    memory_mb: int = Field(2048, ge=256, description="Memory of a worker in MiB if its pool does not set it.")
     cache_mb: int = Field(2048, ge=16, description="Space of a worker in MiB for cached inputs.")
     scratch_mb: int = Field(4096, ge=256, description="Space of a worker in MiB for temporary files.")
     gpu_resource: str = Field(
-        "nvidia.com/gpu", description="Resource of which a worker gets as many as `gpus` of its pool says."
+        "nvidia.com/gpu", description="Name of the resource of which a worker gets the number `gpus` of its pool."
     )
     node_selector: dict[str, str] = Field(
         default_factory=dict, description="Labels that nodes must have to run workers."
     )
-    tolerations: tuple[dict[str, str], ...] = Field((), description="Taints of nodes that workers tolerate.")
+    tolerations: tuple[dict[str, str], ...] = Field((), description="Tolerations of the workers for taints of nodes.")
     pull_secrets: tuple[Name, ...] = Field((), description="Names of Secrets for a private registry.")
     ended_s: int = Field(3600, ge=0, description="Seconds for which the cluster keeps ended workers, with their logs.")
     indexed: bool = Field(
         False,
-        description="Whether workers that are started together are one Indexed Job, which Kueue admits as a whole. One "
-        "of them can then be stopped only after it has a pod.",
+        description="Start several workers as one Indexed Job, which Kueue admits as a whole. A single worker of this "
+        "Job can be stopped only after it has a pod.",
     )
     relist_s: int = Field(30, ge=1, le=600, description="Seconds between two complete lists of the workers.")
     timeout_s: float = Field(10.0, gt=0, le=300, description="Seconds that the cluster has to answer a request.")

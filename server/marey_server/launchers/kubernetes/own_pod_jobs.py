@@ -1,4 +1,4 @@
-"""Documents of the Jobs of a cluster that run one job of the queue, or one task of it in each pod."""
+"""Documents of the Jobs of a cluster: each Job runs one job of the queue, or one of its tasks in each pod."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.kubernetes.states import ended_indexes, is_over
 
 OWN_PODS = "OWN-PODS"
-"""Value of the label with the pool; in capital letters, so that no pool has this name."""
+"""Value of the label for the pool; names of pools have no capital letters, so no pool has this name."""
 JOB_ID_LABEL = "marey-job"
 DISPATCH_ANNOTATION = "marey-dispatch"
 PULL_S = 1800
@@ -36,7 +36,7 @@ class Dispatch:
     project: str = ""
 
     def name(self, options: ClusterOptions) -> str:
-        """Return the name of the Job, which is the same whenever the same start is repeated."""
+        """Return the name of the Job; a repetition of this start gives the same name."""
         return f"{options.instance}-{self.job.replace('_', '-')}-{self.number}"
 
 
@@ -64,7 +64,7 @@ def own_pod_job(
     Parameters
     ----------
     pool : properties of the pod
-    time_limit_s : limit of one attempt; the cluster ends a pod later, if it still runs then
+    time_limit_s : time limit of one attempt in seconds; the cluster ends the pod some time after this limit
     environment : further variables of the worker
     """
     job = worker_job(pool, dispatch.name(pool.options), count=dispatch.size)
@@ -96,7 +96,7 @@ def job_of(job: Mapping[str, Any]) -> str:
 
 
 def dispatch_of(job: Mapping[str, Any]) -> tuple[int, int]:
-    """Return the number of the start of a Job, and the number of claims until then."""
+    """Return the number of the start that created a Job, and the number of claims of its job until this start."""
     stored = _dispatch(job)
     return int(stored.get("number", 0)), int(stored.get("fence", 0))
 
@@ -112,7 +112,7 @@ def _dispatch(job: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def places_of(job: Mapping[str, Any]) -> Iterator[PodPlace]:
-    """Yield the places of a Job whose pods have not ended for good."""
+    """Yield the job or the tasks that the pods of a Job still run or will run."""
     if is_over(job):
         return
     size, ended = _size_of(job), ended_indexes(job)
@@ -123,7 +123,7 @@ def places_of(job: Mapping[str, Any]) -> Iterator[PodPlace]:
 
 
 def pods_of(job: Mapping[str, Any]) -> int:
-    """Return the greatest number of pods that a Job runs at once from now on."""
+    """Return the greatest number of pods that a Job can still run at once."""
     left = sum(1 for _ in places_of(job))
     return min(left, int(job["spec"].get("parallelism", 1)))
 

@@ -55,7 +55,7 @@ def group_pods(pods: Iterable[T]) -> dict[str, list[T]]:
 
 
 def _state(job: Document, name: str, pods: Sequence[Document]) -> tuple[WorkerState, datetime | None]:
-    """Return the state of a worker, and since when it runs."""
+    """Return the state of a worker, and the time at which it started to run."""
     started_at = next((at for pod in reversed(pods) if (at := _started(pod)) is not None), None)
     if has_ended(job, name):
         return "ended", started_at
@@ -65,7 +65,7 @@ def _state(job: Document, name: str, pods: Sequence[Document]) -> tuple[WorkerSt
 
 
 def has_ended(job: Document, worker: str) -> bool:
-    """Return whether a worker of a Job has ended and is not started again."""
+    """Return whether a worker of a Job has ended and will not be started again."""
     if is_over(job):
         return True
     index = worker.removeprefix(job["metadata"]["name"]).lstrip("-")

@@ -1,4 +1,4 @@
-"""Copy of the Jobs and pods of a pool, which lists of the cluster correct and watches keep current."""
+"""Copy of the Jobs and pods of a pool: regular lists of the cluster replace it, and watches update it in between."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ log = logging.getLogger(__name__)
 KINDS: tuple[Kind, ...] = ("jobs", "pods")
 PAUSES = Backoff(first_s=0.5, longest_s=15.0)
 MOST_DELETED = 1024
-"""Number of deleted Jobs whose ids are remembered, until every list that began before has ended."""
+"""Number of deleted Jobs whose ids are remembered, so that a list that began before does not add them again."""
 SHORT_WATCH_S = 1.0
-"""Duration in seconds of a watch that counts as failed, so that a cluster that ends every watch is not flooded."""
+"""Duration in seconds below which a watch counts as failed, so that a pause follows before the next request."""
 
 
 class ClusterView:
     """Copy of the Jobs and pods of a pool.
 
-    The objects are listed every `relist_s` seconds. A watch makes changes visible between two lists; if it fails, the
-    next list makes up for it.
+    The objects are listed every `relist_s` seconds. A watch reports changes between two lists; if the watch fails, the
+    changes become visible with the next list.
     """
 
     def __init__(self, cluster: Cluster, selector: str, *, relist_s: int, timeout_s: float) -> None:

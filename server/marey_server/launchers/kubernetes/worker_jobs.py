@@ -47,7 +47,7 @@ class WorkerJobs:
         return await self.all(self._create(job) for job in jobs)
 
     async def create_allowed(self, jobs: Iterable[Manifest]) -> tuple[list[Manifest], dict[str, str]]:
-        """Create Jobs as `create` does; return those that exist now, and why the cluster refuses others, by name."""
+        """Create Jobs as `create` does; return those that exist now, and by name the reasons for refused Jobs."""
         refused: dict[str, str] = {}
 
         async def create(job: Manifest) -> Manifest | None:
@@ -77,7 +77,7 @@ class WorkerJobs:
         await self.cluster.close()
 
     async def all(self, calls: Iterable[Awaitable[T]]) -> Sequence[T]:
-        """Make all calls, some at the same time; afterwards, raise the first error."""
+        """Wait for all calls, several at a time, and return their results; raise the first error after all calls."""
 
         async def limited(call: Awaitable[T]) -> T:
             async with self._requests:
@@ -126,7 +126,7 @@ class WorkerJobs:
         self._with_token.add(name)
 
     def _log_blocked(self) -> None:
-        """Log why workers cannot start, such as an image that does not exist; once as long as one is blocked."""
+        """Log why workers cannot start, such as a missing image; only once for as long as a worker is blocked."""
         blocked = {name: reason for pod in self.view.pods.values()
                    if (reason := blocked_reason(pod)) is not None and (name := worker_of(pod)) is not None}  # fmt: skip
         for name, reason in blocked.items():

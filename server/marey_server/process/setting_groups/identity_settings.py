@@ -40,7 +40,9 @@ class IdentitySettings(BaseSettings):
         "registered as a public client, without a secret.",
     )
     oidc_scopes: tuple[str, ...] = Field(
-        ("openid", "profile", "email"), max_length=16, description="Scopes that the server requests; one is openid."
+        ("openid", "profile", "email"),
+        max_length=16,
+        description="Scopes that the server requests; openid must be one of them.",
     )
     oidc_name_claim: str = Field(
         "preferred_username",

@@ -36,7 +36,7 @@ class TraceSettings(BaseSettings):
         None,
         ge=0,
         le=1,
-        description="Share of the traces that begin in this server which is recorded, from 0 to 1. Absent: as "
+        description="Sampling rate of the traces that begin in this server, from 0 to 1. Absent: as "
         "OTEL_TRACES_SAMPLER defines it, or 1.",
     )
     traces_callers: TraceCallers = Field(

@@ -68,7 +68,7 @@ def create_link(tx: Transaction, project: str) -> BrowserLink:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try that is to be counted before the code of a link is checked."""
+    """Return the try to redeem the code of a link, which must be counted before the code is checked."""
     prefix, _ = split_view_code(code) or ("", "")
     return SignInTry(f"view {prefix}", address, per_minute)
 

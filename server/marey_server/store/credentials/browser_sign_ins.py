@@ -5,8 +5,8 @@
 3. The provider sends the browser back. The state works once, and only in the browser with the cookie.
 4. The browser gets a code. The program redeems the code, once, with its verifier, and gets a token.
 
-Of the verifier, cookie, state and code, the database contains only hashes. What goes wrong ends the sign-in, and the
-person begins another one.
+The database contains only hashes of the verifier, the cookie, the state and the code. An error ends the sign-in; the
+person must then begin a new sign-in.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def use_state(tx: Transaction, state: str, cookie: str) -> tuple[str, int | None
 
 
 def confirm(tx: Transaction, sign_in_id: str, code: str, person: Person, *, creates_users: bool) -> str:
-    """Note that the provider has identified a person, who gets `code`; return the name of the person's user.
+    """Record that the provider has identified a person, who gets `code`; return the name of the person's user.
 
     An unknown person becomes a new user if `creates_users` is true. Raises `ForbiddenProblem` if the person has no
     user or a disabled one, `ConflictProblem` if the name of the new user is taken, and `NotFoundProblem`.
@@ -129,8 +129,8 @@ def _name_of(claim: str | None) -> str:
     name = (claim or "").partition("@")[0].lower()
     if not _USER_NAME.fullmatch(name):
         raise ForbiddenProblem(
-            "No user name can be made from what the identity provider says about you: the name has at most 64 letters, "
-            "digits, `.`, `_` and `-`. Ask an administrator to create your user and to link it.",
+            "The identity provider sent no valid user name for you: a user name has at most 64 letters, digits, `.`, "
+            "`_` and `-`. Ask an administrator to create a user and to link you with this user.",
             code="no-user-name",
         )
     return name

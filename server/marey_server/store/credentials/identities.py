@@ -33,7 +33,7 @@ MOST_OF_USER = 20
 def list_identities(
     tx: Transaction, name: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """List the identities of a user. Only administrators may read those of others. Raises `NotFoundProblem`."""
+    """List the identities of a user. Only administrators may read other users' identities. Raises `NotFoundProblem`."""
     if not scopes.allows(tx.principal.scopes, "read"):  # a token for one project shows nothing about its user
         raise ForbiddenProblem(
             "This request needs a token with the scope 'read' for all projects.", code="insufficient-scope"
@@ -68,14 +68,14 @@ def link_identity(tx: Transaction, name: str, issuer: str | None, subject: str) 
 
 
 def find_identity(tx: Transaction, issuer: str, subject: str) -> Row[Any] | None:
-    """Return the row of an identity, or None if nobody has linked it."""
+    """Return the row of an identity, or None if no user is linked with it."""
     return tx.execute(select(identity).where(identity.c.issuer == issuer, identity.c.subject == subject)).first()
 
 
 def insert_identity(tx: Transaction, user_id: str, name: str, person: Person) -> Row[Any]:
     """Link an identity with a user, without a check of rights, and return its row.
 
-    Raises `ConflictProblem` if it is linked already, and `QuotaExceededProblem`.
+    Raises `ConflictProblem` if the identity is linked already, and `QuotaExceededProblem` if the user has too many.
     """
     present = tx.execute(select(func.count()).where(identity.c.user_id == user_id)).scalar_one()
     if present >= MOST_OF_USER:

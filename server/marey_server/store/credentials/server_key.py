@@ -16,7 +16,7 @@ _SERVER_KEY = Prepared(select(server_state.c.value).where(server_state.c.key == 
 
 
 def read_server_key(tx: Transaction) -> bytes:
-    """Return the key."""
+    """Return the secret key of all servers that share the database."""
     (row,) = tx.run(_SERVER_KEY, {})
     return bytes.fromhex(row.value)
 
@@ -27,6 +27,6 @@ def read_seal_key(tx: Transaction) -> bytes:
 
 
 def make_server_key(tx: Transaction) -> None:
-    """Create the key, unless the database already contains one."""
+    """Create the secret key of the servers, unless the database already contains it."""
     row = {"key": _KEY_NAME, "value": secrets.token_hex(32)}
     tx.execute(tx.insert_or_ignore(server_state, row))

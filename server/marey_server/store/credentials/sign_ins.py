@@ -1,11 +1,11 @@
 """Limits on wrong passwords and invitation codes, shared by all servers; they never lock out the owner of an account.
 
 Every try with a wrong password counts towards two limits: one for this account from this address, and one for this
-address with all accounts. An address is unknown if nobody has signed in to the account from it lately. A try from an
-unknown address also counts towards a third limit: one for this account from all unknown addresses together. The third
-limit does not apply to known addresses. So guesses from elsewhere never lock out an owner who signs in from a known
-address (docs/decisions/0020-sign-in-limits.md). For the code of an invitation, the prefix of the code takes the place
-of the account.
+address with all accounts. An address is unknown if nobody has signed in to the account from this address in the last
+90 days. A try from an unknown address also counts towards a third limit: one for this account from all unknown
+addresses together. The third limit does not apply to known addresses. So guesses from elsewhere never lock out an owner
+who signs in from a known address (docs/decisions/0020-sign-in-limits.md). For the code of an invitation, the prefix of
+the code takes the place of the account.
 """
 
 from __future__ import annotations

@@ -147,8 +147,8 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
 def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """Create a token of the caller; its secret is shown once.
 
-    The new token may have no rights that the caller's own token lacks: no further scope, no further label of workers,
-    and no longer validity. Otherwise, raises `ForbiddenProblem`. Raises `InvalidProblem` for labels without the scope
+    The new token may not have more rights than the caller's own token: no other scopes, no other labels of workers,
+    and no later expiry. Otherwise, raises `ForbiddenProblem`. Raises `InvalidProblem` for labels without the scope
     `work`.
     """
     user_id = _require_user(tx.principal, "write")
@@ -210,7 +210,7 @@ def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | Non
 
 
 def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
-    """Return the time at which a new token expires, or None if the token never expires.
+    """Return the time in microseconds since 1970 at which a new token expires, or None if it never expires.
 
     By default, the new token expires no later than the caller's own token. Raises `ForbiddenProblem` if the request
     explicitly sets a later time.
@@ -286,9 +286,9 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     With `with_created`, also revoke the successors and predecessors of this token, all tokens that were created with
     any of these, and so on.
 
-    Without `with_created`, only this token is revoked, and its links are joined. For example, if A created the revoked
-    token B, and B created C, then C is recorded as created by A. The successor of B is recorded as the successor of B's
-    predecessor. A token may always revoke itself.
+    Without `with_created`, only this token is revoked, and the tokens connected by it are connected directly. For
+    example, if A created the revoked token B, and B created C, then C is recorded as created by A. The successor of B
+    is recorded as the successor of B's predecessor. A token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:
