@@ -153,7 +153,7 @@ def _with_other_frames(take: Clip, number: int, start: int, count: int) -> Clip:
 
 
 def _share(what: str, first: Copy, second: Copy) -> Row:
-    """Return the row for a second copy: the bytes on each of its two ways, as a share of those of the first copy."""
+    """Return the row for a second copy: the bytes to and from each server, as a share of those of the first copy."""
     read, sent = second.source_bytes / first.source_bytes, second.target_bytes / first.target_bytes
     return Row(
         "second copy with 1 % edited frames", f"{CLIPS} clips of {FRAMES} frames, {JOINTS} joints; {what}",

@@ -52,7 +52,7 @@ FORKER = "forker"
 
 
 class ForkedChild:
-    """A child that a forker has forked, with what `ChildProcess` needs of a `subprocess.Popen`."""
+    """A child that a forker has forked, with those methods of `subprocess.Popen` that `ChildProcess` uses."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
@@ -179,7 +179,10 @@ def _adopt_orphans(adopts: bool) -> None:
 
 
 def _keep_only(*descriptors: int) -> None:
-    """Close all other descriptors but those of the output; without a standard input, take it from nowhere."""
+    """Close all descriptors except `descriptors`, the standard input and the outputs.
+
+    If `descriptors` lacks the standard input (0), it is `/dev/null`.
+    """
     if 0 not in descriptors:
         nothing = os.open(os.devnull, os.O_RDONLY)
         os.dup2(nothing, 0)
@@ -221,7 +224,7 @@ def _serve(orders: socket.socket, parent: int) -> NoReturn:
 
 
 def _place(descriptors: list[int], places: list[int]) -> None:
-    """Give descriptors their numbers, and close all others but those of the output."""
+    """Give descriptors their numbers, and close all other descriptors except those of the output."""
     free = 1 + max((2, *descriptors, *places))
     moved = [fcntl.fcntl(descriptor, fcntl.F_DUPFD, free) for descriptor in descriptors]
     for descriptor, place in zip(moved, places, strict=True):

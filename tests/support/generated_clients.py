@@ -14,7 +14,7 @@ from openapi_python_client.config import Config, ConfigFile, MetaType
 from tests.support.tiers import NODE_PACKAGES
 
 BYTES_TYPES = ("application/zip", "image/png")
-"""Media types that a generated client must be told to be bytes."""
+"""Media types that the generator must be configured to treat as bytes."""
 ONLY_AS_JSON = ("Unsupported content type application/msgpack", "Unsupported content type application/bson")
 """Expected warnings: a generated client sends bodies as JSON only."""
 

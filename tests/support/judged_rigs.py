@@ -1,4 +1,4 @@
-"""Sixteen pairs of real rigs, between which motions are retargeted, and what an animator judges in the results."""
+"""Sixteen pairs of real rigs between which motions are retargeted, and the measures that judge the results."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def plan_between(source: Actor | SimpleNamespace, target: Actor | SimpleNamespac
 
 @dataclass(frozen=True, eq=False)
 class JudgedRetargeting:
-    """A clip and its retargeted copy, as their joints move in the world."""
+    """A clip and its retargeted copy, with positions of joints in world coordinates."""
 
     source: Actor
     target: Actor
@@ -159,7 +159,7 @@ class JudgedRetargeting:
         return float(fastest[0]), float(fastest[1])
 
     def hands_off_m(self, scale: float) -> float:
-        """Compute how far hands are at most from those of the source, scaled about the middle of the shoulders."""
+        """Compute the greatest distance of hands from those of the source, scaled about the middle of the shoulders."""
         (left, left_after), (right, right_after) = (self.places(f"{side}_shoulder") for side in SIDES)
         off = []
         for side in SIDES:

@@ -15,7 +15,7 @@ from marey_server.shared_port.orders import READY, StartOrder
 
 
 def main() -> int:
-    """Behave as the file that the setting `behaviour` names says at this time; return the exit status."""
+    """Read the behaviour from the file that the setting `behaviour` names, and follow it; return the exit status."""
     control = socket.socket(fileno=os.dup(0))
     order = StartOrder.receive(control)
     folder = Path(order.settings["folder"])

@@ -18,7 +18,7 @@ ELSEWHERE = tuple(f"{scope}!project=elsewhere" for scope in USER_SCOPES)
 RANK = {role: rank for rank, role in enumerate(Role)}
 
 LET_THROUGH: frozenset[int] = frozenset()
-"""Verdict on callers who are not refused: the answer depends on the request alone."""
+"""Verdict for callers who are not refused: the answer depends on the request alone."""
 SIGN_IN, FORBIDDEN, HIDDEN, OVER = frozenset({401}), frozenset({403}), frozenset({404}), frozenset({409})
 
 

@@ -1,4 +1,4 @@
-"""Moving in from Marey's predecessor: every document of it goes in and out, on a real server."""
+"""Move from Marey's predecessor: each kind of its documents is imported and exported, on a real server."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ OWNERS = {
     "left_quaternion_mm.bson.bz2": "model left",
     **{name: f"record {name.split('.')[0]}" for name in written_records.records()},
 }  # fmt: skip
-"""Items whose exports are files that do not have their names."""
+"""Kind and name of the item that is exported as each file, for files whose names do not give both."""
 
 
 @pytest.mark.parametrize("way", get_args(Way))

@@ -16,7 +16,7 @@ QUEUE_LABEL = "kueue.x-k8s.io/queue-name"
 
 @dataclass
 class Controllers:
-    """Controllers that move the objects of the cluster to what their specifications say."""
+    """Controllers that bring the objects of the cluster into the state that their specifications describe."""
 
     objects: Objects
     duplicates: bool = False

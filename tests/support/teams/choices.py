@@ -59,7 +59,7 @@ class Chooser:
         return self.model.projects[self.lab]
 
     def operation(self, kind: str) -> Operation | None:
-        """Return an operation, or None if nothing exists to operate on.
+        """Return an operation, or None if the model has nothing to which it applies.
 
         `kind` is the name of one of the methods below.
         """

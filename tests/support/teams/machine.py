@@ -234,12 +234,12 @@ def _fate(chance: random.Random) -> Fate:
 
 
 def _without_loss(fate: Fate) -> Fate:
-    """Return the same fate; if this fate loses answers, return `FINE`."""
+    """Return `FINE` in place of a fate that loses answers, and any other fate unchanged."""
     return FINE if fate.lost else fate
 
 
 def _removal(choose: Chooser, commit: CommitChanges) -> Operation | None:
-    """Return the deletion of an item that a commit puts. If the item is deleted already, return its purge."""
+    """Return the deletion of an item that a commit adds to a version; if the item is deleted already, its purge."""
     for one in commit.changes or ():
         if isinstance(one, PutEntry):
             item = choose.project.items[one.item]

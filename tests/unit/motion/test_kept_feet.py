@@ -167,7 +167,7 @@ def test_contacts_of_one_foot_that_overlap_are_refused() -> None:
 
 
 def test_a_knee_does_not_jump_in_a_long_blend(mocap: Path) -> None:
-    """A run continues out of step, and its feet need three seconds to get to their own places."""
+    """The first part of a run is followed by the whole run, out of step, with a blend of three seconds."""
     clip = read_motion((mocap / RUN).read_bytes(), "run.bvh").clip
     assert clip is not None
     seam, knee = clip.frame_count * 2 // 5, clip.skeleton.index_of(map_joints(clip.skeleton).joints["left_knee"])

@@ -57,7 +57,7 @@ def restored(found: ArrayDifference, base: NDArray[Any]) -> NDArray[Any]:
 def test_the_sum_of_base_and_difference_is_the_array(
     dtype: str, shape: tuple[int, ...], edits: list[tuple[int, int, bool]]
 ) -> None:
-    """Also of numbers of any size: the extremes of the dtype, and zeros with a sign."""
+    """This holds for all numbers, including the extremes of the dtype and signed zeros."""
     base = numbers(dtype, shape)
     array, other = base.copy(), numbers(dtype, shape, seed=2)
     for start, length, extreme in edits if shape else ():
