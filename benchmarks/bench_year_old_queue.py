@@ -1,4 +1,4 @@
-"""The queue of a server that has run for a year, beside a new one: the same operations with and without ended jobs.
+"""The queue of a server that has run for a year, compared with a new one: the same operations beside ended jobs.
 
 Operations call the store of this process without HTTP. The ratio compares the processor time of this process and of
 the database, with few and with many ended jobs: each round measures both, one after the other. A ratio of 1 means that
@@ -178,7 +178,7 @@ _OF_A_CYCLE = ("submit", "claim", "complete")
 
 
 def run(jobs: int = ENDED_JOBS, databases: Sequence[str] = ("SQLite", "Postgres"), event_days: int = 365) -> list[Row]:
-    """Measure each operation beside `jobs` ended jobs, with the events of the last days, and beside few."""
+    """Measure each operation in a queue with `jobs` ended jobs and the events of `event_days`, and in one with few."""
     rows = []
     if "SQLite" in databases:
         with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:

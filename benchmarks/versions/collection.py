@@ -68,7 +68,7 @@ SELECTIONS = (
 
 
 def measure_collection() -> list[Row]:
-    """Measure an import, the first commit of all clips, and checkouts of 300 clips beside those from few clips."""
+    """Measure an import, the first commit of all clips, and checkouts of 300 clips from all clips and from few."""
     with local_server(partial(_prepare, FEW)) as server:
         few = _checkouts(server, FEW)
     with local_server(partial(_prepare, CLIPS)) as server:

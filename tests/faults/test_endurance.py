@@ -21,7 +21,7 @@ pytestmark = pytest.mark.timeout(900)
 
 @dataclass(frozen=True)
 class Ended:
-    """How a trial ended: its exit status, and its output with its errors."""
+    """End of a trial: its exit status, and its output including the error output."""
 
     status: int
     output: str

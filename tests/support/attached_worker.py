@@ -13,7 +13,7 @@ from tests.support.forked_programs import ForkedProgram, nursery
 KINDS_OF_TESTS = Path(__file__).parents[1] / "unit" / "worker" / "thirdparty"
 """Distribution with the kinds of job that only tests know."""
 NAMES_OF_KINDS = ("add", "misbehave", "tally", "make")
-"""Names of these kinds. Their modules are loaded sooner than those of the built-in kinds."""
+"""Names of these kinds. Their modules take less time to load than the modules of the built-in kinds."""
 
 
 def python_path() -> str:

@@ -34,7 +34,7 @@ from marey_schemas.processes.limits import die_with_parent
 from marey_server.process import programs
 
 FORKS = sys.platform == "linux"
-"""Whether the system has what a forker needs: a process that adopts the orphans among its descendants."""
+"""Whether a process of this system can adopt the orphans among its descendants, as a forker needs it."""
 KERNELS = "marey_server.motions.reading"
 """Module that loads the compiled kernels."""
 MODULES = ("marey_worker.child", "marey_server.motions.child", KERNELS)
@@ -48,7 +48,7 @@ MOST_DESCRIPTORS = 8
 LONGEST_NAME = 4096
 """Number of bytes in which the arguments of a forked process must fit."""
 FORKER = "forker"
-"""What `/proc` shows as the only argument of a forker."""
+"""Text that `/proc` shows as the only argument of a forker."""
 
 
 class ForkedChild:
@@ -161,9 +161,9 @@ def fork_children() -> None:
 
 
 def take_name(arguments: Sequence[str]) -> None:
-    """Let `/proc` show these arguments as those of this process.
+    """Let `/proc` show `arguments` as the arguments of this process.
 
-    The arguments of the nursery, which all forked processes show otherwise, leave room for `LONGEST_NAME` bytes.
+    The new arguments replace those of the nursery, which have room for `LONGEST_NAME` bytes.
     """
     with open("/proc/self/stat") as file:
         fields = file.read().rpartition(")")[2].split()

@@ -29,7 +29,7 @@ def generate_python_client(document: Path, package: Path) -> list[str]:
 
 
 def check_typescript_program(document: Path, program: Path) -> str:
-    """Generate TypeScript types from an OpenAPI document into the file `api.ts` beside a program, and check its types.
+    """Generate TypeScript types from an OpenAPI document into `api.ts` in the folder of a program; check the program.
 
     Return the errors of the compiler.
     """

@@ -69,7 +69,7 @@ class Actor:
 
     @classmethod
     def of(cls, mocap: Path, path: str) -> Actor:
-        """Read a file of the collection, with the skeleton beside it if it has one."""
+        """Read a file of the collection, and the skeleton file in the same folder if there is one."""
         file = mocap / path
         companion = next(file.parent.glob("*.asf")).read_bytes() if file.suffix == ".amc" else None
         read = read_motion(file.read_bytes(), file.name, companion=companion).clip
@@ -115,7 +115,7 @@ class JudgedRetargeting:
 
     @property
     def soles_off_m(self) -> float:
-        """Height of the soles of the result over the floor of the source, where the lower foot touches it."""
+        """Median height of the soles of the result above the floor, while the lower foot of the source touches it."""
         before, after = (
             sole_heights(kinematics.global_positions(clip, end_sites=True), actor.skeleton, self._feet(actor, "ankle"))
             for actor, clip in self._both
@@ -128,7 +128,7 @@ class JudgedRetargeting:
 
     @property
     def contact_speeds_m_s(self) -> tuple[float, float]:
-        """Mean speeds on the ground of ankles and toes in source and result, while those of the source touch it."""
+        """Mean horizontal speeds of ankles and toes in source and result, while they touch the floor in the source."""
         still = self._touching[1:] & self._touching[:-1]
         rate = self.source.clip.frame_rate_hz
         source, target = (
@@ -174,7 +174,7 @@ class JudgedRetargeting:
 
     @property
     def _touching(self) -> Flags:
-        """Frames and points (F, 4) of the source that touch the floor: ankles, then toes."""
+        """Whether each ankle and toe of the source touches the floor, by frame (F, 4): ankles, then toes."""
         return contact_labels(self._foot_points(self.source, self.source.clip), self.source.clip.frame_rate_hz)
 
     def _foot_points(self, actor: Actor, clip: Clip) -> Floats:

@@ -1,4 +1,4 @@
-"""Test functions that take long, as measured: the tier `check` leaves them out.
+"""List of measured slow test functions, which the tier `check` leaves out.
 
 `make slow-tests` runs the tests of the tier `check`, the slow ones, too, and writes the list `slow_tests.txt`. A test
 function is slow if all of its cases together take more than `LONGEST_S`. Each process of a test run measures its own

@@ -26,9 +26,9 @@ SIGN_IN, FORBIDDEN, HIDDEN, OVER = frozenset({401}), frozenset({403}), frozenset
 class Person:
     """Kind of caller of the project `lab`.
 
-    `standing` is the kind of the credential: no credential (`none`), one that the server refuses (`refused`), that of a
-    user (`user`), that of an attempt in `lab` that is running (`attempt`) or has ended (`ended`), or that of a
-    participant of a study in `lab` (`participant`).
+    `standing` is the kind of the credential: no credential (`none`), a credential that the server refuses (`refused`),
+    or the token of a user (`user`), of a running attempt in `lab` (`attempt`), of an ended attempt in `lab` (`ended`),
+    or of a participant of a study in `lab` (`participant`).
     """
 
     name: str

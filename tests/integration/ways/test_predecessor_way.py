@@ -63,7 +63,7 @@ def items_of(lab: ProjectHandle) -> dict[str, Any]:
 
 
 def require_same_numbers(found: dict[str, Any]) -> None:
-    """Compare the stored numbers with those of the documents."""
+    """Compare the stored numbers with the numbers in the documents."""
     for name, document in old.clips().items():
         kind = Kind.PROCESSED if "aligned" in name else Kind.CLIP
         motion = found[f"{kind.value} {name.split('.')[0]}"].part("motion")
@@ -217,7 +217,7 @@ def test_a_folder_with_one_of_each_goes_in_at_once_and_out_byte_for_byte(
 
 
 def require_same_graph(found: dict[str, Any]) -> None:
-    """Compare the graph of the archive and its models with those of the archive."""
+    """Check that the graph `grasp` and its models have the contents of the archive."""
     graph = found["graph grasp"].part("graph")
     node = graph["actions"]["walk"]["primitives"]["walk_begin"]
     begin = found["model walk_begin"]

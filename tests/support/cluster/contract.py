@@ -30,7 +30,7 @@ PATIENCE_S = 180.0
 
 @dataclass
 class NamedCluster:
-    """Cluster that a kubeconfig names, as far as a test looks at it; `instance` is part of all names of the test."""
+    """Cluster that a kubeconfig names, with functions to examine it; names of a test's objects contain `instance`."""
 
     kubeconfig: Path
     image: str

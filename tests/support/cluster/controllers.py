@@ -1,4 +1,4 @@
-"""Controllers of the stub cluster: Jobs, Deployments, deletion of ended Jobs, and a small stand-in for Kueue."""
+"""Controllers of the stub cluster: Jobs, Deployments, deletion of ended Jobs, and a simple substitute for Kueue."""
 
 from __future__ import annotations
 

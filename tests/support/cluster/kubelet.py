@@ -69,7 +69,7 @@ class Kubelet:
         os.killpg(self.processes[pod].pid, signal.SIGKILL)
 
     def evict(self, pod: str, reason: str = "EvictionByEvictionAPI") -> None:
-        """End a pod as a cluster does that needs its node."""
+        """End a pod, as a cluster does if it needs the node of the pod."""
         self.objects.change("pods", pod, lambda one: set_condition(one, "DisruptionTarget", True, reason))
         self._terminate(pod)
 

@@ -23,7 +23,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class FaultTrial:
-    """How a trial runs: number of calls that submit jobs, duration of the faults, and the seed of the faults."""
+    """Parameters of a trial: number of calls that submit jobs, duration of the faults in seconds, seed, and others."""
 
     rounds: int
     seconds: float

@@ -49,7 +49,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class LoadTrial:
-    """How a trial runs, and the limits that it checks."""
+    """Parameters of a trial, and the limits that it checks."""
 
     minutes: float
     rate: float
@@ -68,7 +68,7 @@ class LoadTrial:
 
 @dataclass
 class Record:
-    """What a trial has measured."""
+    """Measurements of a trial."""
 
     waits_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     faults: Counter[str] = field(default_factory=Counter)

@@ -40,7 +40,7 @@ def refusal(data: bytes) -> tuple[str, str]:
 
 
 def changed(**members: Any) -> bytes:
-    """Return the zipped graph with members replaced or, for None, left out; underlines stand for dots."""
+    """Return the zipped graph with members replaced, or removed for None; underscores in names stand for dots."""
     names = {"definition": "graph_definition.json", "skeleton": "skeleton.json",
              "begin": "elementary_action_models/elementary_action_walk/walk_begin_quaternion_mm.json",
              "meta": "elementary_action_models/elementary_action_walk/meta_information.json"}  # fmt: skip

@@ -57,7 +57,7 @@ def test_no_foot_sinks_at_a_seam_of_walks_that_are_out_of_step(start: int, blend
 
 
 def test_a_foot_that_stands_on_both_sides_of_a_seam_stays_where_it_stands() -> None:
-    """The second clip stands 6 cm aside; its feet stay where the first clip put them until they step."""
+    """The second clip is shifted sideways by 6 cm; its feet stay at their places in the first clip until they step."""
     walk = generate_gait(1.3, 0.0, 4.0)
     toe = walk.skeleton.index_of(map_joints(walk.skeleton).joints["left_toe"])
     heights, places = _soles(walk)[:, 0], Motion.of(walk).positions(walk.skeleton)[:, toe]

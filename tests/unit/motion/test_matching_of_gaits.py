@@ -201,7 +201,7 @@ def places(database: MatchingDatabase, record: TrialRecord) -> list[tuple[str, i
 def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(
     takes: list[SourceClip], follow: Follow
 ) -> None:
-    """Trials have no straight approach, which the left and the right trial would begin in the same row."""
+    """The trials have no straight approach, because the left and the right trial would begin it in the same row."""
     closed = database_of(takes, DatabaseOptions(mirroring="add"))
     options = ControllerOptions(follow=follow)
     for speed, turn_rate_deg in ((1.3, 40.0), (2.0, 60.0), (1.0, 100.0)):

@@ -1,4 +1,4 @@
-"""Blobs in object storage without a network: names of objects, deletion beside writers, moves, settings."""
+"""Blobs in object storage without a network: names of objects, deletion while others write, moves, settings."""
 
 import threading
 from collections.abc import Iterable, Iterator, Sequence

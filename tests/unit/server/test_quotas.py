@@ -311,7 +311,7 @@ def test_an_import_that_is_being_stored_does_not_delay_other_uploads_of_the_user
 def test_concurrent_uploads_of_one_user_do_not_deadlock_and_all_of_them_count(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Imports store files that they share in different orders, beside other uploads of the same user."""
+    """Imports store the same files in different orders, at the same time as other uploads of the user."""
     monkeypatch.setattr(connections, "WRITE_TRIES", 1)  # so that a deadlock is an error
     lab.database.quotas = Quotas(user_daily_bytes=1_000_000)
     shared = [b"%d" % number * 1000 for number in range(10)]
