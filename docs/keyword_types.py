@@ -81,7 +81,7 @@ MODULES: Mapping[str, tuple[str, Taken]] = {
         },
     ),
 }
-"""Modules of `marey_client.keywords`: what their arguments are, and the models."""
+"""Modules of `marey_client.keywords`: a description of the arguments, and the models of these arguments."""
 
 
 def keyword_modules() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Object storage that fails, is slow or loses bytes: requests get an error or the right bytes, and others go on."""
+"""Object storage that fails, is slow or loses bytes: requests get an error or the right bytes, and do not delay others."""
 
 import os
 import secrets

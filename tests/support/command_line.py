@@ -87,5 +87,5 @@ def _logging_restored() -> Iterator[None]:
 
 
 def _hear_interrupts() -> None:
-    """Let Ctrl-C end this process. If the parent process ignores Ctrl-C, this process has inherited that."""
+    """Let Ctrl-C end this process, which otherwise ignores it if the parent process ignores it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -14,7 +14,7 @@ FAULTS = ("500", "503", "silence", "lost answer", "lost request", "truncated", "
 
 @dataclass
 class FaultyS3:
-    """Proxy at `endpoint`. `spoil` plans the faults of the next requests with a method; later requests pass."""
+    """Proxy at `endpoint`. `spoil` plans the faults of the next requests with an HTTP method; later requests pass."""
 
     port: int
     upstream_port: int

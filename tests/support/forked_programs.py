@@ -43,7 +43,7 @@ MODULES = (
     "marey_worker.commands", *CHILDREN_RUN, "psycopg", "sqlalchemy.dialects.postgresql", "sqlalchemy.dialects.sqlite",
     "uvloop",
 )  # fmt: skip
-"""Modules of servers, workers and their children, and those that these import when they open a database or start."""
+"""Modules of servers, workers and their children, and further modules that they import at their start."""
 STANDARD_ERROR = 2
 _STATUS = struct.Struct("<i")
 

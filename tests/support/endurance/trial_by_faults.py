@@ -35,7 +35,7 @@ class FaultTrial:
     """Kinds of faults; empty: all."""
     slow_s: float = 0.0
     fenced: bool = True
-    """False: the servers do not compare fences, so that the trial must find faults."""
+    """False: the servers do not compare fences, so that the trial must find broken rules."""
     only: Collection[str] = ()
     """Kinds of jobs; empty: all."""
     keep_logs: Path | None = None

@@ -22,7 +22,7 @@ from marey_schemas.items import Event
 from marey_schemas.queue.jobs import Job, JobCreate, JobState
 
 MAX_ATTEMPTS = 20
-"""The greatest number that the server allows, because many faults can meet the same job."""
+"""Number of attempts of each job: the greatest that the server allows, because many faults can meet the same job."""
 ENDS = {"job.succeeded", "job.failed", "job.cancelled"}
 ON_SCHEDULE = {"a": 4711, "b": 0}
 SAME = ("sum", "seen", "seed")

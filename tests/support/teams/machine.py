@@ -176,7 +176,7 @@ class TeamsMachine(RuleBasedStateMachine):
         self.world.counts["Look"] += 1
 
     def _race(self, choose: Chooser, chance: random.Random) -> None:
-        """Let two users change the same branch at once; or let one delete or purge an item that the other commits."""
+        """Let two users change a branch at once, or let one user delete or purge an item that another user commits."""
         mine = choose.commit(right=True)
         if mine is None:
             return
@@ -193,7 +193,7 @@ class TeamsMachine(RuleBasedStateMachine):
             self.session.race({"ben": mine, "ann": other}, _without_loss(_fate(chance)))
 
     def _demote(self, choose: Chooser, chance: random.Random) -> None:
-        """Let an owner make another owner a reader while that one writes; afterwards, restore the first role."""
+        """Let an owner make another owner a reader while the second owner writes; then restore the role."""
         choose.user = "mia"
         operation = choose.operation(chance.choice(("commit", "reset", "delete_ref", "purge_item", "create_clip")))
         if operation is None:

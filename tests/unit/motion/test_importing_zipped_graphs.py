@@ -142,7 +142,7 @@ def test_names_in_refusals_are_short() -> None:
 def test_types_and_trees_are_found_without_searching_all_members_for_each_model(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Searching them took time with the square of their number: minutes for as many models as are permitted."""
+    """The time of these searches grew with the square of the number of models, up to minutes for permitted graphs."""
     searched: Counter[str] = Counter()
     unpacked, list_of = reader._members, reader._list_of
 

@@ -26,7 +26,7 @@ from marey_schemas.options.matching import ControllerOptions, DatabaseOptions, F
 FOLLOWS = ("time", "path", "open_loop")
 EXACT = ControllerOptions(root_inertialisation=False, reselect_window_s=0.0)
 UNBARRED = ControllerOptions(reselect_window_s=0.0)
-"""Options under which a search may choose any frame; a barred frame could be chosen in a copy of its clip."""
+"""Options under which a search may choose any frame, so that copies of a clip make no difference."""
 LEAN_M = 0.04
 """Greatest distance in metres between the torso and the curve of the feet, towards the inside."""
 

@@ -1,4 +1,4 @@
-"""Documents of the predecessor that were imported, changed and written, read again by code that is not Marey's."""
+"""Documents of the predecessor that were imported, changed and written, then read by an independent reader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Search for the first bad commit, compared with a look at every commit of random histories."""
+"""Search for the first bad commit, compared with tests of all commits of random histories."""
 
 from __future__ import annotations
 
