@@ -1,4 +1,4 @@
-"""Object storage that fails, is slow or loses bytes: requests get an error or the right bytes, and do not delay others."""
+"""Object storage that fails, is slow or loses bytes: requests get an error or the right bytes, others continue."""
 
 import os
 import secrets

@@ -163,7 +163,7 @@ def fork_children() -> None:
 def take_name(arguments: Sequence[str]) -> None:
     """Let `/proc` show `arguments` as the arguments of this process.
 
-    The new arguments replace those of the nursery, which have room for `LONGEST_NAME` bytes.
+    In memory, they replace the arguments of the nursery, so they may have at most `LONGEST_NAME` bytes.
     """
     with open("/proc/self/stat") as file:
         fields = file.read().rpartition(")")[2].split()
@@ -194,7 +194,7 @@ def _keep_only(*descriptors: int) -> None:
 def _serve(orders: socket.socket, parent: int) -> NoReturn:
     """Fork the children that the parent orders, until the kernel ends this process with its parent.
 
-    A child is forked twice: when the process between has ended, the parent adopts the child.
+    A child is forked twice: when the intermediate process has ended, the parent adopts the child.
     """
     while True:
         order, descriptors, _, _ = socket.recv_fds(orders, LONGEST_ORDER, MOST_DESCRIPTORS)

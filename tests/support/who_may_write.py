@@ -254,7 +254,7 @@ class WritingProgram:
     def _made(self, path: str) -> Folder:
         """Return the folder at a path.
 
-        If the model lacks it, the restoration of something below has created it; add it.
+        If the model lacks the folder, add it: the restoration of an item or a folder below it has created it.
         """
         found = self._nearest(path)
         if found.path == path:

@@ -148,7 +148,7 @@ class Chooser:
     def commit_to(self, name: str, branch: str, *, right: bool = False) -> CommitChanges | None:
         """Return a commit of up to three changes.
 
-        If `right` is false, it may expect a wrong newest commit of the branch.
+        If `right` is false, the request may expect a wrong newest commit of the branch.
         """
         dataset = self.project.datasets[name]
         changes = [self._change(name, branch) for _ in range(self.chance.randint(1, 3))]
