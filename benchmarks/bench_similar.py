@@ -44,7 +44,7 @@ def run(poses: int = POSES) -> list[Row]:
 
 
 def _written(folder: Path, features: Iterable[PoseFeatures]) -> Iterable[SearchedShard]:
-    """Write shards, each when it is full."""
+    """Write each shard as soon as it is full."""
     runs: list[Rows] = []
     written = 0
 

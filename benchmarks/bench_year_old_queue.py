@@ -112,7 +112,7 @@ class MeasuredQueue:
         return self.database.read(self.administrator, reading.read_job, self.newest)
 
     def count_queue(self) -> None:
-        """Read what `/metrics` and the pools of workers ask for."""
+        """Read the numbers that `/metrics` and the pools of workers need."""
         self.database.read(SYSTEM, read_figures, (), "1")
         self.database.read(SYSTEM, read_demand, JobReach({}), ["bench"], 100)
 

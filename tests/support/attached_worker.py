@@ -24,8 +24,8 @@ def python_path() -> str:
 class AttachedWorker:
     """A worker process that reads its token from its standard input, and ends when this input is closed.
 
-    Its log is a file in `folder`. With a `token_file`, the worker reads the token from the token file instead, and does not
-    end with its standard input. Unless `options` name kinds of job, the worker runs only the kinds of tests. The
+    Its log is a file in `folder`. With a `token_file`, the worker reads the token from there, and does not end with
+    its standard input. Unless `options` name kinds of job, the worker runs only the kinds of tests. The
     process is forked by the nursery; with `forked=False` it is new, so that `/proc` shows its own arguments.
     """
 

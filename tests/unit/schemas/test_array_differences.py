@@ -88,7 +88,7 @@ def test_nine_edited_frames_of_nine_hundred_take_less_than_two_percent() -> None
 
 
 def test_tiles_without_edited_frames_are_those_of_the_base() -> None:
-    """The receiver neither encodes them again nor stores other bytes."""
+    """The receiver neither encodes these tiles again, nor stores other bytes for them."""
     base = numbers("<f4", (FRAMES, 71)).cumsum(axis=0, dtype=np.float32)
     array = base.copy()
     array[300] += 1
