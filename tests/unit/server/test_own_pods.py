@@ -1,4 +1,4 @@
-"""Pods that run one job each: which jobs get such a pod, the rights of its token, and the order of starts."""
+"""Pods that run one job each: which jobs get such a pod, the rights of its token, and the pods that are started."""
 
 from __future__ import annotations
 
