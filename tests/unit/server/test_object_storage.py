@@ -139,7 +139,7 @@ class Sweeper:
         self._going: list[StoredObject] = []
 
     def step(self) -> None:
-        """Delete the objects of the last decision, if any; otherwise decide."""
+        """Delete the objects that the previous step has chosen; if it chose none, choose objects to delete."""
         if self._going:
             self._objects.delete([one.name for one in self._going])
             self._going = []
