@@ -255,7 +255,12 @@ def main() -> int:
     """Print the rows; return the exit status 0."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_year_old_queue", description=__doc__)
     parser.add_argument("--jobs", type=int, default=ENDED_JOBS, help="number of ended jobs (default: %(default)s)")
-    parser.add_argument("--databases", nargs="*", default=("SQLite", "Postgres"), help="names (default: both)")
+    parser.add_argument(
+        "--databases",
+        nargs="*",
+        default=("SQLite", "Postgres"),
+        help="databases to measure: SQLite, Postgres (default: both)",
+    )
     parser.add_argument("--event-days", type=int, default=365, help="days with events (default: 365); fewer save space")
     arguments = parser.parse_args()
     for row in run(arguments.jobs, arguments.databases, arguments.event_days):
