@@ -30,7 +30,7 @@ def main() -> int:
     parser.add_argument(
         "names", nargs="*", metavar="name", help=f"benchmarks to run, of {', '.join(names)}; default: all"
     )
-    parser.add_argument("--json", metavar="FILE", help="write the rows as JSON too")
+    parser.add_argument("--json", metavar="FILE", help="file to which the rows are also written as JSON")
     parser.add_argument("--strict", action="store_true", help="fail when a goal is missed")
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(names):
@@ -52,7 +52,7 @@ def main() -> int:
 
 
 def _table(rows: list[Row]) -> Table:
-    table = Table(title="Marey beside its peers: medians (best), ratios of medians", title_justify="left")
+    table = Table(title="Marey beside other libraries: medians (best), and their ratios", title_justify="left")
     for heading, justify in (
         ("job", "left"),
         ("size", "left"),

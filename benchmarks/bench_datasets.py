@@ -1,4 +1,4 @@
-"""Versions of datasets of up to a million entries, copies of versions between servers, and the same jobs in peers."""
+"""Versions of datasets of up to a million entries and copies between servers, compared with Git, DVC and Oxen."""
 
 from __future__ import annotations
 

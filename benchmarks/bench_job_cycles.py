@@ -1,4 +1,4 @@
-"""Durable job cycles on Postgres beside procrastinate, a job queue that stores its jobs in Postgres.
+"""Durable job cycles on Postgres, compared with procrastinate, a job queue that stores its jobs in Postgres.
 
 Both write every step of a job to the disk: submission, claim and completion. Marey's client sends requests to a server
 by HTTP, which checks tokens, roles, quotas and inputs, and records events; procrastinate's client runs its own three

@@ -103,9 +103,9 @@ def _peers(rows: Floats, selectable: NDArray[np.bool_]) -> dict[str, Callable[[F
 
 
 def _database(row_count: int) -> tuple[Floats, Rows, Floats]:
-    """Return normalised rows (N, D), where each clip starts (row indices, with N at the end), and trajectories.
+    """Return normalised rows (N, D), the first row of each clip (row indices, with N at the end), and trajectories.
 
-    The trajectories come from clips that are held out. The rows are those of all other clips, followed by rows of
+    The trajectories come from clips that are held out. The rows come from all other clips, followed by rows of
     copies of these clips with random changes of scale and offset. Copies are added until there are `row_count` rows.
     """
     clips = matching_features()

@@ -97,7 +97,7 @@ def _all_measurements() -> Row:
 
 
 def _clips(metric: PerceptualMetric) -> Row:
-    """Compare clip distances with the loop for both maps alone, without any registration."""
+    """Time the distance of two clips; the loop computes only both motion maps, without registration curves."""
     from dataclasses import replace
 
     a, b = (replace(_walk(CYCLE_FRAMES, speed), cyclic=True) for speed in (1.2, 1.6))

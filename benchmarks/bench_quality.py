@@ -20,7 +20,7 @@ LOOP_GOAL = 20
 
 
 def run() -> list[Row]:
-    """Measure on one thread: all measures of many clips, and one measure beside the loop of its formula."""
+    """Measure on one thread: all measures of many clips, and one measure compared with a plain loop of its formula."""
     return [_clips(), _weighted_skate()]
 
 

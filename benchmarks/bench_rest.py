@@ -17,7 +17,7 @@ from benchmarks.local_server import PROJECT, LocalServer, Seeded, local_server, 
 from benchmarks.timing import Row
 
 FRAMES, JOINTS = 1040, 63
-"""About 500 kB as stored."""
+"""Numbers of frames and joints of a clip whose stored form has about 500 kB."""
 CONNECTIONS = 8
 SECONDS = 6.0
 ROUNDS = 4

@@ -1,4 +1,4 @@
-"""Exact searches by example, beside searches of all windows in numpy.
+"""Exact searches by example, compared with searches of all windows in numpy.
 
 The number of poses can be given: `python -m benchmarks.bench_similar 3000000` measures 100,000 s of motion at 30 Hz,
 for which 2 GB of temporary files are written.
@@ -34,7 +34,7 @@ _ALL = (1 << len(JOINTS)) - 1
 def run(poses: int = POSES) -> list[Row]:
     """Measure the processor time of both threads together, for each of some examples; half of them are unchanged takes.
 
-    The hits of the first example of each length must be those of numpy.
+    For the first example of each length, the hits must equal the hits that numpy finds.
     """
     originals = [one for one in takes() if presence(one) == _ALL]
     with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
@@ -44,7 +44,7 @@ def run(poses: int = POSES) -> list[Row]:
 
 
 def _written(folder: Path, features: Iterable[PoseFeatures]) -> Iterable[SearchedShard]:
-    """Write shards, each when it is full."""
+    """Write each shard as soon as it is full."""
     runs: list[Rows] = []
     written = 0
 
@@ -65,7 +65,7 @@ def _written(folder: Path, features: Iterable[PoseFeatures]) -> Iterable[Searche
 
 
 def _examples(shards: list[SearchedShard], seconds: float) -> list[Example]:
-    """Choose windows of the first takes, which are unchanged, and of any shard, in turn."""
+    """Choose windows alternately from the first takes, which are unchanged, and from any shard."""
     rng, offsets = np.random.default_rng(0), sample_offsets(seconds)
     examples: list[Example] = []
     while len(examples) < SEARCHES:

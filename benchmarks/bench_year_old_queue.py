@@ -1,4 +1,4 @@
-"""The queue of a server that has run for a year, beside a new one: the same operations with and without ended jobs.
+"""The queue of a server that has run for a year, compared with a new one: the same operations beside ended jobs.
 
 Operations call the store of this process without HTTP. The ratio compares the processor time of this process and of
 the database, with few and with many ended jobs: each round measures both, one after the other. A ratio of 1 means that
@@ -50,7 +50,7 @@ ROUNDS = 9
 CYCLES = 40
 """Number of jobs that are submitted, claimed and completed in each round."""
 ROUND_S, MOST_CALLS = 0.05, 100
-"""Each round repeats an operation for about this long, at most so often."""
+"""Duration in seconds for which each round repeats an operation, and greatest number of repetitions."""
 GOAL = 0.8
 
 
@@ -112,12 +112,12 @@ class MeasuredQueue:
         return self.database.read(self.administrator, reading.read_job, self.newest)
 
     def count_queue(self) -> None:
-        """Read what `/metrics` and the pools of workers ask for."""
+        """Read the numbers that `/metrics` and the pools of workers need."""
         self.database.read(SYSTEM, read_figures, (), "1")
         self.database.read(SYSTEM, read_demand, JobReach({}), ["bench"], 100)
 
     def follow_events(self) -> None:
-        """Read the newest events of the project, and what the server announces."""
+        """Read the newest events of the project, and the topics of new events that wake waiting requests."""
         self.database.write(SYSTEM, events.number_events)
         after = self.database.read(SYSTEM, events.newest_number) - 50
         self.database.read(self.administrator, events.list_events, PROJECT, after=after)
@@ -131,7 +131,7 @@ class MeasuredQueue:
         commit_deferred(self.database)
 
     def sweep(self) -> None:
-        """Do the hourly work of the leading server: delete what is old or unused."""
+        """Do the hourly work of the leading server: delete old rows and unused blobs."""
         retire(self.database, Retention())
         collect_garbage(self.database)
 
@@ -178,7 +178,7 @@ _OF_A_CYCLE = ("submit", "claim", "complete")
 
 
 def run(jobs: int = ENDED_JOBS, databases: Sequence[str] = ("SQLite", "Postgres"), event_days: int = 365) -> list[Row]:
-    """Measure each operation beside `jobs` ended jobs, with the events of the last days, and beside few."""
+    """Measure each operation in a queue with `jobs` ended jobs and the events of `event_days`, and in one with few."""
     rows = []
     if "SQLite" in databases:
         with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
@@ -254,9 +254,14 @@ def _row(database: str, jobs: int, operation: str, times: Sequence[tuple[float, 
 def main() -> int:
     """Print the rows; return the exit status 0."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_year_old_queue", description=__doc__)
-    parser.add_argument("--jobs", type=int, default=ENDED_JOBS, help="how many ended jobs instead of %(default)s")
-    parser.add_argument("--databases", nargs="*", default=("SQLite", "Postgres"), help="default: %(default)s")
-    parser.add_argument("--event-days", type=int, default=365, help="days of which there are events, to save space")
+    parser.add_argument("--jobs", type=int, default=ENDED_JOBS, help="number of ended jobs (default: %(default)s)")
+    parser.add_argument(
+        "--databases",
+        nargs="*",
+        default=("SQLite", "Postgres"),
+        help="databases to measure: SQLite, Postgres (default: both)",
+    )
+    parser.add_argument("--event-days", type=int, default=365, help="days with events (default: 365); fewer save space")
     arguments = parser.parse_args()
     for row in run(arguments.jobs, arguments.databases, arguments.event_days):
         print(f"{row.job:45} {row.size:40} {row.ratio:6.2f}x  {row.ours}; {row.peer}")

@@ -60,7 +60,7 @@ def _without_numbers(size: str) -> str:
 
 
 def _take(left: list[Row], row: Row, form: Callable[[str], str]) -> Row | None:
-    """Remove the first row of the same job and size from `left`, and return this row, or None.
+    """Remove the first row with the job and size of `row` from `left`, and return it, or None if there is none.
 
     The sizes are compared after conversion by `form`.
     """

@@ -151,7 +151,7 @@ def free_port() -> int:
 
 @dataclass(frozen=True)
 class Seeded:
-    """What `seed` has created in a project: a clip and the clip's skeleton."""
+    """A clip and the clip's skeleton, which `seed` has created in a project."""
 
     clip: str
     stored_bytes: int

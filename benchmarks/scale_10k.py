@@ -65,7 +65,7 @@ class MemoryWatch:
 def main() -> int:
     """Run the measurement and print a table; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale_10k", description=__doc__)
-    parser.add_argument("--clips", type=int, default=CLIPS, help="how many clips instead of %(default)s")
+    parser.add_argument("--clips", type=int, default=CLIPS, help="number of clips (default: %(default)s)")
     clips: int = parser.parse_args().clips
     console, watch = Console(width=110), MemoryWatch()
     with local_server() as server:

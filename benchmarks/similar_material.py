@@ -19,7 +19,10 @@ _REAL_TAKES = ("bandai-namco-1/*.bvh", "bandai-namco-2/*.bvh", "cmu-bvh/*.bvh", 
 _LEAST_ROWS = 12
 _SPEEDS, _SIZES = (0.7, 1.4), (0.85, 1.2)
 _MOVED_M, _TURNED_RAD, _PERIOD_ROWS = 0.02, 0.05, 45
-"""Changes of the poses of a copy: per joint, smooth, another every 1.5 s, on top of constant ones of the same size."""
+"""Size of the changes of a copy's poses (metres, radians), and their period in rows: 45 rows are 1.5 s.
+
+Each joint gets a constant change, and a smooth change of the same size with a new random value in each period.
+"""
 
 
 def takes() -> list[PoseFeatures]:

@@ -81,7 +81,7 @@ MODULES: Mapping[str, tuple[str, Taken]] = {
         },
     ),
 }
-"""Modules of `marey_client.keywords`: what their arguments are, and the models."""
+"""Modules of `marey_client.keywords`: a description of the arguments, and the models of these arguments."""
 
 
 def keyword_modules() -> dict[str, str]:
@@ -146,7 +146,7 @@ class KeywordModule:
         return name
 
     def _written(self, kind: Any) -> str:
-        """Return a type as it is written in Python; lists may be given for tuples, and documents for models."""
+        """Return the source text of a type; it accepts lists in place of tuples, and documents in place of models."""
         return " | ".join(self._parts(kind))
 
     def _parts(self, kind: Any) -> list[str]:

@@ -40,12 +40,12 @@ from marey_server.store.transaction import Transaction
 from marey_versions.records import DatasetEntry
 
 CLIPS, FEW = 142_220, 1_000
-"""Number of clips of the collection, and of the small one with which checkouts are compared."""
+"""Number of clips of the collection, and of the small collection with which checkouts are compared."""
 IMPORTED, JOINTS, RATE_HZ = 200, 77, 30.0
-"""Number of clips that are imported from files, and their form; their durations are evenly spread."""
+"""Number of clips that are imported from files, their number of joints, and their frame rate in Hz."""
 SHORTEST_S, LONGEST_S = 15.0, 60.0
 PER_SUBJECT = 300
-"""Number of clips of each performer, which have a folder of their own."""
+"""Number of clips of each performer; each performer has a folder."""
 ALL, IMPORTS = "all", "all/imported"
 TIMEOUT_S = 600.0
 ROWS_PER_WRITE = 10_000
@@ -68,7 +68,7 @@ SELECTIONS = (
 
 
 def measure_collection() -> list[Row]:
-    """Measure an import, the first commit of all clips, and checkouts of 300 clips beside those from few clips."""
+    """Measure an import, the first commit of all clips, and checkouts of 300 clips from all clips and from few."""
     with local_server(partial(_prepare, FEW)) as server:
         few = _checkouts(server, FEW)
     with local_server(partial(_prepare, CLIPS)) as server:

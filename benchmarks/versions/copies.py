@@ -32,10 +32,10 @@ from marey_schemas.access import ProjectCreate
 from marey_schemas.documents.references import RevisionRef
 
 LABELLED, LABELS = 500, 5
-"""Number of clips of the dataset of which one is relabelled at a time, and how often this is measured."""
+"""Number of clips of a dataset in which one clip is relabelled at a time, and number of repetitions."""
 FOLDER = "day 0"
 CLIPS, FRAMES, JOINTS = 100, 900, 77
-"""Size of the dataset with edited frames; its clips of 15 s have 60 frames in a second."""
+"""Numbers of clips, of frames of each clip, and of joints of the dataset with edited frames; the clips have 60 Hz."""
 GOAL_LABEL_BYTES, GOAL_SHARE = 20_000, 0.02
 
 
@@ -145,7 +145,7 @@ def _take(number: int) -> Clip:
 
 
 def _with_other_frames(take: Clip, number: int, start: int, count: int) -> Clip:
-    """Return the take with `count` frames from `start` on replaced by those of a take with other noise and fingers."""
+    """Return the take with `count` frames from `start` on replaced by the same frames of a take with other noise."""
     other = _take(CLIPS + number)
     poses = np.array(take.poses)
     poses[start : start + count] = other.poses[start : start + count]
@@ -153,7 +153,7 @@ def _with_other_frames(take: Clip, number: int, start: int, count: int) -> Clip:
 
 
 def _share(what: str, first: Copy, second: Copy) -> Row:
-    """Return the row for a second copy: the bytes on each of its two ways, as a share of those of the first copy."""
+    """Return the row for a second copy: the bytes to and from each server, as a share of those of the first copy."""
     read, sent = second.source_bytes / first.source_bytes, second.target_bytes / first.target_bytes
     return Row(
         "second copy with 1 % edited frames", f"{CLIPS} clips of {FRAMES} frames, {JOINTS} joints; {what}",

@@ -119,7 +119,7 @@ class _Measurement:
         return Measured(times, written)
 
     def _written(self, times: list[float]) -> Written:
-        """Measure commits of one change; append their times to `times`, and return what they write."""
+        """Measure commits of one change; append their times in ms to `times`, and return the bytes that they write."""
         begun_us, before = time.time() * 1e6, _bytes_to_files(self._server)
         times += _times(lambda: self._commit(places=[next(self._places)]))
         after, commits = _bytes_to_files(self._server), REPEATS + 1

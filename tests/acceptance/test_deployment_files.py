@@ -36,7 +36,7 @@ def services() -> dict[str, Any]:
 
 
 def started_commands() -> list[list[str]]:
-    """Return the words after `marey` of each command that a unit or an image starts, or that the page runs in them."""
+    """Return the words after `marey` of each command that a unit, an image or a page of the documentation runs."""
     lines = [shlex.split(line) for unit in UNITS for line in directives(unit, "ExecStart")]
     assert all(words.pop(0) == "/opt/marey/bin/marey" for words in lines)
     started = re.findall(r"CMD (\[.*\])", CONTAINERFILE.read_text(encoding="utf-8"))

@@ -38,7 +38,7 @@ class Uploaded:
 
 @pytest.fixture(scope="module")
 def uploaded(mocap: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Uploaded]:
-    """The collection on a server; of many files with the same skeleton, a few, except in the tier `soak`."""
+    """The collection on a server; outside the tier `soak`, only a few of the files with the same skeleton."""
     with serving(tmp_path_factory.mktemp("collection")) as server, server.client() as marey:
         lab = marey.project("lab")
         marey.transport.send("POST", "/projects", content=b'{"name": "lab"}')

@@ -32,7 +32,7 @@ OLD_US = 2 * 24 * 3600 * 1_000_000
 
 
 def written_by(backing: Any) -> type:
-    """Return the class whose method `write` transactions call."""
+    """Return the class of the object whose method `write` is called by transactions."""
     return type(backing.within(Carried(), int)) if isinstance(backing, ObjectBlobs) else type(backing)
 
 

@@ -16,7 +16,7 @@ from marey_server.launchers.pools import find_launcher
 
 @pytest.fixture(scope="class")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StubCluster]:
-    """A stub cluster, whose folder with the files of Secrets is none of the folders that a test searches for tokens."""
+    """A stub cluster, which stores files of Secrets outside the folders that a test searches for tokens."""
     with running_cluster(tmp_path_factory.mktemp("contract") / "cluster") as stub:
         yield stub
 

@@ -388,7 +388,7 @@ def test_a_server_in_a_pod_uses_the_newest_token_of_its_service_account(
 
 
 class Tomorrow(datetime.datetime):
-    """Clock of the next day."""
+    """Clock that is one day ahead."""
 
     @classmethod
     def now(cls, tz: datetime.tzinfo | None = None) -> Tomorrow:

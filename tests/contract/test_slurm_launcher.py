@@ -202,7 +202,7 @@ def commands(folder: Path, monkeypatch: pytest.MonkeyPatch, **scripts: str) -> N
 def test_when_the_controller_has_forgotten_a_task_the_records_explain_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: str, reason: str, status: int | None
 ) -> None:
-    """The records are scripted, because accounting needs a database server beside the controller."""
+    """A script simulates the accounting records, because real accounting needs a further database server."""
     lines = f"echo '7_1|COMPLETED|0:0'; echo '7_2|{record}'"
     commands(tmp_path, monkeypatch, squeue="exit 0", sacct=lines)
     end = asyncio.run(SlurmLauncher(context_of(tmp_path)).why_ended("crew-k1-2"))

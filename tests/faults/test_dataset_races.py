@@ -105,7 +105,7 @@ def both(lab: Lab, other: Database, first: Callable[..., Any], second: Callable[
 def test_of_two_checkouts_the_folder_has_all_entries_of_the_second(
     gaits: Lab, other: Database, paths: tuple[tuple[str, ...], tuple[str, ...]]
 ) -> None:
-    """Otherwise, the next commit of the folder would remove the entries that the first checkout has taken away."""
+    """If entries were missing, the next commit of the folder would remove them from the branch."""
 
     def checking_out(only: tuple[str, ...]) -> Callable[[Transaction], Any]:
         request = CheckoutRequest(paths=only, discard=True)

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.timeout(900)
 
 @dataclass(frozen=True)
 class Ended:
-    """How a trial ended: its exit status, and its output with its errors."""
+    """End of a trial: its exit status, and its output including the error output."""
 
     status: int
     output: str
@@ -61,9 +61,9 @@ def test_jobs_under_faults_have_the_results_of_a_quiet_run(trial: Trial) -> None
 
 @pytest.mark.soak
 def test_the_trial_finds_that_fences_are_not_compared(trial: Trial) -> None:
-    """A worker that is suspended while it draws completes a job that another worker has by then.
+    """A suspended worker continues after its lease has ended, and completes a job that another worker is running.
 
-    In one trial, all suspended workers may be idle, so there are up to three.
+    In a trial, all suspended workers may be idle, so up to three trials run.
     """
     words = ("--rounds", "8", "--seconds", "40", "--every", "0.6", "--slow", "9", "--jobs", "draw")
     told = ""

@@ -31,7 +31,7 @@ LONG: dict[str, Any] = {
     "replicates": 1,
     "report": False,
 }
-"""Arguments of an evaluation of 80 trials in 10 tasks. A task takes longer than two questions of `wait_until`."""
+"""Arguments of an evaluation of 80 trials in 10 tasks. A task takes longer than two polls of `wait_until`."""
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.soak, pytest.mark.timeout(7200)]
 
 LONGEST_ANSWER_S = 10.0
 AT_ONCE = 3
-"""Number of requests that are sent to one operation before it is the turn of the next operation."""
+"""Number of requests that are sent to one operation before requests are sent to the next one."""
 MOST_FAULTS = 20
 PROBES = list(probes())
 

@@ -1,4 +1,4 @@
-"""Concurrent uses of invitations: only one person gets the last use. If the inviter loses the right, nobody does."""
+"""Concurrent uses of invitations: one person gets the last use, or nobody if the inviter loses the right to invite."""
 
 from __future__ import annotations
 

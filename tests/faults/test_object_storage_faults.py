@@ -1,4 +1,4 @@
-"""Object storage that fails, is slow or loses bytes: requests get an error or the right bytes, and others go on."""
+"""Object storage that fails, is slow or loses bytes: requests get an error or the right bytes, others continue."""
 
 import os
 import secrets
@@ -244,7 +244,7 @@ def test_a_sweeper_that_dies_has_deleted_nothing_that_a_row_names(
 
 
 class _DiedError(BaseException):
-    """Stands for the death of the process."""
+    """Error that simulates the death of the process."""
 
 
 def _die(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""Pods of a job's own as real workers, beside a real server: kills, duplicates, restarts, tasks and images."""
+"""Pods that run one job each, as real workers of a real server: kills, duplicates, restarts, tasks and images."""
 
 from __future__ import annotations
 

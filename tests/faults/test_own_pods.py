@@ -64,7 +64,7 @@ def lose_lease(bench: DispatchBench) -> None:
 
 
 def run_out_of_memory(bench: DispatchBench, cluster: StubCluster, job: str, number: int) -> None:
-    """Let the start of a job with this number claim the job, and die because its container has no memory left."""
+    """Let the pod of the start with this number claim the job, and die because its container has no memory left."""
     bench.rounds_until(lambda: name_of(job, number) in bench.jobs() and bench.pods())
     (lease,) = bench.claim(job)
     bench.desk.heartbeat(lease)

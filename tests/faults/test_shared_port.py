@@ -155,7 +155,8 @@ def test_sign_ins_are_limited_at_all_processes_together(pair: Pair) -> None:
 class Load:
     """Threads that create collections during a `with` block, some over a new connection for each request.
 
-    After the block, everything that was accepted is stored, and if the load is not forgiving, no request has failed.
+    After the block, the load checks that all accepted collections are stored. Unless it is `forgiving`, it also checks
+    that no request has failed.
     """
 
     def __init__(self, server: SharingServer, name: str, *, forgiving: bool) -> None:

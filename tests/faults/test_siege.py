@@ -218,7 +218,7 @@ def test_two_servers_and_workers_that_are_killed_and_stopped_publish_each_job_on
 def _starts(
     folder: Path, servers: list[ServerProcess], workers: list[WorkerProcess], token: str
 ) -> list[Callable[[], object]]:
-    """Return one function for each server and worker that starts it; each server gets half of the workers."""
+    """Return, for each server and worker, a function that starts it; each server gets half of the workers."""
 
     def start_worker(number: int) -> Callable[[], object]:
         cache, url = folder / f"cache{number}", servers[number % len(servers)].url

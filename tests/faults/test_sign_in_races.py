@@ -1,4 +1,4 @@
-"""Concurrent steps of sign-ins with an identity provider, on two servers: a person is let in once, or not at all."""
+"""Concurrent steps of sign-ins with an identity provider, on two servers: a person is signed in once, or not at all."""
 
 from __future__ import annotations
 

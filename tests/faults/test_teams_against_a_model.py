@@ -139,7 +139,7 @@ PLANTS: dict[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]] = {
     check_no_role: ("commit", "demote"),
     ignore_folder_roles: ("create_clip", "restrict"),
 }
-"""Faults that are planted, and for each the kinds of steps in the programs that must find it."""
+"""Planted faults; for each fault, the kinds of steps that random programs need in order to find it."""
 
 
 @pytest.mark.soak

@@ -293,7 +293,7 @@ def _is_sign_in(entry: dict[str, Any]) -> bool:
 
 
 def check_details(story: Story) -> None:
-    """Check that the bodies of entries tell what changed."""
+    """Check that the bodies of entries state the changes."""
     bodies = {(one["kind"], one["about"]): one["body"] for one in story.entries()}
     assert bodies["project.changed", "lab"] == {"fields": ["visibility"], "visibility": "public"}
     assert bodies["project.limited", "lab"] == {"limits": {"items": 50}}

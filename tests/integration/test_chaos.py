@@ -1,4 +1,4 @@
-"""Fault injection into a server: what it finds on a sound server, and that it finds what is wrong."""
+"""Fault injection into a server: a server without defects passes, and planted defects are found."""
 
 import random
 from collections.abc import Iterator

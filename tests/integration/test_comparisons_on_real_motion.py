@@ -24,7 +24,7 @@ FAMILIES = {"judged": {"better", "worse"}, "others": {"changed"}}
 """Families of metrics, with the verdicts that their changes can have."""
 COMPARISONS, REPLICATES = 1000, 8
 POOL = 48
-"""Number of replicates from which those of a comparison are drawn."""
+"""Number of simulated replicates, from which the replicates of each comparison are drawn."""
 OPTIONS = EvaluationOptions(
     speeds_m_s=(1.0, 1.5, 2.5), turn_rates_deg_s=(-75.0, -25.0, 0.0, 50.0), duration_s=8.0, switch_every_s=3.0
 )

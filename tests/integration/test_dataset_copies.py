@@ -237,7 +237,7 @@ def test_a_file_that_a_version_needs_is_copied_although_its_clip_is_deleted(
 def test_a_reference_to_an_item_of_the_receiving_project_is_refused_with_what_to_do(
     marey: Marey, lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle
 ) -> None:
-    """Only the receiving project knows the item, so that the same document has another digest there."""
+    """Only the receiving project has the item, so the digest of the same document differs there."""
     rig = make_rig(partner)
     body = {"schema": "marey/document@1", "rig": {"item": rig.id, "revision": 1}}
     study = lab.items(Kind.CHARACTER).create("character", {"character": body})
@@ -413,7 +413,7 @@ def test_a_copy_to_a_server_of_an_earlier_version_sends_whole_arrays(
 def test_a_copy_with_differences_continues_after_an_interruption(
     lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Ctrl-C while documents are read, and again while they are sent."""
+    """The copy is interrupted by Ctrl-C while it reads documents, and again while it sends them."""
     clips = {name: make_walk(lab, name) for name in ("a", "walk")}
     assert_copied(partner, gaits, commit(gaits, **clips))
     for clip in clips.values():

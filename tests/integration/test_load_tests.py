@@ -1,4 +1,4 @@
-"""Load tests of a running server: what they measure, and that they leave nothing behind."""
+"""Load tests of a running server: their measurements, and the removal of scratch projects and tokens."""
 
 import json
 from collections.abc import Iterator

@@ -46,7 +46,7 @@ class Model:
     checks: dict[str, CheckState] = field(default_factory=dict)
     """State of the check by commit."""
     waiting: tuple[str, str] | None = None
-    """User for whom the proposal is merged as soon as possible, and the commit to merge; None if it does not wait."""
+    """User for whom the proposal is merged as soon as possible, and the commit to merge; None if no merge waits."""
 
     def lacks_nothing(self, head: str, rule: ProtectionRule | None) -> bool:
         if any(verdict is Verdict.REQUEST_CHANGES for verdict, _ in self.verdicts.values()):

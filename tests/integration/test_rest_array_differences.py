@@ -33,7 +33,7 @@ ABSENT = "sha256:" + "2" * 64
 
 
 def poses(edited: int = 0, height_m: float = 0) -> NDArray[np.float32]:
-    """Return the poses of one joint; the root is moved in `edited` frames from frame 300 on, and up in all frames."""
+    """Return the poses of one joint; `edited` frames from frame 300 on are moved by 0.5 m, all by `height_m`."""
     made = np.zeros((FRAMES, 7), np.float32)
     made[:, :3] = np.random.default_rng(1).normal(size=(FRAMES, 3))
     made[:, 1] += height_m
@@ -43,7 +43,7 @@ def poses(edited: int = 0, height_m: float = 0) -> NDArray[np.float32]:
 
 
 def clip(array: NDArray[np.float32], sent: Any = None) -> dict[str, Any]:
-    """Return a clip with the given poses, in a request as the value `sent` instead."""
+    """Return a received clip whose digest is that of the poses `array`; its document contains `sent`, if given."""
     motion: dict[str, Any] = {
         "schema": "marey/motion@1", "frame_rate_hz": 30, "joints": ["Hips"], "skeleton": {"content": RIG},
         "poses": array,

@@ -457,7 +457,7 @@ def test_a_repeated_request_gets_its_commit_although_the_branches_are_gone(
 
 
 def test_no_branch_or_tag_hides_a_commit(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
-    """Otherwise, somebody who names a commit by its first digits would get the version of the branch."""
+    """If a branch could have the first digits of a commit as its name, it would be used in place of this commit."""
     first = ok(owner.get(f"{GAITS}/commits/main"))["digest"].removeprefix("sha256:")
     put(owner, "gaits/a", "Pelvis")
     gaits("second")

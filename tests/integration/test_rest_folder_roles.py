@@ -146,8 +146,8 @@ REQUESTS: dict[str, Sends] = {
 }
 """For each operation that a role in a folder allows or forbids: a function that sends the operation for a folder.
 
-Jobs and schedules belong to no folder, so the last three functions use one of `who` for `team`, and one of the owner
-for `other`.
+Jobs and schedules are in no folder. So the last three functions use a job or a schedule of `who` in place of one in
+`team`, and one of the owner in place of one in `other`.
 """
 
 OF_NO_FOLDER = ("DELETE /projects/{project}/schedules/", "POST /jobs/")

@@ -39,7 +39,7 @@ class Process:
     """A server in a separate process, started as by an operator."""
 
     def __init__(self, folder: Path, *, warm_up: bool = False, **environment: str) -> None:
-        """Start the server; with `warm_up`, it warms up as it does without any setting."""
+        """Start the server; with `warm_up`, it warms up at the start, which is the default of servers."""
         self.folder = folder
         own = {"MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json"}
         if not warm_up:

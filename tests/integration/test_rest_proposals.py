@@ -471,7 +471,7 @@ def test_a_merge_that_waits_is_prepared_again_if_a_branch_moves(
     prepare, earlier = proposals.prepare_waiting, list[Any]()
 
     def prepare_late(*arguments: Any) -> Any:
-        """Return at the second call the result of the first, as if the branch moved after the preparation."""
+        """Return the result of the first call at the second call, too, as if the branch moved after the preparation."""
         earlier.append(prepare(*arguments))
         return earlier[0 if len(earlier) == 2 else -1]
 
@@ -544,7 +544,10 @@ def test_wrong_versions_and_full_lists_are_refused(team: Team, monkeypatch: pyte
 
 
 def test_the_texts_of_proposals_have_limits(team: Team, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Empty texts are limited, too, because each counts 200 bytes more than it has. A quarter is for maintainers."""
+    """Each text counts 200 bytes more than its size, so empty texts are limited, too.
+
+    A quarter of each limit is reserved for maintainers.
+    """
     texts = "marey_server.store.datasets.proposals.texts"
     monkeypatch.setattr(f"{texts}.MOST_TEXT_OF_PROPOSAL", 1334)
     monkeypatch.setattr(server.database, "quotas", Quotas(project_proposal_bytes=2000))

@@ -292,7 +292,7 @@ def test_a_partial_array_takes_nothing_from_another_project(client: httpx.Client
 
 
 def partial_clip(first: dict[str, Any]) -> dict[str, Any]:
-    """Return a clip whose array of poses has all tiles of that of the clip `first`."""
+    """Return a clip with a partial array of poses, which takes its tiles from the poses of the clip `first`."""
     motion = {**first["parts"]["motion"], "poses": {
         "base": first["content"], "pointer": "/poses", "dtype": "<f4", "shape": [1, 7],
         "tiles": numbers("<i4", 0), "sizes": numbers("<i4"), "bytes": numbers("|u1"),
@@ -335,7 +335,7 @@ def test_tiles_are_hashed_when_no_transaction_is_open(client: httpx.Client, monk
 def test_a_base_is_divided_into_tiles_once_for_many_partial_arrays(
     client: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise a request with many small partial arrays of one large base takes an hour of processor time."""
+    """Without this, a request with many small partial arrays of one large base would take an hour of processor time."""
     rig = skeleton("Hips")
     first = clip("Hips", rig["content"])
     send(client, rig)

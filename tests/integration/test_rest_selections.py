@@ -155,7 +155,7 @@ def test_a_selection_of_nothing_or_of_too_much_is_refused(owner: httpx.Client, g
 def test_a_query_compares_the_content_of_the_version(
     owner: httpx.Client, gaits: Callable[..., Any], database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The items have other content now, and one of them other tags."""
+    """After the commit of the version, the items have got other content, and one item other tags."""
     item = item_at(owner, "gaits/raw/a")["id"]
 
     def measure(tx: Transaction) -> None:

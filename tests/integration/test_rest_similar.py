@@ -1,4 +1,4 @@
-"""Searches by example in indexes that somebody has written by hand: their files may be anything."""
+"""Searches by example in indexes that somebody has written by hand, with arbitrary files."""
 
 from __future__ import annotations
 

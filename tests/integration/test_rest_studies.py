@@ -1,4 +1,4 @@
-"""Studies over HTTP: links, consent, trials, withdrawal, and who sees what participants answered."""
+"""Studies over HTTP: links, consent, trials, withdrawal, and the rights to see the answers of participants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A backup that is made while clients write, with blobs in object storage: it is restored elsewhere, and serves."""
+"""A backup that is made while clients write, with blobs in object storage: a server uses the restored copy."""
 
 from __future__ import annotations
 

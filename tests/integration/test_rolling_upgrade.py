@@ -186,14 +186,14 @@ class Visitors:
         self._running = [self._pool.submit(self._write), self._pool.submit(self._upload)]
 
     def stop(self) -> None:
-        """Wait until the file is sent, and end the visits. Raises what a client raised."""
+        """Wait until the file is sent, and end both threads. Raises the first error of a client."""
         self._stopping.set()
         self._pool.shutdown()
         for one in self._running:
             one.result()
 
     def await_more(self, count: int) -> None:
-        """Wait until so many more items are written and pieces are sent."""
+        """Wait until `count` more items have been written, and `count` more pieces of the file have been sent."""
         written, pieces = self.written + count, self.pieces + count
         deadline = time.monotonic() + PATIENCE_S
         while self.written < written or self.pieces < pieces:

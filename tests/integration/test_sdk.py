@@ -28,7 +28,7 @@ WALK = generate_gait(1.3, 0.2, 2.0)
 
 @pytest.fixture
 def lab(server: Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[ProjectHandle]:
-    """The project `lab`, found as the command line finds it."""
+    """The project `lab`; server and token are read from environment variables, as by the command line."""
     monkeypatch.setenv("MAREY_SERVER", server.address)
     monkeypatch.setenv("MAREY_TOKEN", server.make_project())
     with marey.connect() as client:

@@ -13,7 +13,7 @@ from tests.support.forked_programs import ForkedProgram, nursery
 KINDS_OF_TESTS = Path(__file__).parents[1] / "unit" / "worker" / "thirdparty"
 """Distribution with the kinds of job that only tests know."""
 NAMES_OF_KINDS = ("add", "misbehave", "tally", "make")
-"""Names of these kinds. Their modules are loaded sooner than those of the built-in kinds."""
+"""Names of these kinds. Their modules take less time to load than the modules of the built-in kinds."""
 
 
 def python_path() -> str:
@@ -24,8 +24,8 @@ def python_path() -> str:
 class AttachedWorker:
     """A worker process that reads its token from its standard input, and ends when this input is closed.
 
-    Its log is a file in `folder`. With a `token_file`, the worker reads the token from this file instead, and does not
-    end with its standard input. Unless `options` name kinds of job, the worker runs only the kinds of tests. The
+    Its log is a file in `folder`. With a `token_file`, the worker reads the token from there, and does not end with
+    its standard input. Unless `options` name kinds of job, the worker runs only the kinds of tests. The
     process is forked by the nursery; with `forked=False` it is new, so that `/proc` shows its own arguments.
     """
 

@@ -11,7 +11,7 @@ from typing import Protocol
 
 
 class Forked(Protocol):
-    """A process that was forked for this process."""
+    """A process that a forker or the nursery has forked for this process."""
 
     pid: int
 
@@ -25,7 +25,7 @@ class Forked(Protocol):
 
 
 class AwaitedProgram:
-    """A forked program, with what servers need of an `asyncio.subprocess.Process`."""
+    """A forked program with those methods of `asyncio.subprocess.Process` that servers use."""
 
     def __init__(self, program: Forked, stdin: FileIO | None) -> None:
         self.stdin = stdin

@@ -26,8 +26,8 @@ FLOORS = {
 }
 """Minimum coverage in percent, by package: 2 to 3 percentage points below the coverage of a whole run of `make check`.
 
-Half of the client runs only in the whole ways of `make test`, and a part of the reports only in slow tests, which draw
-them. Most kinds of jobs, the limits, and the fork server in
+Half of the client runs only in the workflows of `make test`, and a part of the reports only in slow tests, which draw
+reports. Most kinds of jobs, the limits, and the fork server in
 `marey_schemas.processes` mostly run in child processes, which are not measured.
 """
 

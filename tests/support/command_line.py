@@ -54,7 +54,7 @@ class CommandLine:
 
 
 def run_here(arguments: list[str], stdin: str = "") -> subprocess.CompletedProcess[str]:
-    """Run `marey` in this process and return its result; its output streams are like those of a pipe."""
+    """Run `marey` in this process and return its result; its output streams are no terminal, like a pipe."""
     given, out, err = (io.TextIOWrapper(io.BytesIO(text), encoding="utf-8") for text in (stdin.encode(), b"", b""))
     streams = mock.patch.multiple(sys, argv=["marey", *arguments], stdin=given, stdout=out, stderr=err)
     status: object = 0
@@ -87,5 +87,5 @@ def _logging_restored() -> Iterator[None]:
 
 
 def _hear_interrupts() -> None:
-    """Let Ctrl-C end this process. If the parent process ignores Ctrl-C, this process has inherited that."""
+    """Let Ctrl-C end this process, which otherwise ignores it if the parent process ignores it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

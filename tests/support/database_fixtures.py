@@ -61,7 +61,7 @@ def _administer(url: URL, *statements: str) -> None:
 
 @contextlib.contextmanager
 def postgres_server(*, durable: bool = False) -> Iterator[URL]:
-    """Yield the address of a Postgres server on which databases may be created: a given one, or one that is started.
+    """Yield the address of a Postgres server on which databases may be created: the named server, or a new one.
 
     Unless `durable`, a started server does not wait for the disk, which makes tests faster.
     """

@@ -1,4 +1,4 @@
-"""Launcher without an engine, for tests of the task that keeps pools."""
+"""Launcher without an engine, for tests of the task that starts and stops the workers of pools."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from marey_server.launchers.launcher import EngineError, LaunchedWorker, WorkerE
 
 
 class FakeLauncher:
-    """Engine whose workers tests let run and end; `lose_answers` makes it do what was asked and then raise an error."""
+    """Engine whose workers run and end when a test says so.
+
+    With `lose_answers`, the engine starts the workers, but raises an error instead of answering.
+    """
 
     def __init__(self, *, outlives_server: bool = True) -> None:
         self.outlives_server = outlives_server

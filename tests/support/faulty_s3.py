@@ -14,7 +14,7 @@ FAULTS = ("500", "503", "silence", "lost answer", "lost request", "truncated", "
 
 @dataclass
 class FaultyS3:
-    """Proxy at `endpoint`. `spoil` plans the faults of the next requests with a method; later requests pass."""
+    """Proxy at `endpoint`. `spoil` plans the faults of the next requests with an HTTP method; later requests pass."""
 
     port: int
     upstream_port: int
@@ -24,7 +24,7 @@ class FaultyS3:
     authorizations: list[str | None] = field(default_factory=list)
     """The header Authorization of each request."""
     silent: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
-    """Released once for each request that gets no answer."""
+    """Semaphore that is released once for each request without an answer."""
     go_on: threading.Event = field(default_factory=threading.Event)
     """Ends the silence of all requests."""
 

@@ -72,7 +72,7 @@ def rolls(times: AnyFloats) -> tuple[Rotations, AnyFloats]:
 
 
 def fall(times: AnyFloats) -> tuple[Rotations, AnyFloats]:
-    """A fall on the back: the body stands for a third of the time, then lies and moves its arms."""
+    """A fall on the back: the body stands for a third of the time, then falls, lies, and moves its arms."""
     share = times / times[-1]
     lying = np.clip((share - 0.35) / 0.15, 0.0, 1.0)
     pose = {"Hips": turned("x", -88.0 * lying, times)}

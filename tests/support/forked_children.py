@@ -34,7 +34,7 @@ from marey_schemas.processes.limits import die_with_parent
 from marey_server.process import programs
 
 FORKS = sys.platform == "linux"
-"""Whether the system has what a forker needs: a process that adopts the orphans among its descendants."""
+"""Whether a process of this system can adopt the orphans among its descendants, as a forker needs it."""
 KERNELS = "marey_server.motions.reading"
 """Module that loads the compiled kernels."""
 MODULES = ("marey_worker.child", "marey_server.motions.child", KERNELS)
@@ -48,11 +48,11 @@ MOST_DESCRIPTORS = 8
 LONGEST_NAME = 4096
 """Number of bytes in which the arguments of a forked process must fit."""
 FORKER = "forker"
-"""What `/proc` shows as the only argument of a forker."""
+"""Text that `/proc` shows as the only argument of a forker."""
 
 
 class ForkedChild:
-    """A child that a forker has forked, with what `ChildProcess` needs of a `subprocess.Popen`."""
+    """A child that a forker has forked, with those methods of `subprocess.Popen` that `ChildProcess` uses."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
@@ -161,9 +161,9 @@ def fork_children() -> None:
 
 
 def take_name(arguments: Sequence[str]) -> None:
-    """Let `/proc` show these arguments as those of this process.
+    """Let `/proc` show `arguments` as the arguments of this process.
 
-    The arguments of the nursery, which all forked processes show otherwise, leave room for `LONGEST_NAME` bytes.
+    In memory, they replace the arguments of the nursery, so they may have at most `LONGEST_NAME` bytes.
     """
     with open("/proc/self/stat") as file:
         fields = file.read().rpartition(")")[2].split()
@@ -179,7 +179,10 @@ def _adopt_orphans(adopts: bool) -> None:
 
 
 def _keep_only(*descriptors: int) -> None:
-    """Close all other descriptors but those of the output; without a standard input, take it from nowhere."""
+    """Close all descriptors except `descriptors`, the standard input and the outputs.
+
+    If `descriptors` lacks the standard input (0), it is `/dev/null`.
+    """
     if 0 not in descriptors:
         nothing = os.open(os.devnull, os.O_RDONLY)
         os.dup2(nothing, 0)
@@ -191,7 +194,7 @@ def _keep_only(*descriptors: int) -> None:
 def _serve(orders: socket.socket, parent: int) -> NoReturn:
     """Fork the children that the parent orders, until the kernel ends this process with its parent.
 
-    A child is forked twice: when the process between has ended, the parent adopts the child.
+    A child is forked twice: when the intermediate process has ended, the parent adopts the child.
     """
     while True:
         order, descriptors, _, _ = socket.recv_fds(orders, LONGEST_ORDER, MOST_DESCRIPTORS)
@@ -221,7 +224,7 @@ def _serve(orders: socket.socket, parent: int) -> NoReturn:
 
 
 def _place(descriptors: list[int], places: list[int]) -> None:
-    """Give descriptors their numbers, and close all others but those of the output."""
+    """Give descriptors their numbers, and close all other descriptors except those of the output."""
     free = 1 + max((2, *descriptors, *places))
     moved = [fcntl.fcntl(descriptor, fcntl.F_DUPFD, free) for descriptor in descriptors]
     for descriptor, place in zip(moved, places, strict=True):

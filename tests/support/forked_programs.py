@@ -43,7 +43,7 @@ MODULES = (
     "marey_worker.commands", *CHILDREN_RUN, "psycopg", "sqlalchemy.dialects.postgresql", "sqlalchemy.dialects.sqlite",
     "uvloop",
 )  # fmt: skip
-"""Modules of servers, workers and their children, and those that these import when they open a database or start."""
+"""Modules of servers, workers and their children, and further modules that they import at their start."""
 STANDARD_ERROR = 2
 _STATUS = struct.Struct("<i")
 
@@ -247,7 +247,10 @@ def tell_statuses(running: dict[int, int]) -> None:
 def adopt(
     arguments: list[str], environment: dict[str, str], folder: str, own_children: bool, own_group: bool
 ) -> list[str]:
-    """Take on the name, the environment and the folder of a program; unless it has own children, give it a forker."""
+    """Adopt the name, the environment and the folder of a program.
+
+    Unless `own_children` is set, start a forker for the children of the program.
+    """
     if own_group:
         os.setpgid(0, 0)
     if FORKS:
@@ -260,7 +263,7 @@ def adopt(
 
 
 def take_on(environment: dict[str, str]) -> None:
-    """Take on the environment of a program, and read what modules read when they are imported."""
+    """Adopt the environment of a program, and read the variables again that modules read when they are imported."""
     from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
     from marey_server import faults
 

@@ -14,7 +14,7 @@ from openapi_python_client.config import Config, ConfigFile, MetaType
 from tests.support.tiers import NODE_PACKAGES
 
 BYTES_TYPES = ("application/zip", "image/png")
-"""Media types that a generated client must be told to be bytes."""
+"""Media types that the generator must be configured to treat as bytes."""
 ONLY_AS_JSON = ("Unsupported content type application/msgpack", "Unsupported content type application/bson")
 """Expected warnings: a generated client sends bodies as JSON only."""
 
@@ -29,7 +29,7 @@ def generate_python_client(document: Path, package: Path) -> list[str]:
 
 
 def check_typescript_program(document: Path, program: Path) -> str:
-    """Generate TypeScript types from an OpenAPI document into the file `api.ts` beside a program, and check its types.
+    """Generate TypeScript types from an OpenAPI document into `api.ts` in the folder of a program; check the program.
 
     Return the errors of the compiler.
     """

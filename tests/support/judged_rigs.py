@@ -1,4 +1,4 @@
-"""Sixteen pairs of real rigs, between which motions are retargeted, and what an animator judges in the results."""
+"""Sixteen pairs of real rigs between which motions are retargeted, and the measures that judge the results."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Actor:
 
     @classmethod
     def of(cls, mocap: Path, path: str) -> Actor:
-        """Read a file of the collection, with the skeleton beside it if it has one."""
+        """Read a file of the collection, and the skeleton file in the same folder if there is one."""
         file = mocap / path
         companion = next(file.parent.glob("*.asf")).read_bytes() if file.suffix == ".amc" else None
         read = read_motion(file.read_bytes(), file.name, companion=companion).clip
@@ -90,7 +90,7 @@ def plan_between(source: Actor | SimpleNamespace, target: Actor | SimpleNamespac
 
 @dataclass(frozen=True, eq=False)
 class JudgedRetargeting:
-    """A clip and its retargeted copy, as their joints move in the world."""
+    """A clip and its retargeted copy, with positions of joints in world coordinates."""
 
     source: Actor
     target: Actor
@@ -115,7 +115,7 @@ class JudgedRetargeting:
 
     @property
     def soles_off_m(self) -> float:
-        """Height of the soles of the result over the floor of the source, where the lower foot touches it."""
+        """Median height of the soles of the result above the floor, while the lower foot of the source touches it."""
         before, after = (
             sole_heights(kinematics.global_positions(clip, end_sites=True), actor.skeleton, self._feet(actor, "ankle"))
             for actor, clip in self._both
@@ -128,7 +128,7 @@ class JudgedRetargeting:
 
     @property
     def contact_speeds_m_s(self) -> tuple[float, float]:
-        """Mean speeds on the ground of ankles and toes in source and result, while those of the source touch it."""
+        """Mean horizontal speeds of ankles and toes in source and result, while they touch the floor in the source."""
         still = self._touching[1:] & self._touching[:-1]
         rate = self.source.clip.frame_rate_hz
         source, target = (
@@ -159,7 +159,7 @@ class JudgedRetargeting:
         return float(fastest[0]), float(fastest[1])
 
     def hands_off_m(self, scale: float) -> float:
-        """Compute how far hands are at most from those of the source, scaled about the middle of the shoulders."""
+        """Compute the greatest distance of hands from those of the source, scaled about the middle of the shoulders."""
         (left, left_after), (right, right_after) = (self.places(f"{side}_shoulder") for side in SIDES)
         off = []
         for side in SIDES:
@@ -174,7 +174,7 @@ class JudgedRetargeting:
 
     @property
     def _touching(self) -> Flags:
-        """Frames and points (F, 4) of the source that touch the floor: ankles, then toes."""
+        """Whether each ankle and toe of the source touches the floor, by frame (F, 4): ankles, then toes."""
         return contact_labels(self._foot_points(self.source, self.source.clip), self.source.clip.frame_rate_hz)
 
     def _foot_points(self, actor: Actor, clip: Clip) -> Floats:

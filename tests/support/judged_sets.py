@@ -1,4 +1,4 @@
-"""Sets of generated clips with a known flaw, evaluated on a few short trials, to test what a verdict says of them."""
+"""Sets of generated clips with a known flaw, evaluated on a few short trials, for tests of verdicts."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ WHERE schemaname = 'public' AND last_value IS NOT NULL
 
 
 class _Kept(NamedTuple):
-    """What a function made in an empty database."""
+    """Rows and result of a function that was called with an empty database."""
 
     put_back: Callable[[Any], None]
     """Function that puts the rows back, through a connection of the driver."""
@@ -35,7 +35,7 @@ class _Kept(NamedTuple):
 
 
 class _Placeholder:
-    """Object that stands for the database, or for its clock, in a result that is kept."""
+    """Placeholder for the database, or for its clock, in a stored result."""
 
 
 _DATABASE, _CLOCK = _Placeholder(), _Placeholder()
@@ -43,10 +43,10 @@ _KEPT: dict[tuple[bool, object], _Kept] = {}
 
 
 def made_once(make: Callable[[Database], T], database: Database) -> T:
-    """Return what `make` makes in an empty database, and leave its rows in `database`, which must be empty.
+    """Return the result of `make`, and fill `database`, which must be empty, with the rows that `make` creates.
 
-    The first call in a process runs `make`. Later calls for the same kind of database put its rows back, and return a
-    copy of its result. So `make` may depend on nothing but the database.
+    The first call in a process runs `make`. Later calls for the same kind of database insert the stored rows, and
+    return a copy of the stored result. So `make` may depend on nothing but the database.
     """
     key = (database.is_sqlite, make)
     if kept := _KEPT.get(key):

@@ -76,7 +76,7 @@ class Engine:
         self.until(lambda: all(self.states().get(name) == "running" and processes_of(name) for name in self.names))
 
     def until_ended(self, *names: str) -> None:
-        """Wait until workers have no process any more and the launcher knows it."""
+        """Wait until the processes of workers have ended, and the launcher no longer lists these workers as running."""
         self.until(lambda: all(self.states().get(name, "ended") == "ended" for name in names))
         self.until(lambda: not any(processes_of(name) for name in names))
 

@@ -37,7 +37,7 @@ def rubbish(size: int) -> bytes:
 
 
 def read_and_measure(make: Callable[[int], bytes], size: int, folder: str) -> None:
-    """Read a file of about `size` bytes; write the outcome, and the memory used beside it, to `folder`/result."""
+    """Read a file of about `size` bytes; write the outcome and the memory used for reading to `folder`/result."""
     data = make(size)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     try:

@@ -24,7 +24,7 @@ class PlainRows(NamedTuple):
 
 
 def joints_in_the_world(clip: Clip) -> np.ndarray:
-    """Return joint positions (F, J, 3), computed down the hierarchy frame by frame."""
+    """Return joint positions (F, J, 3) in world coordinates, in metres, computed frame by frame from the root down."""
     skeleton = clip.skeleton
     places = np.zeros((clip.frame_count, skeleton.joint_count, 3))
     for frame in range(clip.frame_count):

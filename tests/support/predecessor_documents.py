@@ -294,7 +294,7 @@ def model_times(document: Mapping[str, Any], scores: Array) -> Array:
 
 
 def encode(document: Mapping[str, Any], name: str) -> bytes:
-    """Encode a document as the ending of its file's name says."""
+    """Encode a document in the encoding that the ending of the file name states."""
     if name.endswith((".bson", ".bson.bz2")):
         blob: bytes = bson.encode(dict(document))
         return bz2.compress(blob) if name.endswith("bz2") else blob
@@ -315,7 +315,7 @@ def decode(data: bytes) -> Document:
 
 
 def transitions(*places: tuple[str, str, str]) -> Document:
-    """Return the transitions to places; each is an action, the name of a model, and its id in the database."""
+    """Return the transitions to nodes; each node is given by an action, the name of its model, and the model's id."""
     return {
         f"{action}:{number}": {"action_name": action, "model_name": name, "model_id": number}
         for action, name, number in places
@@ -354,9 +354,9 @@ SECTIONS: dict[str, Document] = {
         "time_function": json.dumps(TIME_FUNCTION),
     },
 }  # fmt: skip
-"""Notes of the clips of `folder`.
+"""Annotations of the clips of `folder`.
 
-Those of `walk` are inclusive, those of `turn` exclusive; labels of `run` overlap.
+Sections of `walk` include their end frames, sections of `turn` do not; labels of `run` overlap.
 """
 
 

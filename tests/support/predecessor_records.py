@@ -181,5 +181,5 @@ ZIPPED = "grasp.mg.zip"
 
 
 def folder() -> dict[str, bytes]:
-    """Return the files of a folder with one of everything: those of `predecessor_documents`, records, and a graph."""
+    """Return the files of a folder with one document of each kind: `predecessor_documents`, records, and a graph."""
     return {**old.folder(), **records(), ZIPPED: zipped_graph()}

@@ -1,4 +1,4 @@
-"""Values that may be None by their type, and that a test knows to be there."""
+"""Check for values whose type allows None, but which a test knows not to be None."""
 
 from __future__ import annotations
 

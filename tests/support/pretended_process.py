@@ -1,4 +1,4 @@
-"""Program that tests of the parent run instead of a server process; the setting `behaviour` says what it does.
+"""Program that tests of the parent run instead of a server process; the file `behaviour` selects its behaviour.
 
 It reads its order as a server process does. Then it is ready and waits for SIGTERM or the end of the parent
 (`serve`), ends at once (`fail`), or ends soon after it has become ready (`die`). It writes what it receives to a file.
@@ -15,7 +15,7 @@ from marey_server.shared_port.orders import READY, StartOrder
 
 
 def main() -> int:
-    """Behave as the file that the setting `behaviour` names says at this time; return the exit status."""
+    """Read the file `behaviour` in the folder that the settings name, and do what it says; return the exit status."""
     control = socket.socket(fileno=os.dup(0))
     order = StartOrder.receive(control)
     folder = Path(order.settings["folder"])

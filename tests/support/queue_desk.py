@@ -138,7 +138,7 @@ class Desk:
         self.database.write(self.user, projects.create_project, ProjectCreate(name=self.project))
 
     def replaced_token(self) -> Principal:
-        """Return the user with another token, as after a rotation."""
+        """Return a principal of the user with another token, as after a rotation."""
         return replace(self.user, token_id="token_new", token_key=b"another secret")
 
     # -- submitting ----------------------------------------------------------------------------------------------------

@@ -81,7 +81,7 @@ class ModelQueue:
         job.lease_expires_us = min(now_us + TTL_US, job.deadline_us + GRACE_US)
 
     def write(self, job_id: str) -> None:
-        """Count the attempt that holds a running job as a try, if this is its first write."""
+        """Count the attempt that holds a running job towards the limit of attempts, if this is its first write."""
         job = self.jobs[job_id]
         job.attempt += not job.started
         job.started = True

@@ -109,14 +109,14 @@ class S3Server:
 
 
 def moto(folder: Path) -> S3Server:
-    """Return a server that keeps objects in memory, without signatures being checked."""
+    """Return a server that keeps objects in memory and does not check signatures."""
     (port,) = free_ports(1)
     command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
     return S3Server("moto", port, command, folder, creates_bucket=True)
 
 
 def seaweedfs(folder: Path, command: Sequence[str] = ()) -> S3Server:
-    """Return a server that keeps objects on disk and checks signatures; `command` contains other words than usual."""
+    """Return a server that keeps objects on disk and checks signatures; `command` replaces the usual command."""
     ports = free_ports(10)
     names = (
         "s3.port", "s3.port.grpc", "master.port", "master.port.grpc", "volume.port", "volume.port.grpc", "filer.port",

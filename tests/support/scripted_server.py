@@ -27,7 +27,7 @@ def problem(
 
 
 def folder(path: str) -> httpx.Response:
-    """Return the list of folders of a project that has the folder `path`, which is how the client looks it up."""
+    """Return the answer to the client's lookup of a folder: the list of folders of a project with the folder `path`."""
     now = "2026-01-01T00:00:00Z"
     return httpx.Response(
         200, json={"items": [{"id": "collection_1", "path": path, "created_at": now, "updated_at": now, "rev": 1}]}

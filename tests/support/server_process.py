@@ -36,7 +36,7 @@ class MareyProcess:
     """A process with its own environment; `log` is the file of its output."""
 
     own_children = False
-    """Whether its child processes are new ones, which have arguments and share no memory, instead of forked ones."""
+    """Whether the child processes are started as new programs instead of forked, so that they share no memory."""
 
     def __init__(self, log: Path) -> None:
         self.log = log

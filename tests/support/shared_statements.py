@@ -1,7 +1,7 @@
-"""Engines of a test process that compile each statement once, as a server does, which opens one database.
+"""Engines of a test process that compile each statement only once, like a server with its only database.
 
-Each test opens a database of its own. Each engine of SQLAlchemy has its own dialect, and compiles all statements for
-it again, which took a third of the processor time of the tests of the store.
+Each test opens a database of its own. Each engine of SQLAlchemy has a dialect of its own, for which it compiles all
+statements again. This took a third of the processor time of the tests of the store.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SHARED: dict[str, tuple[Dialect, MutableMapping[Any, Any]]] = {}
 
 
 def sharing(create: Callable[P, Engine]) -> Callable[P, Engine]:
-    """Return a function that creates engines like `create`; they share what is compiled for a kind of database."""
+    """Return a function that creates engines as `create` does; engines of one dialect share compiled statements."""
 
     @functools.wraps(create)
     def create_sharing(*args: P.args, **kwargs: P.kwargs) -> Engine:

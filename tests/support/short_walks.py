@@ -1,4 +1,4 @@
-"""Many short walks as files, which differ only in their place: generating different walks would take twice as long."""
+"""Many short walks as files, which differ only in position: generating different walks would take twice as long."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marey_motion.gait import generate_gait
 
 
 def write_short_walks(folder: Path, count: int) -> list[LocalFile]:
-    """Write walks of 0.5 s on one skeleton as BVH files; each begins 1 cm beside the one before."""
+    """Write walks of 0.5 s on one skeleton as BVH files; each begins 1 cm away from the previous walk."""
     walk = generate_gait(1.0, 0.0, 0.5, 30)
     for number in range(count):
         poses = walk.poses.copy()

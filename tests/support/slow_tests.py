@@ -1,4 +1,4 @@
-"""Test functions that take long, as measured: the tier `check` leaves them out.
+"""List of measured slow test functions, which the tier `check` leaves out.
 
 `make slow-tests` runs the tests of the tier `check`, the slow ones, too, and writes the list `slow_tests.txt`. A test
 function is slow if all of its cases together take more than `LONGEST_S`. Each process of a test run measures its own
@@ -19,7 +19,7 @@ LIST = Path(__file__).with_name("slow_tests.txt")
 LONGEST_S = 0.4
 """Longest time in seconds of all cases of a function in the tier `check`, on a slow machine that does nothing else."""
 CERTAINLY_SLOW_S = 3 * LONGEST_S
-"""Time of a function which the tier `check` prints if the list lacks this function; busy machines take longer, too."""
+"""Seconds above which the tier `check` prints a function that the list lacks; large, because machines may be busy."""
 
 _TAKEN = pytest.StashKey[dict[str, float]]()
 
@@ -38,7 +38,7 @@ def function_of(item: pytest.Item) -> str:
 
 
 def still_slow(listed: Iterable[str], taken: Mapping[str, float]) -> list[str]:
-    """Return the slow functions in order: those of which the times say so, and the listed ones that did not run."""
+    """Return the slow functions in order: those with long measured times, and the listed functions that did not run."""
     return sorted({name for name, seconds in taken.items() if seconds > LONGEST_S} | (set(listed) - set(taken)))
 
 
@@ -80,7 +80,7 @@ def pytest_testnodedown(node: Any) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Write the list if asked to; in the tier `check`, print functions that took long and that the list lacks."""
+    """Write the list if the option is set; in the tier `check`, print slow functions that the list lacks."""
     taken = config.stash[_TAKEN]
     if config.getoption("store_slow"):
         names = still_slow(slow_tests(), taken)

@@ -1,6 +1,6 @@
 """A real Slurm cluster on this machine: controller, node daemon and munge, as Debian packages them, for one user.
 
-`tests/support/install_slurm.sh` installs the programs. The tests run where they are there already.
+`tests/support/install_slurm.sh` installs the programs. The tests run only on machines that have these programs.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ def named(tracks: list[Track], prefix: str = "clip") -> list[Track]:
 
 
 def wandering_tracks(count: int = 8, seed: int = 3) -> list[Track]:
-    """Return tracks (paths of a root) that trials need, and two tracks that are faster than every trial."""
+    """Return random tracks (paths of a root), and two tracks that are faster than every trial."""
     fast = [arc_track(9.0 + number, 0.0, 4.0, uid=uid) for number, uid in enumerate(UNWANTED)]
     return [*named(random_tracks(count, seed)), *fast]
 

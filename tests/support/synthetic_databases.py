@@ -59,7 +59,7 @@ def arc_track(speed_m_s: float, turn_rate_deg_s: float, seconds: float, phase: f
 
 
 def path_track(trial: Trial, **options: Any) -> Track:
-    """Return a root on the path of a trial, continued by one second, because the last rows look ahead."""
+    """Return a root that follows the path of a trial and continues for one second, because the last rows look ahead."""
     path = reference(trial)
     return Track(path.positions, path.headings, gait_pose(len(path.headings), trial.speed_m_s), **options)
 

@@ -30,7 +30,7 @@ MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
 CLUSTER_VARIABLE = "MAREY_TEST_KUBECONFIG"
 """Environment variable with the kubeconfig of a real cluster, which has a namespace `marey`."""
 CLUSTER_IMAGE_VARIABLE = "MAREY_TEST_CLUSTER_IMAGE"
-"""Environment variable with the image of the worker, named by its digest, as this cluster pulls it."""
+"""Environment variable with the image of the worker that the real cluster pulls, named by its digest."""
 CHROMIUM_VARIABLE = "MAREY_TEST_CHROMIUM"
 """Environment variable with the path of Chromium; without it, the program `chromium` is looked for."""
 NODE_PACKAGES = PAGE_SOURCES / "node_modules"
@@ -192,8 +192,8 @@ ON_DATABASES = pytest.StashKey[Counter[str]]()
 def examples(count: int, soak: int | None = None) -> int:
     """Return how many examples a property test draws in the running tier; `count` is the number in the tier `test`.
 
-    The tier `soak` multiplies this number, or `soak` if that is given: a test that is too slow to draw enough examples
-    each time draws them in `soak`.
+    The tier `soak` multiplies `count`, or `soak` if it is given. A test that is too slow to draw enough examples in the
+    tier `test` passes `soak`.
     """
     base = soak if soak is not None and is_soak() else count
     return max(1, base * present(hypothesis.settings.default).max_examples // EXAMPLES)
@@ -309,8 +309,8 @@ def _group(item: pytest.Item) -> str:
 def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
     """Return the tests in the order in which processes start them: large groups first, with fault cases in between.
 
-    Large groups that start late would run alone at the end; a whole way counts as twenty tests. Fault cases mostly
-    wait, so they are spread among tests that compute.
+    Large groups that start late would run alone at the end; a workflow counts as twenty tests. Fault cases mostly wait,
+    so they are spread among tests that compute.
     """
     groups: defaultdict[str, list[pytest.Item]] = defaultdict(list)
     for item in items:

@@ -25,7 +25,7 @@ FEET = ("left_toe", "right_toe")
 
 
 def write_cases(folder: Path) -> None:
-    """Write arrays and clips in stored forms, and what their readers must find in them."""
+    """Write arrays and clips in stored forms, and the values that readers must return for them."""
     folder.mkdir(parents=True, exist_ok=True)
     arrays = _arrays()
     for name, (array, encoded) in arrays.items():

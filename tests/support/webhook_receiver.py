@@ -51,7 +51,7 @@ class Received:
         return dict(json.loads(self.body))
 
     def is_signed_with(self, secret: str) -> bool:
-        """Return whether one of the signatures is that of a secret."""
+        """Return whether one of the signatures of the request was made with `secret`."""
         key = base64.b64decode(secret.removeprefix("whsec_"))
         signed = f"{self.headers['webhook-id']}.{self.headers['webhook-timestamp']}.".encode() + self.body
         expected = "v1," + base64.b64encode(hmac.new(key, signed, "sha256").digest()).decode()

@@ -18,7 +18,7 @@ ELSEWHERE = tuple(f"{scope}!project=elsewhere" for scope in USER_SCOPES)
 RANK = {role: rank for rank, role in enumerate(Role)}
 
 LET_THROUGH: frozenset[int] = frozenset()
-"""Verdict on callers who are not refused: the answer depends on the request alone."""
+"""Verdict for callers who are not refused: the answer depends on the request alone."""
 SIGN_IN, FORBIDDEN, HIDDEN, OVER = frozenset({401}), frozenset({403}), frozenset({404}), frozenset({409})
 
 
@@ -26,9 +26,9 @@ SIGN_IN, FORBIDDEN, HIDDEN, OVER = frozenset({401}), frozenset({403}), frozenset
 class Person:
     """Kind of caller of the project `lab`.
 
-    `standing` is the kind of the credential: no credential (`none`), one that the server refuses (`refused`), that of a
-    user (`user`), that of an attempt in `lab` that is running (`attempt`) or has ended (`ended`), or that of a
-    participant of a study in `lab` (`participant`).
+    `standing` is the kind of the credential: no credential (`none`), a credential that the server refuses (`refused`),
+    or the token of a user (`user`), of a running attempt in `lab` (`attempt`), of an ended attempt in `lab` (`ended`),
+    or of a participant of a study in `lab` (`participant`).
     """
 
     name: str

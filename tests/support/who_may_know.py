@@ -117,7 +117,7 @@ class World:
         return project in self.public or mine
 
     def referring(self, caller: Caller, blob: int) -> bool:
-        """Return whether something that the caller may read refers to a blob."""
+        """Return whether a document that the caller may read refers to a blob."""
         return any(self.sees_contents(caller, project) and blob in self.items[project].values() for project in PROJECTS)
 
     def may_refer(self, caller: Caller, blob: int) -> bool:

@@ -1,4 +1,4 @@
-"""Model of who may write where: folders, items and roles in memory, and random calls whose outcomes it predicts.
+"""Model of the rights to write in folders: folders, items and roles in memory. It predicts outcomes of random calls.
 
 The model repeats the rules of roles in folders in a simpler form: at each call, it goes from the folder upwards to the
 nearest role.
@@ -179,7 +179,7 @@ class WritingProgram:
     def _on(
         self, who: str, thing: Thing, method: str, path: str, function: Any, *args: Any, allowed: bool | None = None
     ) -> bool:
-        """Call a function for an item; by default, the model expects success for contributors in the item's folder."""
+        """Call a function for an item; by default, the call must succeed for contributors in the item's folder."""
         expected = thing.folder.allows(who, Role.CONTRIBUTOR) if allowed is None else allowed
         state = {"expected_rev": None}
         given = (Kind.SKELETON, thing.id, *args)
@@ -235,7 +235,7 @@ class WritingProgram:
             folder.deleted, folder.above = False, self._made(above)
 
     def _is_free(self, folder: Folder) -> bool:
-        """Return whether a deleted folder can be restored at its path, which no other folder has or could get back."""
+        """Return whether a deleted folder can be restored: no other folder has its path, or can be restored to it."""
         alive = {id(one) for one in self._alive()}
         line = {one.path: one for one in folder.line}
         others = [one for one in self.folders if line.get(one.path, one) is not one]
@@ -254,7 +254,7 @@ class WritingProgram:
     def _made(self, path: str) -> Folder:
         """Return the folder at a path.
 
-        If the model lacks it, the restoration of something below has created it; add it.
+        If the model lacks the folder, add it: the restoration of an item or a folder below it has created it.
         """
         found = self._nearest(path)
         if found.path == path:

@@ -24,7 +24,7 @@ SHORT = ["--seconds", "1", "--replicates", "1"]
 
 
 def told(*words: str) -> list[str]:
-    """Return the arguments of the only command of the page that begins with `marey` and the given words."""
+    """Return the arguments of the only command of the page that begins with `marey`, followed by the given words."""
     lines = [line for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL) for line in block.splitlines()]
     (found,) = [line for line in lines if line.startswith(" ".join(("marey", *words)))]
     return shlex.split(found)[1:]

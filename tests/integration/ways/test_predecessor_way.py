@@ -1,4 +1,4 @@
-"""Moving in from Marey's predecessor: every document of it goes in and out, on a real server."""
+"""Move from Marey's predecessor: each kind of its documents is imported and exported, on a real server."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def items_of(lab: ProjectHandle) -> dict[str, Any]:
 
 
 def require_same_numbers(found: dict[str, Any]) -> None:
-    """Compare the stored numbers with those of the documents."""
+    """Compare the stored numbers with the numbers in the documents."""
     for name, document in old.clips().items():
         kind = Kind.PROCESSED if "aligned" in name else Kind.CLIP
         motion = found[f"{kind.value} {name.split('.')[0]}"].part("motion")
@@ -181,7 +181,7 @@ OWNERS = {
     "left_quaternion_mm.bson.bz2": "model left",
     **{name: f"record {name.split('.')[0]}" for name in written_records.records()},
 }  # fmt: skip
-"""Items whose exports are files that do not have their names."""
+"""Kind and name of the item that is exported as each file, for files whose names do not give both."""
 
 
 @pytest.mark.parametrize("way", get_args(Way))
@@ -217,7 +217,7 @@ def test_a_folder_with_one_of_each_goes_in_at_once_and_out_byte_for_byte(
 
 
 def require_same_graph(found: dict[str, Any]) -> None:
-    """Compare the graph of the archive and its models with those of the archive."""
+    """Check that the graph `grasp` and its models have the contents of the archive."""
     graph = found["graph grasp"].part("graph")
     node = graph["actions"]["walk"]["primitives"]["walk_begin"]
     begin = found["model walk_begin"]

@@ -1,4 +1,4 @@
-"""Workflow of a proposal of two users: the commands of the how-to page, on a real server."""
+"""Workflow of a proposal with two users: the commands of the how-to page, on a real server."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ PATIENCE_S = 180.0
 
 @dataclass
 class NamedCluster:
-    """Cluster that a kubeconfig names, as far as a test looks at it; `instance` is part of all names of the test."""
+    """Cluster that a kubeconfig names, with functions to examine it; names of a test's objects contain `instance`."""
 
     kubeconfig: Path
     image: str
@@ -78,7 +78,7 @@ class NamedCluster:
         return json.dumps([{one["metadata"]["name"]: one.get("status")} for one in self.all("jobs") + self.all("pods")])
 
     def close(self) -> None:
-        """Delete what a failed test has left, and the connections."""
+        """Delete the objects that a failed test has left, and close the connections."""
         batch = client.BatchV1Api(self._api)
         for job in self.all("jobs"):
             batch.delete_namespaced_job(job["metadata"]["name"], self.namespace, propagation_policy="Background")

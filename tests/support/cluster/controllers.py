@@ -1,4 +1,4 @@
-"""Controllers of the stub cluster: Jobs, Deployments, deletion of ended Jobs, and a small stand-in for Kueue."""
+"""Controllers of the stub cluster: Jobs, Deployments, deletion of ended Jobs, and a simple substitute for Kueue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ QUEUE_LABEL = "kueue.x-k8s.io/queue-name"
 
 @dataclass
 class Controllers:
-    """Controllers that move the objects of the cluster to what their specifications say."""
+    """Controllers that bring the objects of the cluster into the state that their specifications describe."""
 
     objects: Objects
     duplicates: bool = False

@@ -40,7 +40,7 @@ class Seconds:
 
 
 class WatchedCluster(Protocol):
-    """Cluster in which a dispatcher starts pods, as far as tests look at it."""
+    """Cluster in which a dispatcher starts pods: the functions with which tests examine it."""
 
     @property
     def instance(self) -> str: ...
@@ -68,7 +68,7 @@ class DispatchBench:
         self.dispatcher = self.open()
 
     def open(self, **rules: Any) -> Dispatcher:
-        """Return a new dispatcher, as that of the next server; the earlier one has died."""
+        """Return a new dispatcher, as if the server had died and the next server had started its own."""
         labels = {"gpu=a100": {"accelerator": "a100"}}
         own_pods = {"most": 5, "memory_mb": 4096, "labels": labels, "images": ["registry.example.org/motion/"], **rules}
         settings = Settings(

@@ -22,7 +22,7 @@ from tests.support.forked_programs import start_program
 MAREY = (sys.executable, "-m", "marey_client.cli")
 """Command that the entry point of the images runs."""
 SCRIPT = (sys.executable, "-I", "-S", "-c")
-"""Command that runs a text of Python, without the installed packages, whose search takes most of the start."""
+"""Command that runs Python code without the installed packages, whose lookup takes most of the starting time."""
 GRACE_S = 30.0
 
 
@@ -69,7 +69,7 @@ class Kubelet:
         os.killpg(self.processes[pod].pid, signal.SIGKILL)
 
     def evict(self, pod: str, reason: str = "EvictionByEvictionAPI") -> None:
-        """End a pod as a cluster does that needs its node."""
+        """End a pod, as a cluster does if it needs the node of the pod."""
         self.objects.change("pods", pod, lambda one: set_condition(one, "DisruptionTarget", True, reason))
         self._terminate(pod)
 

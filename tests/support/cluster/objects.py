@@ -120,7 +120,7 @@ class Objects:
         return [event for event in later if selects(selector, event.document)]
 
     def forget_events(self) -> None:
-        """Forget all changes, as a cluster does after some minutes; earlier versions are gone."""
+        """Forget all changes, as a cluster does after some minutes; watches of earlier versions are then refused."""
         self._events.clear()
         self._oldest = self.version
 

@@ -21,23 +21,38 @@ from tests.support.endurance.workload import KINDS
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m tests.support.endurance")
     trials = parser.add_subparsers(dest="trial", required=True)
-    faults = trials.add_parser("faults", help="the results of mixed jobs must be the same under faults")
-    faults.add_argument("--rounds", type=int, default=1_340, help="calls that submit jobs; 1,340 make 2,010 jobs")
-    faults.add_argument("--seconds", type=float, default=600, help="duration of the faults")
-    faults.add_argument("--every", type=float, default=3.0, help="mean seconds between two faults")
-    faults.add_argument("--slow", type=float, default=0.0, help="seconds that a job draws a skeleton")
-    faults.add_argument("--jobs", action="append", default=[], choices=sorted(KINDS), help="only jobs of this kind")
-    faults.add_argument("--only", action="append", default=[], choices=sorted(FAULTS), help="only this kind of fault")
-    faults.add_argument("--without-fence", action="store_true", help="negative control: the trial must find faults")
+    faults = trials.add_parser("faults", help="check that mixed jobs have the same results under faults")
+    faults.add_argument("--rounds", type=int, default=1_340, help="calls that submit jobs (default: 1340; 2010 jobs)")
+    faults.add_argument("--seconds", type=float, default=600, help="seconds in which faults happen (default: 600)")
+    faults.add_argument("--every", type=float, default=3.0, help="mean seconds between two faults (default: 3)")
+    faults.add_argument("--slow", type=float, default=0.0, help="seconds for which a job draws a skeleton (default: 0)")
+    faults.add_argument(
+        "--jobs", action="append", default=[], choices=sorted(KINDS), help="submit only this kind of job (repeatable)"
+    )
+    faults.add_argument(
+        "--only",
+        action="append",
+        default=[],
+        choices=sorted(FAULTS),
+        help="inject only this kind of fault (repeatable)",
+    )
+    faults.add_argument("--without-fence", action="store_true", help="do not compare fences: the trial must fail")
     faults.add_argument("--logs", type=Path, help="folder to which the logs are copied at the end")
-    load = trials.add_parser("load", help="reads stay quick, heartbeats in time, and the memory of servers bounded")
-    load.add_argument("--minutes", type=float, default=30)
-    load.add_argument("--rate", type=float, default=20, help="requests per second")
-    load.add_argument("--read-ms", type=float, default=1_000, help="greatest 99th percentile of reads and lists")
+    load = trials.add_parser("load", help="check waits of reads, heartbeats, and the memory of servers")
+    load.add_argument("--minutes", type=float, default=30, help="duration of the trial (default: 30)")
+    load.add_argument("--rate", type=float, default=20, help="requests per second (default: 20)")
+    load.add_argument(
+        "--read-ms",
+        type=float,
+        default=1_000,
+        help="limit for the 99th percentile of reads and lists, ms (default: 1000)",
+    )
     for one, workers in ((faults, WORKERS), (load, 2)):
-        one.add_argument("--seed", type=int, default=None, help="equal seeds give equal faults or requests")
-        one.add_argument("--s3", choices=["seaweedfs", "moto"], default="seaweedfs")
-        one.add_argument("--workers", type=int, default=workers)
+        one.add_argument("--seed", type=int, default=None, help="seed of the faults or requests (default: random)")
+        one.add_argument(
+            "--s3", choices=["seaweedfs", "moto"], default="seaweedfs", help="S3 server (default: seaweedfs)"
+        )
+        one.add_argument("--workers", type=int, default=workers, help="number of workers (default: %(default)s)")
     return parser
 
 

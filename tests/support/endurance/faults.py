@@ -125,7 +125,7 @@ def _silence_answers(made: Installation, fault: Fault) -> None:
 
 
 def _silence(link: TcpProxy, fault: Fault, *, answers: bool) -> None:
-    """Discard the bytes of one direction; afterwards the connections, in which bytes are missing, end."""
+    """Discard the bytes of one direction; then close the connections, because bytes are missing in them."""
     dropping = link.drop_answers if answers else link.drop_requests
     dropping.set()
     time.sleep(fault.seconds)

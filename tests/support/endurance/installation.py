@@ -50,12 +50,12 @@ class TrialServer(ServerProcess):
         self._module = module
 
     def spawn(self, arguments: list[str], environment: dict[str, str], stdin: bytes | None = None) -> None:
-        """Start the server, from its own module."""
+        """Start the server from the module that was given to the constructor."""
         super().spawn([self._module, *arguments[1:]], environment, stdin)
 
 
 class TrialWorker(WorkerProcess):
-    """A worker that runs all kinds of jobs, those of tests too, and reaches a server through its own proxy."""
+    """A worker that runs all kinds of jobs, also those that only tests know, and has its own proxy to a server."""
 
     def __init__(self, folder: Path, token: str, link: TcpProxy) -> None:
         folder.mkdir()

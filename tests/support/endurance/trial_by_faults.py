@@ -23,7 +23,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class FaultTrial:
-    """How a trial runs: number of calls that submit jobs, duration of the faults, and the seed of the faults."""
+    """Parameters of a trial: number of calls that submit jobs, duration of the faults in seconds, seed, and others."""
 
     rounds: int
     seconds: float
@@ -35,7 +35,7 @@ class FaultTrial:
     """Kinds of faults; empty: all."""
     slow_s: float = 0.0
     fenced: bool = True
-    """False: the servers do not compare fences, so that the trial must find faults."""
+    """False: the servers do not compare fences, so that the trial must find broken rules."""
     only: Collection[str] = ()
     """Kinds of jobs; empty: all."""
     keep_logs: Path | None = None

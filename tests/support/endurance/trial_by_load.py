@@ -35,11 +35,11 @@ from marey_server.store.database.connections import Database
 
 LEASE_S, HEARTBEAT_S = 15.0, 3.0
 SETTLING_S = 300.0
-"""Time after which the growth of the memory counts; in shorter trials, a third of the time."""
+"""Seconds after which the growth of the memory is measured; in a short trial, after a third of its duration."""
 SENDERS = 24
 SHOTS = 2_000
 ATTACKERS = ("contributor", "stranger")
-"""Callers who send hostile requests; those of all callers would fill gigabytes."""
+"""Callers who send hostile requests; the requests of all callers would take gigabytes of memory."""
 SAMPLE_EVERY_S = 2.0
 UPLOAD_BYTES = 50_000
 SHARES = {"read": 50, "list": 20, "upload": 10, "job": 5, "events": 5, "hostile": 10}
@@ -49,7 +49,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class LoadTrial:
-    """How a trial runs, and the limits that it checks."""
+    """Parameters of a trial, and the limits that it checks."""
 
     minutes: float
     rate: float
@@ -68,7 +68,7 @@ class LoadTrial:
 
 @dataclass
 class Record:
-    """What a trial has measured."""
+    """Measurements of a trial."""
 
     waits_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     faults: Counter[str] = field(default_factory=Counter)

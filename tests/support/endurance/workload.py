@@ -1,4 +1,4 @@
-"""Mixed jobs of a trial, and what became of them, in a form that is the same in every project and on every server."""
+"""Mixed jobs of a trial, and their outcomes in a form that is the same in every project and on every server."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from marey_schemas.items import Event
 from marey_schemas.queue.jobs import Job, JobCreate, JobState
 
 MAX_ATTEMPTS = 20
-"""The greatest number that the server allows, because many faults can meet the same job."""
+"""Number of attempts of each job: the greatest that the server allows, because many faults can meet the same job."""
 ENDS = {"job.succeeded", "job.failed", "job.cancelled"}
 ON_SCHEDULE = {"a": 4711, "b": 0}
 SAME = ("sum", "seen", "seed")
@@ -31,7 +31,7 @@ SAME = ("sum", "seen", "seed")
 
 @dataclass
 class Ends:
-    """What became of the jobs of a project."""
+    """Outcomes of the jobs of a project."""
 
     jobs: dict[str, str]
     """State, failure and result of each job, by its label."""
@@ -54,7 +54,7 @@ class Workload:
     slow_s: float
     """Duration of the jobs that draw a skeleton, in seconds."""
     kinds: tuple[str, ...]
-    """Kinds of jobs, of which one call of `submit` after another takes the next."""
+    """Kinds of jobs; each call of `submit` takes the next kind."""
     submitted: dict[str, str] = field(default_factory=dict)
     """Ids of the jobs by label."""
     cancelled: set[str] = field(default_factory=set)
@@ -96,7 +96,7 @@ class Workload:
             time.sleep(1)
 
     def ends(self) -> Ends:
-        """Return what became of the jobs, and which rules were broken."""
+        """Return the outcomes of the jobs, and the rules that were broken."""
         faults: list[str] = []
         labels = {job: label for label, job in self.submitted.items()}
         listed = {job.id: job for job in self._listed()}
@@ -241,7 +241,7 @@ KINDS: dict[str, Callable[[Workload, int], object]] = {
     "refuse, with two that depend on it": _refuse,
     "align": _align,
 }
-"""Functions that submit jobs, by what the jobs do; a trial calls them in turn."""
+"""Functions that submit jobs, by the kind of work of these jobs; a trial calls them in turn."""
 
 
 def new_workload(

@@ -59,7 +59,7 @@ class Chooser:
         return self.model.projects[self.lab]
 
     def operation(self, kind: str) -> Operation | None:
-        """Return an operation, or None if nothing exists to operate on.
+        """Return an operation, or None if the model has nothing to which it applies.
 
         `kind` is the name of one of the methods below.
         """
@@ -148,7 +148,7 @@ class Chooser:
     def commit_to(self, name: str, branch: str, *, right: bool = False) -> CommitChanges | None:
         """Return a commit of up to three changes.
 
-        If `right` is false, it may expect a wrong newest commit of the branch.
+        If `right` is false, the request may expect a wrong newest commit of the branch.
         """
         dataset = self.project.datasets[name]
         changes = [self._change(name, branch) for _ in range(self.chance.randint(1, 3))]

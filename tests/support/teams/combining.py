@@ -1,4 +1,4 @@
-"""What users do with two versions: merges, cherry-picks and reverts."""
+"""Operations of users on two versions: merges, cherry-picks and reverts."""
 
 from __future__ import annotations
 

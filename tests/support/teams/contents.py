@@ -82,7 +82,7 @@ def references_of(content: Content) -> set[Content]:
 
 
 def files_of(content: Content) -> set[str]:
-    """Return the digests of all files that a content names, or that contents to which it refers name."""
+    """Return the digests of all files that are named in a content, or in contents to which this content refers."""
     found = {value.file for _, value in content.parts if isinstance(value, Info) and value.file is not None}
     return found.union(*(files_of(one) for one in references_of(content)))
 

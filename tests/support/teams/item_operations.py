@@ -1,4 +1,4 @@
-"""What users do with items: creation, revisions, renaming, deletion, restoration, purges and uploads of files."""
+"""Operations of users on items: creation, revisions, renaming, deletion, restoration, purges and uploads of files."""
 
 from __future__ import annotations
 

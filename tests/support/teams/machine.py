@@ -176,7 +176,7 @@ class TeamsMachine(RuleBasedStateMachine):
         self.world.counts["Look"] += 1
 
     def _race(self, choose: Chooser, chance: random.Random) -> None:
-        """Let two users change the same branch at once; or let one delete or purge an item that the other commits."""
+        """Let two users change a branch at once, or let one user delete or purge an item that another user commits."""
         mine = choose.commit(right=True)
         if mine is None:
             return
@@ -193,7 +193,7 @@ class TeamsMachine(RuleBasedStateMachine):
             self.session.race({"ben": mine, "ann": other}, _without_loss(_fate(chance)))
 
     def _demote(self, choose: Chooser, chance: random.Random) -> None:
-        """Let an owner make another owner a reader while that one writes; afterwards, restore the first role."""
+        """Let an owner make another owner a reader while the second owner writes; then restore the role."""
         choose.user = "mia"
         operation = choose.operation(chance.choice(("commit", "reset", "delete_ref", "purge_item", "create_clip")))
         if operation is None:
@@ -234,12 +234,12 @@ def _fate(chance: random.Random) -> Fate:
 
 
 def _without_loss(fate: Fate) -> Fate:
-    """Return the same fate; if this fate loses answers, return `FINE`."""
+    """Return `FINE` in place of a fate that loses answers, and any other fate unchanged."""
     return FINE if fate.lost else fate
 
 
 def _removal(choose: Chooser, commit: CommitChanges) -> Operation | None:
-    """Return the deletion of an item that a commit puts. If the item is deleted already, return its purge."""
+    """Return the deletion of an item that a commit adds to a version; if the item is deleted already, its purge."""
     for one in commit.changes or ():
         if isinstance(one, PutEntry):
             item = choose.project.items[one.item]

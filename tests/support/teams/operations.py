@@ -1,4 +1,4 @@
-"""What users do: the base class of all operations, and operations on commits, branches and tags.
+"""Operations of users: the base class of all operations, and operations on commits, branches and tags.
 
 An operation sends its request, compares the outcome with the expectation of the model, and then changes the model.
 """
@@ -103,7 +103,7 @@ class Operation(ABC):
         """Apply the effect to the model although no answer arrived; needed if a repetition gets another answer."""
 
     def again(self, outcome: Outcome, second: Outcome) -> None:  # noqa: B027 - most have nothing to check
-        """Check the outcome `second` of the repeated operation, which had succeeded with `outcome` the first time."""
+        """Check the outcome `second` of a repetition, after the operation had succeeded with `outcome` at first."""
 
     def place(self, model: Model) -> str | None:
         """Return the folder in which the user needs the role; None: in the project."""

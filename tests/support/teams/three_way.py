@@ -137,7 +137,7 @@ Origin = tuple[Key | None, Key | None]
 def _settle(
     waiting: Iterable[tuple[Origin, Located]], origins: dict[Key, Origin], take: Mapping[Key, Side], merged: Merged
 ) -> None:
-    """Give each key that two entries want to one of them; the loser goes back to its own place, if it has one.
+    """Give each key that two entries claim to one of them; the other entry gets its earlier key, if it had one.
 
     `origins` contains, by key, the origin of each entry in `merged.state`.
     """
@@ -301,7 +301,7 @@ def _replaced_twice(
     theirs: frozenset[Hashable],
     instead: Callable[[Hashable, Hashable], bool],
 ) -> bool:
-    """Return whether both sides have removed a label and replaced it by different labels.
+    """Return whether both sides have replaced the same label, but by different labels.
 
     `instead(new, old)` states whether `new` replaces `old`.
     """

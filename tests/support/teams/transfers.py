@@ -1,4 +1,4 @@
-"""What users do with whole versions: copies to other datasets, archives, and checkouts into folders."""
+"""Operations of users on whole versions: copies to other datasets, archives, and checkouts into folders."""
 
 from __future__ import annotations
 

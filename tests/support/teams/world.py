@@ -24,7 +24,7 @@ RANKS = {role: rank for rank, role in enumerate(Role)}
 
 
 class Fate(NamedTuple):
-    """What happens to an operation: nothing, the loss of answers, or the death of a server."""
+    """Fault during an operation: none, the loss of answers, or the death of a server."""
 
     lost: int = 0
     """Number of answers to writes that are lost."""

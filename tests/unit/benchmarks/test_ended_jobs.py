@@ -1,4 +1,4 @@
-"""Ended jobs for benchmarks: written by SQL, they are what the queue would have left."""
+"""Ended jobs for benchmarks: the rows written by SQL equal the rows that the queue would have written."""
 
 from __future__ import annotations
 

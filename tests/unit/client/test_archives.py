@@ -97,7 +97,7 @@ def transfers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def make_old(path: Path) -> None:
-    """Set the time of a file's last change so far back that the file is deleted."""
+    """Set the time of a file's last change to a time before which files are deleted."""
     old = time.time() - (MOST_DAYS_KEPT + 1) * 86_400
     os.utime(path, (old, old))
 

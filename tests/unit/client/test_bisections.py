@@ -18,7 +18,7 @@ from marey_schemas.datasets.commits import Commit
 
 
 class ListedVersions:
-    """Versions whose names are their numbers; parents have lower numbers. `read` are the versions that were listed."""
+    """Versions whose names are numbers; parents have lower numbers. `read` contains the versions that were listed."""
 
     def __init__(self, parents: Sequence[Sequence[int]]) -> None:
         self.parents = parents

@@ -1,4 +1,4 @@
-"""Commands of edits as people type them."""
+"""Edit commands as text on the command line."""
 
 from typing import Any
 

@@ -193,7 +193,7 @@ def test_completion_loads_nothing_heavy(nowhere: dict[str, str]) -> None:
 
 
 class _Recorder(BaseHTTPRequestHandler):
-    """Answers everything with a page of a list that never ends, and records the tokens."""
+    """Handler that answers every request with a page of an endless list, and records the tokens."""
 
     tokens: ClassVar[list[str | None]] = []
 

@@ -1,4 +1,4 @@
-"""Shell completion in bash: what it inserts is text for bash, whatever names others have chosen on the server."""
+"""Shell completion in bash: inserted names are quoted, so that bash never executes names from the server."""
 
 import os
 import pty

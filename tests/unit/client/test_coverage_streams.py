@@ -1,4 +1,4 @@
-"""Recordings that the SDK sends to coverage streams: each frame once, and on from the offset of the last answer."""
+"""Recordings that the SDK sends to coverage streams: each frame is sent once, from the offset of the last answer on."""
 
 from datetime import UTC, datetime
 from typing import Any

@@ -20,7 +20,7 @@ NOTHING = cast(Any, None)
 
 @dataclass
 class TabledValues(VersionEvaluations):
-    """Values of the metric by version; a version without a value cannot be evaluated. `read` are evaluated versions."""
+    """Values of the metric by version; others cannot be evaluated. `read` contains the evaluated versions."""
 
     values: Mapping[str, float] = field(default_factory=dict)
     read: list[str] = field(default_factory=list)

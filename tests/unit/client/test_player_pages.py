@@ -1,4 +1,4 @@
-"""Pages that play motion without a server: packed poses, escaped names, files written at once, and refusals."""
+"""Pages that play motion without a server: packed poses, escaped names, atomic writes of files, and refusals."""
 
 import json
 import re

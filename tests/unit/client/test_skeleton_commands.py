@@ -1,4 +1,4 @@
-"""Command `skeleton map`: assignments of joints, as people type them."""
+"""Command `skeleton map`: assignments of joints as text on the command line."""
 
 from __future__ import annotations
 

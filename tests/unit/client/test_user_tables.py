@@ -30,7 +30,7 @@ def table(folder: Path, text: str) -> Path:
 
 
 class Team:
-    """Answers of a server with the user ada, who is a contributor of the project lab, and what was sent to it."""
+    """Simulated server with the user ada, a contributor of the project lab; it records the requests."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, str, Any]] = []

@@ -10,7 +10,7 @@ from marey_client.poses.windows import MotionWindows
 
 
 def a_clip(path: str, *, rate_hz: float = 30.0, joints: int = 22) -> Any:
-    """Return what a dataset of windows needs of the handle of a clip with 100 frames."""
+    """Return a substitute for the handle of a clip with 100 frames, with the attributes that `MotionWindows` uses."""
     item = SimpleNamespace(summary={"joints": joints})
     return SimpleNamespace(path=path, id=path, frames=100, frame_rate_hz=rate_hz, item=item)
 

@@ -17,7 +17,7 @@ STEPS = ((1, 1), (1, 0), (0, 1))
 
 
 def plain_total(costs: Floats) -> float:
-    """Return the total cost of the best path, by the recursion of textbooks, cell by cell."""
+    """Return the total cost of the best path, computed cell by cell with the recursion of textbooks."""
     n, m = costs.shape
     totals = np.full((n + 1, m + 1), np.inf)
     totals[0, 0] = 0.0

@@ -123,7 +123,7 @@ def test_the_path_of_all_sections_is_one_way_that_costs_the_total(example: tuple
 
 
 def test_sections_are_put_behind_each_other_instead_of_each_beginning_at_frame_0() -> None:
-    """An earlier program counted the frames 0, 1, ..., 22, 23, 0, 0, 1, ... in this case."""
+    """An earlier program began each section at frame 0: it counted the frames 0, 1, ..., 22, 23, 0, 0, 1, ... here."""
     costs = np.abs(np.arange(48)[:, None] - np.arange(48)[None]).astype(float)
     found = align_sections(costs, (0, 23, 47), (0, 23, 47), partial(align, max_run=3))
     assert found.times.tolist() == list(range(48))

@@ -1,4 +1,4 @@
-"""Constraints that a limb cannot follow: it goes round its shoulder and takes time between targets, with a warning."""
+"""Constraints that a limb cannot follow: the wrist passes around the shoulder and takes time, with a warning."""
 
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ def _arm(clip: Clip) -> np.ndarray:
 
 
 def _excess(before: np.ndarray, after: np.ndarray, rate_hz: float) -> float:
-    """Return how much farther a joint moves between two frames than the motion before and the blend allow."""
+    """Return the greatest difference, over all joints, of the largest step and the allowed step, in metres."""
     moved = np.linalg.norm(after - before, axis=-1).max(axis=0)
     steps = np.linalg.norm(np.diff(after, axis=0), axis=-1).max(axis=0)
     return float((steps - allowed_steps(largest_steps(before), moved, BLEND_S * rate_hz)).max())

@@ -38,7 +38,7 @@ def _resting(skeleton: Skeleton) -> Motion:
 
 
 def _across(skeleton: Skeleton) -> tuple[Motion, PositionTarget, tuple[int, int]]:
-    """Return a body at rest, and a target of its wrist that passes the direction opposite to the arm."""
+    """Return a body at rest, a wrist target that passes the direction opposite to the arm, and shoulder and elbow."""
     motion = _resting(skeleton)
     shoulder, elbow, wrist = (_index(skeleton, f"right_{part}") for part in ("shoulder", "elbow", "wrist"))
     places = motion.positions(skeleton)[0]

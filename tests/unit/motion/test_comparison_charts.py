@@ -1,4 +1,4 @@
-"""Charts and pages that compare runs: what they show, and that names and values from scripts cannot break them."""
+"""Charts and pages that compare runs: their contents, and harmless display of names and values from scripts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EVIL = "<script>alert('$x_1$')</script>&\u202e\x1b[31m\n\x00 名前 \U0001f3c3"
 
 
 def trained() -> RunComparison:
-    """Two learning rates with three seeds, of which one diverges at the higher rate; a third one with one seed."""
+    """Runs with two learning rates and three seeds each, one of which diverges, and with a third rate and one seed."""
     runs, curves = [], {}
     given: list[tuple[float, int, float | str]] = [
         (0.001, 0, 0.5), (0.001, 1, 0.6), (0.001, 2, 0.4), (0.1, 0, 0.9), (0.1, 1, "NaN"), (0.1, 2, 0.8), (10.0, 0, 3.0)

@@ -25,11 +25,14 @@ TAKES = {
     "bandai-namco-1": 10, "bandai-namco-2": 8, "cmu-amc": 12, "cmu-bvh": 3, "cmu-iclone-bvh": 2, "rigs/snu-mss": 3,
     "rigs/snu-mass": 2,
 }  # fmt: skip
-"""Numbers of takes by folder: forty of seven rigs."""
+"""Number of takes by folder: forty takes of seven rigs in total."""
 SHORT = {"bandai-namco-1": 1, "cmu-amc": 1, "rigs/snu-mass": 1}
 NEEDED = [f"{side}_{part}" for side in ("left", "right") for part in ("shoulder", "elbow", "wrist", "hip", "ankle")]
 MOST_STEP = 1.5
-"""Largest step of a joint between two frames, as a multiple of the take's own largest, beside what was asked for."""
+"""Largest allowed step of a joint between two frames, as a multiple of the largest step in the unedited take.
+
+The steps that the constraints themselves require are allowed in addition.
+"""
 MOST_SUNK_M = 0.01
 
 
@@ -103,7 +106,7 @@ def _constraints(clip: Clip, which: str, places: np.ndarray) -> list[dict[str, A
 
 
 def _constrained_excess(clip: Clip, which: str) -> float:
-    """Return the largest step of a joint, divided by what the take's own steps and the constraint's need allow."""
+    """Return the largest step of a joint, divided by the step that the take and the constraint allow."""
     places, constraints = _places(clip), _constraints(clip, which, _places(clip))
     known = map_joints(clip.skeleton).joints
     joint = clip.skeleton.index_of(known.get(constraints[0]["joint"], constraints[0]["joint"]))
@@ -119,7 +122,7 @@ def _constrained_excess(clip: Clip, which: str) -> float:
 
 
 def _joined_sunk(clip: Clip, blend: str) -> float:
-    """Return how far feet sink around the seam when a take follows on its own beginning, out of step."""
+    """Return how far feet sink (metres) around the seam if a cut take is followed by the whole take, out of step."""
     seam, before, after = clip.frame_count * 2 // 5, round(0.4 * clip.frame_rate_hz), round(0.6 * clip.frame_rate_hz)
     joined = _edited(clip.sliced(0, seam), {"command": "concatenate", "source": "other", "blend": blend}, other=clip)
     soles = _soles(clip)
@@ -128,7 +131,7 @@ def _joined_sunk(clip: Clip, blend: str) -> float:
 
 
 def _sunk(clip: Clip, command: dict[str, Any]) -> tuple[float, float]:
-    """Return how far feet sink below their lowest place nearby, and the largest step beside the take's own."""
+    """Return how far feet sink below their nearby minimum (m), and the ratio of the largest steps, after to before."""
     made = _edited(clip, command).clip
     floors = minimum_filter1d(_soles(clip), 2 * int(0.15 * clip.frame_rate_hz) + 1, axis=0)
     return float((floors - _soles(made)).max()), float(_steps(_places(made)).max() / _steps(_places(clip)).max())
@@ -142,7 +145,7 @@ FILTERS: tuple[dict[str, Any], ...] = (
 
 
 def _faults(clip: Clip) -> list[str]:
-    """Edit a take in every way, and list what an animator would not keep."""
+    """Apply every kind of edit to a take, and return texts about results that an animator would reject."""
     excesses = {one: _constrained_excess(clip, one) for one in ("point", "hold", "look", "shoulder", "in a row")}
     faults = [f"{one} {excess:.3f} times too fast" for one, excess in excesses.items() if excess > 1.0]
     for blend in ("inertialise", "slerp"):

@@ -162,7 +162,7 @@ def test_a_verdict_needs_more_than_chance_and_a_metric_with_a_direction() -> Non
 
 
 def test_the_verdicts_of_many_metrics_are_rarely_false_together() -> None:
-    """Chance alone: uncorrected, more than half of these families would contain a false verdict."""
+    """The replicates differ by chance alone: uncorrected, more than half of the families would have a false verdict."""
     random = np.random.default_rng(7)
     metrics = LESS_IS_BETTER
     false = 0

@@ -47,7 +47,7 @@ pytestmark = DRAWN_EVALUATIONS
 ONE_TRIAL = [name for name, kind in FIGURES.items() if kind.trials == "one"]
 SWITCHING = "switching v=2 w=50"
 ARRANGED = ("points", "usage", "clip-graph")
-"""Figures that choose or arrange what they show of two results."""
+"""Figures that select or arrange their contents by both of two compared results."""
 
 
 @pytest.fixture(scope="module")

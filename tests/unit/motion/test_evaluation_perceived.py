@@ -1,4 +1,4 @@
-"""Coverage of poses, removals and their reasons by a perceptual metric."""
+"""Coverage of poses, planned removals and the reasons for them, computed with a perceptual metric."""
 
 from dataclasses import replace
 from functools import cache

@@ -359,7 +359,7 @@ def test_each_region_gets_a_sentence_and_motion_that_no_trial_asks_for_is_named(
 
 
 def replicated(result: EvaluationResult, *counts: int) -> EvaluationResult:
-    """Return the evaluation with replicates, in each of which so many of its trials are followed."""
+    """Return the evaluation with replicates; the number of followed trials is given for each replicate."""
     trials = len(result.trials)
     followed = np.arange(trials)[:, None] < np.array(counts)
     return replace(result, replicates=ReplicateValues((), np.empty((trials, len(counts), 0)), followed, {}))

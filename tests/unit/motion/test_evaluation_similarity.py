@@ -25,7 +25,7 @@ from marey_motion.matching.record import Status
 
 
 def straight_walks(count: int = 3, seconds: float = 5.0, **given: Any) -> list[Track]:
-    """Return clips of one speed, so all in one cell, that differ in the phase of the gait."""
+    """Return clips that have one speed, and so are in one cell, but differ in the phase of the gait."""
     return named([arc_track(1.0, 0.0, seconds, phase=0.4 * number, **given) for number in range(count)])
 
 

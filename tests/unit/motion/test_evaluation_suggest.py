@@ -167,7 +167,7 @@ def test_reasons_name_the_clip_and_what_it_does(found: Suggestions) -> None:
 
 
 def effect(*changes_m: float) -> Effect:
-    """Return an effect that changes the mean distance from the path by so much in each replicate."""
+    """Return an effect whose changes of the mean distance from the path, by replicate, are given."""
     before, after = np.ones((1, len(changes_m))), 1.0 + np.array([changes_m])
     changes = {name: paired_change(name, before, after) for name in HEADLINES}
     return Effect(paired_change(OBJECTIVE, before, after), changes)

@@ -1,4 +1,4 @@
-"""Evaluations with varied weights: results equal those of a database with these weights.
+"""Evaluations with varied weights: results equal the results of a database that was built with these weights.
 
 Groups are ranked by effect.
 """

@@ -56,9 +56,9 @@ def test_removing_all_that_is_unused_leaves_every_record_bit_identical(variant: 
 def test_frames_that_a_search_may_not_choose_stay_in_one_clip_with_the_frame_that_bars_them() -> None:
     """The clip repeats itself every 110 frames, and is played alternately around frame 100 and around frame 310.
 
-    While it is played from frame 306 on, searches must not choose frames from 186 on, because they are near and in the
-    same clip. Without the unused frames 226 to 266, the frames before them would be another clip. A search would then
-    choose frame 196.
+    While it is played from frame 306 on, searches must not choose its frames from 186 on, which are too near. If the
+    unused frames 226 to 266 were removed, the frames before them would be another clip. A search would then choose
+    frame 196.
     """
     track = arc_track(1.0, 0.0, 12.0)
     frames = np.arange(len(track.headings))

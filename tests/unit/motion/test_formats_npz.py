@@ -151,7 +151,7 @@ def test_poses_in_half_precision_are_limited_like_those_in_single_precision(
 
 
 def test_no_more_is_unpacked_than_the_archive_declares(archive: dict[str, bytes]) -> None:
-    """The sizes in the archive are false: of 64 MiB, it declares 100 bytes."""
+    """The archive declares a false size: 100 bytes for a member of 64 MiB."""
     archive["format.npy"] = bytes(64 << 20)
     data = bytearray(packed(archive, zipfile.ZIP_DEFLATED))
     with zipfile.ZipFile(io.BytesIO(data)) as members:

@@ -1,4 +1,4 @@
-"""Time and memory that odd or large files may cost; those that describe a huge motion are refused."""
+"""Limits of time and memory for odd or large files; files that describe a huge motion are refused."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def refusal(data: bytes) -> tuple[str, str]:
 
 
 def changed(**members: Any) -> bytes:
-    """Return the zipped graph with members replaced or, for None, left out; underlines stand for dots."""
+    """Return the zipped graph with members replaced, or removed for None; underscores in names stand for dots."""
     names = {"definition": "graph_definition.json", "skeleton": "skeleton.json",
              "begin": "elementary_action_models/elementary_action_walk/walk_begin_quaternion_mm.json",
              "meta": "elementary_action_models/elementary_action_walk/meta_information.json"}  # fmt: skip
@@ -142,7 +142,7 @@ def test_names_in_refusals_are_short() -> None:
 def test_types_and_trees_are_found_without_searching_all_members_for_each_model(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Searching them took time with the square of their number: minutes for as many models as are permitted."""
+    """The time of these searches grew with the square of the number of models, up to minutes for permitted graphs."""
     searched: Counter[str] = Counter()
     unpacked, list_of = reader._members, reader._list_of
 

@@ -428,7 +428,7 @@ def test_a_limb_that_is_straight_or_folded_bends_about_its_hinge(body: Skeleton)
 
 
 def _bending_leg(body: Skeleton, bends_rad: np.ndarray, aside_rad: float) -> tuple[Motion, TwoBoneLimb]:
-    """Return a motion in which the hanging left leg bends its knee forwards by these angles, and the limb of this leg.
+    """Return a motion in which the knee of the hanging left leg bends forwards by `angles`, and the limb of this leg.
 
     The axis of the knee is turned to the side by `aside_rad`.
     """

@@ -57,7 +57,7 @@ def test_no_foot_sinks_at_a_seam_of_walks_that_are_out_of_step(start: int, blend
 
 
 def test_a_foot_that_stands_on_both_sides_of_a_seam_stays_where_it_stands() -> None:
-    """The second clip stands 6 cm aside; its feet stay where the first clip put them until they step."""
+    """The second clip is shifted sideways by 6 cm; its feet stay at their places in the first clip until they step."""
     walk = generate_gait(1.3, 0.0, 4.0)
     toe = walk.skeleton.index_of(map_joints(walk.skeleton).joints["left_toe"])
     heights, places = _soles(walk)[:, 0], Motion.of(walk).positions(walk.skeleton)[:, toe]
@@ -167,7 +167,7 @@ def test_contacts_of_one_foot_that_overlap_are_refused() -> None:
 
 
 def test_a_knee_does_not_jump_in_a_long_blend(mocap: Path) -> None:
-    """A run continues out of step, and its feet need three seconds to get to their own places."""
+    """The first part of a run is followed by the whole run, out of step, with a blend of three seconds."""
     clip = read_motion((mocap / RUN).read_bytes(), "run.bvh").clip
     assert clip is not None
     seam, knee = clip.frame_count * 2 // 5, clip.skeleton.index_of(map_joints(clip.skeleton).joints["left_knee"])

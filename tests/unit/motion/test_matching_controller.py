@@ -356,7 +356,7 @@ def test_following_the_path_a_slow_character_is_not_hurried_along() -> None:
 def test_the_path_is_looked_at_from_the_nearest_point_also_where_that_lies_between_two_ticks() -> None:
     """The root moves at 0.9 m/s parallel to a straight path; the requested speed is 2 m/s.
 
-    So the trajectory ahead must be the same at every tick.
+    So the requested points, relative to the root, must be the same at every tick.
     """
     database = synthetic_database([arc_track(0.9, 0.0, 60.0)])
     path = reference(circle(2.0, 0.0, duration_s=1.0))

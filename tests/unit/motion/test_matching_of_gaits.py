@@ -26,7 +26,7 @@ from marey_schemas.options.matching import ControllerOptions, DatabaseOptions, F
 FOLLOWS = ("time", "path", "open_loop")
 EXACT = ControllerOptions(root_inertialisation=False, reselect_window_s=0.0)
 UNBARRED = ControllerOptions(reselect_window_s=0.0)
-"""Options under which a search may choose any frame; a barred frame could be chosen in a copy of its clip."""
+"""Options under which a search may choose any frame, so that copies of a clip make no difference."""
 LEAN_M = 0.04
 """Greatest distance in metres between the torso and the curve of the feet, towards the inside."""
 
@@ -201,7 +201,7 @@ def places(database: MatchingDatabase, record: TrialRecord) -> list[tuple[str, i
 def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(
     takes: list[SourceClip], follow: Follow
 ) -> None:
-    """Trials have no straight approach, which the left and the right trial would begin in the same row."""
+    """The trials have no straight approach, because the left and the right trial would begin it in the same row."""
     closed = database_of(takes, DatabaseOptions(mirroring="add"))
     options = ControllerOptions(follow=follow)
     for speed, turn_rate_deg in ((1.3, 40.0), (2.0, 60.0), (1.0, 100.0)):

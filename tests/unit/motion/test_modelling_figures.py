@@ -341,7 +341,7 @@ ODD_SHOWS = {
     "many keyframes": ("time-components", "time-warps", "alignment-costs", *STRIPS),
     "below the floor": ("paths", *STRIPS),
 }
-"""Names of the figures that show what is odd about a model."""
+"""Names of the figures that show the unusual property of each model in `ODD`."""
 
 
 @pytest.mark.parametrize("odd", ODD)

@@ -17,7 +17,7 @@ from marey_motion.modelling.mixture_fitting import fit_mixture, one_thread
 from marey_schemas.options.modelling import CovarianceKind, MixtureOptions
 
 THOROUGH = MixtureOptions() if is_soak() else MixtureOptions(starts=2)
-"""Options of fits whose number of starts is not what a test is about."""
+"""Options of fits for tests that do not depend on the number of starts."""
 
 
 def two_kinds(examples: int = 200, dimensions: int = 3, apart: float = 8.0, seed: int = 0) -> Floats:

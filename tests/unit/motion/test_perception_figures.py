@@ -1,4 +1,4 @@
-"""The example in the explanation of the perceptual metric runs, and its figures show what they say."""
+"""The example in the explanation of the perceptual metric runs, and its figures agree with their captions."""
 
 import re
 from pathlib import Path

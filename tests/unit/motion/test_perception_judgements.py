@@ -142,7 +142,7 @@ STARTS = 1000 if is_soak() else 100
 
 
 def fit_by_descent(means: Floats, perceived: Floats) -> Floats:
-    """Return the sums of squares that projected descent reaches from random starts: 1,000 as in the paper, or 100."""
+    """Return the sums of squares that projected gradient descent reaches from random starts: 1,000 (paper), or 100."""
     table = np.column_stack((np.ones(len(means)), means))
     scale = np.linalg.norm(table, axis=0)
     table = table / np.where(scale > 0, scale, 1.0)

@@ -1,4 +1,4 @@
-"""Quality of motion on clips with known numbers, beside loops of the published formulas, and on recorded walks."""
+"""Quality of motion on clips with known numbers and on recorded walks, compared with loops of published formulas."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

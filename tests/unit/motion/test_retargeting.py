@@ -88,7 +88,7 @@ def axis_directions(clip: Clip, joint: int, axis: tuple[float, float, float]) ->
 
 
 def pairs_as_in(clip: Clip, plan: RetargetPlan) -> list[JointPair]:
-    """List the pairs whose joints have the orientation of the source: all but those that stand for dropped joints."""
+    """List the joint pairs that copy the orientation of the source: all except those that replace dropped joints."""
     check = check_of(clip, plan, DROPPED)
     return [pair for pair in plan.pairs if check is None or pair.source not in check.joints]
 
@@ -138,7 +138,7 @@ def check_of(clip: Clip, plan: RetargetPlan, code: str) -> CheckWarning | None:
 
 
 def assert_body_travels(source: Actor, target: Actor, clip: Clip, result: Clip, plan: RetargetPlan) -> None:
-    """Check that the anchor of the result moves like that of the source, times the scale, apart from the told shift."""
+    """Check that the anchor of the result moves as in the source, times the scale, apart from the reported shift."""
     anchors = [anchor.standard for anchor in plan.anchors]
     expected, found = (
         kinematics.global_positions(one)[:, [actor.joint(anchor) for anchor in anchors]].astype(np.float64).mean(axis=1)

@@ -20,7 +20,7 @@ JUDGED = [pytest.param(*pair, marks=[pytest.mark.soak] if number >= SHORT else [
 
 @pytest.fixture(scope="module")
 def rigs(mocap: Path) -> dict[str, Actor]:
-    """All rigs in the tier soak, otherwise those of the first pairs."""
+    """All rigs in the tier soak, otherwise the rigs of the first pairs."""
     used = {name for pair in PAIRS[: None if is_soak() else SHORT] for name in pair}
     return {name: Actor.of(mocap, RIGS[name]) for name in used}
 

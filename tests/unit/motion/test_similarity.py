@@ -171,7 +171,7 @@ def exhaustively(
 
 
 def random_metric(rng: np.random.Generator, name: str) -> PerceptualMetric:
-    """Return a built-in metric with other weights, some of them 0, constants, and measure of angles."""
+    """Return a built-in metric with random weights (some are 0), random constants, and a random measure of angles."""
     metric = metric_of(built_in_metric(name))
     parts = []
     for part in metric.components:

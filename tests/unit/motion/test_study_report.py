@@ -1,4 +1,4 @@
-"""Report of a study: what it shows, and what it says if there is no order, or if no metric was fitted."""
+"""Report of a study: its contents, also without an order of the motions, and without a fitted metric."""
 
 from __future__ import annotations
 

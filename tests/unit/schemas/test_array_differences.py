@@ -57,7 +57,7 @@ def restored(found: ArrayDifference, base: NDArray[Any]) -> NDArray[Any]:
 def test_the_sum_of_base_and_difference_is_the_array(
     dtype: str, shape: tuple[int, ...], edits: list[tuple[int, int, bool]]
 ) -> None:
-    """Also of numbers of any size: the extremes of the dtype, and zeros with a sign."""
+    """This holds for all numbers, including the extremes of the dtype and signed zeros."""
     base = numbers(dtype, shape)
     array, other = base.copy(), numbers(dtype, shape, seed=2)
     for start, length, extreme in edits if shape else ():
@@ -88,7 +88,7 @@ def test_nine_edited_frames_of_nine_hundred_take_less_than_two_percent() -> None
 
 
 def test_tiles_without_edited_frames_are_those_of_the_base() -> None:
-    """The receiver neither encodes them again nor stores other bytes."""
+    """The receiver neither encodes these tiles again, nor stores other bytes for them."""
     base = numbers("<f4", (FRAMES, 71)).cumsum(axis=0, dtype=np.float32)
     array = base.copy()
     array[300] += 1

@@ -1,4 +1,4 @@
-"""Words of entries of the audit log."""
+"""Entries of the audit log in words."""
 
 from datetime import UTC, datetime
 

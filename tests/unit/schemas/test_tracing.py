@@ -1,4 +1,4 @@
-"""Configuration of traces, their headers, and what they load."""
+"""Traces: their configuration, their headers, and the modules that they load."""
 
 import logging
 import subprocess

@@ -107,7 +107,7 @@ class LabellingDesk(CommittingDesk):
         return found
 
     def problems(self) -> list[Any]:
-        """Return what is wrong with the store."""
+        """Return the defects that the check of the store finds."""
         return list(fsck.check_store(self.desk.database))
 
 

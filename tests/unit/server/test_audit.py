@@ -76,7 +76,7 @@ def changes_of_events() -> Iterator[tuple[str, str, str]]:
 
 
 def _changes_event(call: ast.Call) -> str | None:
-    """Return `delete` or `update` if a call builds such a statement for the table of events, or None."""
+    """Return `delete` or `update` if a call builds a statement of this kind for the table of events, otherwise None."""
     named = call.func
     if isinstance(named, ast.Name) and named.id in CHANGING:
         target = ast.unparse(call.args[0])

@@ -1,4 +1,4 @@
-"""Demand for workers: which queued jobs count, and what the given workers run."""
+"""Demand for workers: the queued jobs that count, and the jobs that given workers run."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""Roles in folders: who may set them, when they end, and what jobs, checkouts and received versions may write."""
+"""Roles in folders: rights to set them, their end, and rights of jobs, checkouts and received versions to write."""
 
 from __future__ import annotations
 

@@ -159,7 +159,7 @@ def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(
 
 
 def test_nothing_is_lost_while_everybody_is_busy(lab: Lab, clock: AdjustableClock) -> None:
-    """Publications, uploads and garbage collection run at once, without a grace period; nothing may be missing."""
+    """Publications, uploads and garbage collection run at once, without a grace period; all references stay valid."""
     errors = []
 
     def publisher(number: int) -> None:

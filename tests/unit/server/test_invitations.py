@@ -85,7 +85,7 @@ def kinds(lab: Lab) -> list[str]:
 
 
 def is_invalid(lab: Lab, code: str, who: Principal | None = None) -> bool:
-    """Return whether a code is refused; fail if the refusal differs from that of any other invalid code."""
+    """Return whether a code is refused; fail unless all invalid codes are refused in the same way."""
     refused = None
     try:
         accept(lab, code, who)

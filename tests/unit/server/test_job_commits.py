@@ -357,7 +357,7 @@ def test_identical_jobs_that_all_meet_a_conflict_share_the_commit(gaits: Committ
 
 
 def test_a_step_that_reads_an_earlier_one_starts_from_the_commit_of_that(gaits: CommittingDesk) -> None:
-    """Both steps write to the same path; the second one follows the commit of the first, so there is no conflict."""
+    """Two steps write to one path; the second starts from the commit of the first, so there is no conflict."""
     first = gaits.submit(into="made")
     second = gaits.submit("square", into="made", inputs={"things": (JobOutputsInput(job=first),)})
     gaits.work("a")

@@ -1,4 +1,4 @@
-"""Projects of tests: the rows that are put back are those that were made, and the database goes on after them."""
+"""Stored rows of test projects: the inserted rows equal the original ones, and sequences continue after them."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -125,7 +125,7 @@ class Tree:
 
 
 def test_a_refused_call_keeps_nothing_that_its_functions_used() -> None:
-    """Only the garbage collector could free bodies of refused requests that a call keeps, and it stops all threads."""
+    """Bodies that a refused call keeps can be freed only by the garbage collector, which stops all threads."""
     trees: list[weakref.ref[Tree]] = []
 
     def check(tree: Tree) -> None:

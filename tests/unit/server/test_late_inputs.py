@@ -209,7 +209,7 @@ def test_a_chain_that_was_computed_before_is_done_when_it_is_submitted(desk: Des
 def test_a_long_chain_that_was_computed_before_is_served_in_portions(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One transaction must not publish a whole pipeline, because it would occupy the database for too long."""
+    """A transaction that published the results of a whole pipeline would occupy the database for too long."""
     monkeypatch.setattr(result_cache, "MOST_SHARED_OUTPUTS", 3)
 
     def submit_chain() -> list[str]:

@@ -1,4 +1,4 @@
-"""Blobs in object storage without a network: names of objects, deletion beside writers, moves, settings."""
+"""Blobs in object storage without a network: names of objects, deletion while others write, moves, settings."""
 
 import threading
 from collections.abc import Iterable, Iterator, Sequence
@@ -139,7 +139,7 @@ class Sweeper:
         self._going: list[StoredObject] = []
 
     def step(self) -> None:
-        """Delete the objects of the last decision, if any; otherwise decide."""
+        """Delete the objects that the previous step has chosen; if it chose none, choose objects to delete."""
         if self._going:
             self._objects.delete([one.name for one in self._going])
             self._going = []

@@ -1,4 +1,4 @@
-"""Pods of a job's own: which jobs get one, what the token of a pod may do, and which pods are started."""
+"""Pods that run one job each: which jobs get such a pod, the rights of its token, and the pods that are started."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one commit of a dataset writes to the log of an SQLite database, and in which form chunks are stored."""
+"""Pages that one commit of a dataset writes to the log of an SQLite database, and the stored form of chunks."""
 
 import struct
 from collections import Counter

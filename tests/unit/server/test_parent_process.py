@@ -32,7 +32,7 @@ class Played:
         self.behave("serve")
 
     def behave(self, how: str) -> None:
-        """Set what processes do that start from now on."""
+        """Set the behaviour of processes that start from now on."""
         (self.folder / "behaviour").write_text(how)
 
     async def play(self, script: Callable[[Parent], Awaitable[None]]) -> None:
@@ -59,7 +59,7 @@ class Played:
 
     @property
     def received(self) -> list[str]:
-        """What the processes have received and noted so far."""
+        """Messages that the processes have received and written to files so far."""
         file = self.folder / "received"
         return file.read_text().splitlines() if file.exists() else []
 

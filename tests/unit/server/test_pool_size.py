@@ -6,7 +6,7 @@ LIMITS = PoolLimits(least=1, most=8, grow_after_s=10, shrink_after_s=100)
 
 
 def sizes(size: PoolSize, present: int, *numbers: tuple[float, int, int]) -> list[int]:
-    """Return the decisions at these times, with these numbers of queued and running jobs; each decision is obeyed."""
+    """Return the size decided at each time, given the queued and running jobs; the pool then has the decided size."""
     decided = []
     for at_s, queued, running in numbers:
         present = size.decide(at_s, queued=queued, running=running, present=present)

@@ -1,4 +1,4 @@
-"""Start of the workers of a server: launchers by name, and what each launcher is given."""
+"""Start of the workers of a server: launchers by name, and the arguments that each launcher gets."""
 
 from __future__ import annotations
 

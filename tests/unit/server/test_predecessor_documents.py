@@ -1,4 +1,4 @@
-"""Documents of the predecessor that were imported, changed and written, read again by code that is not Marey's."""
+"""Documents of the predecessor that were imported, changed and written, then read by an independent reader."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TIMED = [name for name in old.primitives() if not name.startswith(("stand", "old
 
 @pytest.fixture(scope="module")
 def imported() -> Mapping[str, ImportedItem]:
-    """Items of the folder with one of each, by kind and name."""
+    """Items imported from the folder with one document of each kind, by kind and name."""
     return {f"{item.kind.value} {item.item_name}": item for item in _items()}
 
 

@@ -169,7 +169,7 @@ def prepared_statements() -> Iterator[str]:
 
 
 def test_only_statements_with_a_measured_gain_are_prepared() -> None:
-    """The decision record lists the prepared statements: measure the gain of a new one, and add it to the record."""
+    """The decision record lists all prepared statements; measure the gain of a new one, and add it to the record."""
     record = Path("docs/decisions/0012-prepared-statements.md").read_text(encoding="utf-8")
     listed = re.findall(r"^\| `([\w.]+)` \|", record, re.MULTILINE)
     assert sorted(set(prepared_statements())) == sorted(listed)

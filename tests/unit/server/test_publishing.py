@@ -400,7 +400,7 @@ def test_what_a_batch_refers_to_within_itself_is_not_read_again(lab: Lab, monkey
 
 
 def test_a_joint_that_only_other_clips_move_keeps_its_offset(lab: Lab) -> None:
-    """A rig whose clip moves a joint does not stand for a rig whose clips need the offset of this joint."""
+    """A skeleton whose clip translates a joint must not replace a skeleton whose clips need the joint's offset."""
 
     def drafts(number: int, offset_m: float, moved: tuple[tuple[str, ...], ...]) -> list[Draft]:
         hierarchy = skeleton_tree()

@@ -91,7 +91,7 @@ class House:
         return answer
 
     def holders(self, item_id: str) -> HeldItem:
-        """Return what holds a deleted item; fail if its purge is not refused, or if the refusal changes anything."""
+        """Return what prevents the purge of a deleted item; fail unless the purge is refused and changes nothing."""
         with pytest.raises(ConflictProblem) as raised:
             self.purge(item=item_id)
         assert raised.value.error_code == "still-held"

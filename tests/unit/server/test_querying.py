@@ -320,7 +320,7 @@ SHARED_VALUES = {
     "subject": "02", "action": "walk", "take": "7b", "licence": '"CC-BY 4.0"', "shoot_day": "2025-03-01",
 }  # fmt: skip
 READS_ALL = "(project_id=? AND kind=?)"
-"""Text that is in SQLite's query plan if all clips are read."""
+"""Text that SQLite's query plan contains if the statement reads all clips."""
 
 
 @pytest.mark.parametrize(

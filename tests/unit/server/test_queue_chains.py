@@ -28,7 +28,7 @@ AT_ONCE = 4
 
 @pytest.fixture
 def few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let few jobs be as many as get a shared result in one transaction."""
+    """Limit the number of jobs that get a shared result in one transaction to `AT_ONCE`."""
     monkeypatch.setattr(result_cache, "SHARED_AT_ONCE", AT_ONCE)
 
 

@@ -52,7 +52,7 @@ def _forget_jobs(tx: Transaction) -> None:
 
 
 class QueueMachine(RuleBasedStateMachine):
-    """State machine: single jobs must equal those of the model; connected jobs must meet general conditions."""
+    """State machine: jobs without connections must equal the jobs of the model; others must meet general conditions."""
 
     def __init__(self, desk: Desk, clock: StillClock) -> None:
         super().__init__()
@@ -132,7 +132,7 @@ class QueueMachine(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def try_again(self, data: st.DataObject) -> None:
-        """Retry a job that is connected to others; the model contains only single jobs without retries."""
+        """Retry a job that is connected to others; the model contains only jobs without connections and retries."""
         self._tick()
         lost = {row.id for row in self._rows() if row.kind in CHAINED and row.state in ("failed", "cancelled")}
         again = sorted(job for job in lost if self._is_head(job) and not self._needs_an_errand(job))

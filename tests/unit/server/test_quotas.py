@@ -207,7 +207,7 @@ def make_skeleton(tx: Transaction, name: str, bone_m: float) -> Item:
 
 
 def test_documents_of_items_count_for_the_day_even_if_the_items_are_deleted(lab: Lab) -> None:
-    """Otherwise a user who creates and deletes items in turn fills the disk without using up any quota."""
+    """A user who creates and deletes items in turn must not fill the disk without using up a quota."""
     size_bytes = prepare_document(skeleton_tree(bone_m=1.0)).size_bytes
     lab.database.quotas = Quotas(user_daily_bytes=int(2.5 * size_bytes))
     first = lab.write(make_skeleton, "first", 1.0)
@@ -243,7 +243,7 @@ def test_an_upload_of_bytes_that_are_there_does_not_count(lab: Lab) -> None:
 
 
 def test_pieces_of_an_upload_that_is_not_needed_count_until_they_are_deleted(lab: Lab) -> None:
-    """Otherwise a user who uploads the same bytes again and again fills the disk without using up any quota."""
+    """A user who uploads the same bytes again and again must not fill the disk without using up a quota."""
     lab.database.quotas = Quotas(user_upload_bytes=1000)
     data = b"a" * 600
     for again in (False, True):
@@ -311,7 +311,7 @@ def test_an_import_that_is_being_stored_does_not_delay_other_uploads_of_the_user
 def test_concurrent_uploads_of_one_user_do_not_deadlock_and_all_of_them_count(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Imports store files that they share in different orders, beside other uploads of the same user."""
+    """Imports store the same files in different orders, at the same time as other uploads of the user."""
     monkeypatch.setattr(connections, "WRITE_TRIES", 1)  # so that a deadlock is an error
     lab.database.quotas = Quotas(user_daily_bytes=1_000_000)
     shared = [b"%d" % number * 1000 for number in range(10)]

@@ -1,4 +1,4 @@
-"""Round trips between the server and Postgres: each costs a request more than the statement that it carries."""
+"""Round trips between the server and Postgres: a round trip costs more time than the statement that it sends."""
 
 import tempfile
 from collections.abc import Callable, Mapping

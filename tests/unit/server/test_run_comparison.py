@@ -1,4 +1,4 @@
-"""Comparisons of the runs of a script: settings, replicates, best values, and results that a worker made up."""
+"""Comparisons of the runs of a script: settings, replicates, best values, and results that a worker has invented."""
 
 from __future__ import annotations
 

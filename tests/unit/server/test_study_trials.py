@@ -1,4 +1,4 @@
-"""The clock of trials and the replay of requests, against a model, with a clock that the test moves."""
+"""Times of trials and repeated requests, compared with a model; the test sets the clock."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def judged(lab: Lab, study: str) -> JudgingParticipant:
 
 @dataclass
 class Model:
-    """What a participant's trials should be."""
+    """Expected trials of a participant."""
 
     answered: int = 0
     number: int = 0

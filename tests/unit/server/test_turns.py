@@ -1,4 +1,4 @@
-"""Fairness between projects, and limits of running jobs: claims must equal those of a model that picks one by one."""
+"""Fairness between projects, and limits of running jobs: claims are compared with a model that picks jobs singly."""
 
 from __future__ import annotations
 

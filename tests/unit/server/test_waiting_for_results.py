@@ -1,4 +1,4 @@
-"""Jobs that wait for the result of an identical job: for which job, and what they do if they cannot have the result."""
+"""Jobs that wait for the result of an identical job: the choice of this job, and the outcome if there is no result."""
 
 from collections import Counter
 from dataclasses import replace
@@ -26,7 +26,7 @@ AT_ONCE = 3
 
 @pytest.fixture
 def few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let few jobs be as many as get a shared result in one transaction."""
+    """Limit the number of jobs that get a shared result in one transaction to `AT_ONCE`."""
     monkeypatch.setattr(result_cache, "SHARED_AT_ONCE", AT_ONCE)
 
 

@@ -1,4 +1,4 @@
-"""List of workers: what claims and attempts show about them, and who may see it."""
+"""List of workers: the facts that claims and attempts reveal about workers, and who may read the list."""
 
 import pytest
 from pydantic import ValidationError

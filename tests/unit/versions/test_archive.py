@@ -450,7 +450,7 @@ def with_difference(**changed: Any) -> tuple[Example, str]:
 
 
 def test_an_archive_of_later_versions_may_have_arrays_as_differences() -> None:
-    """Programs that do not know differences refuse its schema."""
+    """Programs that do not know array differences refuse the schema of such an archive."""
     made, motion = with_difference()
     archive = checked(made.write(base=first_commit()))
     (found,) = archive.differences(motion).values()

@@ -1,4 +1,4 @@
-"""Search for the first bad commit, compared with a look at every commit of random histories."""
+"""Search for the first bad commit, compared with tests of all commits of random histories."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def search(commits: History, bad: str, is_bad: Callable[[str], bool | None]) -> 
 def most_tests(commits: int) -> int:
     """Return how many tests are enough for n commits if a test leaves at most 2 n / 3 + 1/2 commits.
 
-    Why such a test exists: start at the newest commit, and go to the parent with more ancestors until a commit has at
-    most 2 n / 3 ancestors (itself included). Its child has more than 2 n / 3 ancestors, so this commit has more than n
-    / 3 - 1/2. A test of this commit leaves either its ancestors or all other commits.
+    Such a test always exists: start at the newest commit, and go to the parent with more ancestors until a commit has
+    at most 2 n / 3 ancestors (itself included). The child of this commit has more than 2 n / 3 ancestors, so the
+    commit itself has more than n / 3 - 1/2. A test of the commit leaves either its ancestors or all other commits.
     """
     return 0 if commits == 1 else 1 + most_tests((4 * commits + 3) // 6)
 

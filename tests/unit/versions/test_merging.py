@@ -171,7 +171,7 @@ RESTORED = (
     state(b=entry("1", "1")),
     state(a=entry("1", "1"), b=entry("2", "3")),
 )
-"""A base, our side that removed `b` and moved `a` to its place, and their side that changed `b`."""
+"""A base; our side, which removed `b` and moved `a` to the path of `b`; and their side, which changed `b`."""
 
 
 def test_a_restored_entry_does_not_replace_one_that_no_conflict_has_shown() -> None:

@@ -1,4 +1,4 @@
-"""Jobs of the kind `analyse_study`: which answers are analysed, and what the result says first."""
+"""Jobs of the kind `analyse_study`: the answers that are analysed, and the first finding of the result."""
 
 from __future__ import annotations
 

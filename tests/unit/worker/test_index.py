@@ -1,4 +1,4 @@
-"""Jobs of the kind `index`: what happens to an earlier index that cannot be read."""
+"""Jobs of the kind `index` whose earlier index cannot be read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worker of a pod that was started for one job: what it asks for, and with which status it ends."""
+"""Worker of a pod that was started for one job: its claims, and its exit status."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class IdleChild:
         self.killed = False
 
     def wait_until_ready(self) -> None:
-        """Be ready."""
+        """Return at once: the process is always ready."""
 
     def kill(self, *, grace_s: float) -> None:
         self.killed = True

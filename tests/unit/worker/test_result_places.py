@@ -1,4 +1,4 @@
-"""Paths of the results of jobs with many clips, and what happens if one clip cannot be used."""
+"""Paths of the results of jobs with many clips, and the results if one clip cannot be used."""
 
 import io
 import zipfile

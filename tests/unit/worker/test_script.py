@@ -102,7 +102,7 @@ def refusal(repository: Repository, text: str, **changes: Any) -> JobRefused:
 
 
 def running_below() -> set[psutil.Process]:
-    """Return the processes below this one that run, such as servers of other tests."""
+    """Return the running descendants of this process, such as servers of other tests."""
     return {one for one in psutil.Process().children(recursive=True) if one.status() != psutil.STATUS_ZOMBIE}
 
 

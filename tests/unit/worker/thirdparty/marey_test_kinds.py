@@ -30,7 +30,7 @@ class MisbehaveParams(Request):
 
 
 ODD = {"nan": math.nan, "inf": math.inf, str(1 << 63): 1 << 63, str(1 << 64): 1 << 64, "half a character": "\udc80"}
-"""Values of which a result may not consist."""
+"""Values that are no valid results."""
 
 
 def add(context: Context, params: AddParams) -> dict[str, int]:
@@ -136,7 +136,7 @@ def _give_up_early(context: Context) -> None:
 
 
 def _do_without(context: Context, blob: str) -> dict[str, str]:
-    """Read a file, or a skeleton if `blob` is empty, and do without it if it cannot be read."""
+    """Read a file, or a skeleton if `blob` is empty; continue without it if it cannot be read."""
     try:
         if blob:
             context.blob(blob)
