@@ -41,7 +41,7 @@ def store_document(tx: Transaction, content: Any, *, schema: str | None = None) 
 
 
 def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
-    """Store documents as `store_document` does, all with the same few statements.
+    """Store many documents, as `store_document` stores one, with few SQL statements in total.
 
     Returns, by digest, the number of bytes that each new document uses of a quota.
     """
@@ -76,7 +76,7 @@ def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> di
 
 
 def _text_bytes(one: PreparedDocument) -> int:
-    """Return the size of a document without its arrays."""
+    """Return the size, in bytes, of a document without its arrays."""
     return one.size_bytes - sum(map(len, dict(one.arrays.values()).values()))
 
 

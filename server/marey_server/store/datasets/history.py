@@ -337,7 +337,8 @@ def compare_versions(
     found = list(islice(changes, MOST_DIFFERENCES + 1))
     if len(found) > MOST_DIFFERENCES:
         raise BadRequestProblem(
-            f"The versions differ in more than {MOST_DIFFERENCES:,} entries; compare versions that are closer.",
+            f"The versions differ in more than {MOST_DIFFERENCES:,} entries; compare versions with fewer commits "
+            "between them, or select a `path`.",
             code="large-difference",
         )
     compared = compare_entries(found)

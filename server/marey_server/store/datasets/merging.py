@@ -51,7 +51,7 @@ LARGE_MERGE = "large-merge"
 
 @dataclass(frozen=True)
 class PreparedMerge:
-    """Merge that was computed, but not recorded; without conflicts it has a commit to record."""
+    """Merge that was computed, but not recorded; `commit` is the commit to record if there are no conflicts."""
 
     answer: MergeAnswer
     commit: PreparedCommit
@@ -103,7 +103,9 @@ def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest,
         tx, project_row.id, request, replace(started, answer=started.answer.model_copy(update={"base": base}))
     )
     if not merge.answer.changes and not merge.answer.conflict_count:
-        raise InvalidProblem(f"The branch {request.into!r} would not change.", code="no-changes")
+        raise InvalidProblem(
+            f"The branch {request.into!r} would not change, so there is nothing to commit.", code="no-changes"
+        )
     return merge
 
 
@@ -198,9 +200,10 @@ def _combine(
 
 
 def _require_all_used(merged: MergedEntries) -> None:
-    """Raise `InvalidProblem` if a resolution has decided no conflict.
+    """Raise `InvalidProblem` if a resolution of the request has resolved no conflict.
 
-    While conflicts remain, a further resolution of a decided key may be for one that only the next answer shows.
+    While other conflicts remain, an unused resolution of an entry with a resolved conflict is allowed, because it may
+    be for a further conflict of this entry.
     """
     unknown = [one for one in merged.unused if one.key not in merged.decided or not merged.conflicts]
     if not unknown:

@@ -375,9 +375,11 @@ def _require_no_commit(tx: Transaction, dataset_id: str, name: str) -> None:
     """
     if found := _commits_by_digits(tx, dataset_id, name):
         raise ConflictProblem(
-            f"The commit {found[0]} is named by its first digits {name!r}; choose another name.",
+            f"The digest of the commit {found[0]} begins with {name!r}, so this name would be ambiguous; choose "
+            "another name.",
             code="name-taken",
-            unnamed=f"A commit is named by its first digits {name!r}; choose another name.",
+            unnamed=f"The digest of a commit begins with {name!r}, so this name would be ambiguous; choose another "
+            "name.",
         )
 
 
@@ -386,7 +388,9 @@ def _by_digits(tx: Transaction, dataset_id: str, name: str) -> str:
     if not found:
         raise _no_version(name)
     if len(found) > 1:
-        raise InvalidProblem(f"Several commits begin with {name!r}; write more digits.", code="ambiguous-version")
+        raise InvalidProblem(
+            f"The digests of several commits begin with {name!r}; write more digits.", code="ambiguous-version"
+        )
     return str(found[0])
 
 

@@ -184,8 +184,8 @@ def _merged(
 ) -> MergedEntries:
     """Merge the entries of a job, part by part, with the changes of other commits.
 
-    Other commits have changed the tree `base` to the tree `head`. Only their changes of the entries in `entries` are
-    considered.
+    Other commits have changed the tree `base` to the tree `head`. Changes of entries that are not in `entries` are
+    ignored.
     """
     before = {key: entry_of(key, value) for key, value in Tree(reader, base).get_several(entries).items()}
     if base == head:

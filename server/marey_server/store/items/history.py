@@ -95,7 +95,7 @@ def read_lineage(
 
 
 def _versions(environment: Mapping[str, str] | None) -> dict[str, str]:
-    """Return the versions of libraries in the environment of a job, without its place in a trace."""
+    """Return the versions of libraries from the environment of a job, without its trace header."""
     return {name: text for name, text in (environment or {}).items() if name != HEADER}
 
 
@@ -137,7 +137,7 @@ def list_staleness(
 ) -> Page:
     """List the items of a kind of which an input has a newer revision, in the order of their names.
 
-    `read_staleness` says what counts. A page examines `limit` items, so it may list fewer, even none.
+    See `read_staleness` for the inputs that count. A page examines `limit` items, so it may list fewer, even none.
     """
     examined = list_items(
         tx, project_name, kind, filters, sort="name", cursor=cursor, limit=limit, fields=("id", "revision")

@@ -285,7 +285,7 @@ def _outputs_of_tasks(tx: Transaction, parent_id: str) -> Iterable[Mapping[str, 
 
 
 class _CommitRefused(Exception):
-    """The outputs of a job may not be committed to its branch."""
+    """Error for outputs of a job that may not be committed to the branch of the job."""
 
     def __init__(self, target: Target, error: ApiProblem) -> None:
         super().__init__(error.detail)
@@ -364,7 +364,7 @@ def _free_path(output: Mapping[str, Any], taken: Mapping[str, RevisionKey]) -> s
         other = taken.get(key_of(path, output["kind"]))
         if other is None or other.item == output["item"]:
             return str(path)
-    raise AssertionError("unreachable")
+    raise AssertionError("the loop ends only with a return")
 
 
 def _message(row: Any) -> str:

@@ -63,7 +63,8 @@ def require_worker(caller: Principal, request: ClaimRequest) -> list[str]:
         return scopes
     if OWN_POD_LABEL in request.labels:
         raise ForbiddenProblem(
-            f"The worker announces the label {OWN_POD_LABEL!r}, which only a pod has that was started for one job.",
+            f"The worker announces the label {OWN_POD_LABEL!r}, which is reserved for pods that were started for one "
+            "job. Start the worker without this label.",
             code="label-not-allowed",
             context={"label": OWN_POD_LABEL},
         )
