@@ -29,7 +29,7 @@ from marey_server.store.transaction import Transaction, in_lists
 MOST_CHANGES = 20_000
 """Greatest number of clips that may have changed since an index was updated; a search checks each of them."""
 MOST_COPIED_BYTES = 8 * GIB
-"""Greatest size of the copies of index files on one server, and so of one index."""
+"""Greatest total size, in bytes, of the copies of index files on one server, and so of one index."""
 
 
 class FoundIndex(NamedTuple):
@@ -78,7 +78,9 @@ def find_index(tx: Transaction, project: str, index: str | None) -> FoundIndex:
     found = items.read_part(tx, project, Kind.INDEX, row.id, "index", revision=row.head)
     document = MotionIndexDocument.model_validate(found.tree)
     if document.version != INDEX_VERSION:
-        raise ConflictProblem("The index has an older form; update it.", code="index-outdated")
+        raise ConflictProblem(
+            "The index was made by an earlier version of Marey; update it with `marey index`.", code="index-outdated"
+        )
     since_us = row.created_us if row.submitted_us is None else row.submitted_us
     return FoundIndex(row.id, row.head, document, _changed_since(tx, project_row.id, since_us))
 
@@ -91,7 +93,7 @@ def _changed_since(tx: Transaction, project_id: str, since_us: int) -> dict[str,
     rows = tx.execute(statement).all()
     if len(rows) > MOST_CHANGES:
         raise ConflictProblem(
-            f"More than {MOST_CHANGES:,} clips have changed since the index was updated; update it.",
+            f"More than {MOST_CHANGES:,} clips have changed since the index was updated; update it with `marey index`.",
             code="index-outdated",
         )
     return {row.id: row.head if row.deleted_us is None else 0 for row in rows}
@@ -181,7 +183,7 @@ class IndexFiles:
             with os.fdopen(handle, "wb") as file:
                 written = sum(file.write(chunk) for chunk in tx.blobs.read(tx.connection, digest, 0, size))
             if written != size:
-                raise NotFoundProblem("Files of the index are missing; build it again.", code="no-index")
+                raise NotFoundProblem("Files of the index are missing; build the index again.", code="no-index")
             os.replace(name, self.path(digest))
         except BaseException:
             with suppress(FileNotFoundError):
@@ -189,7 +191,7 @@ class IndexFiles:
             raise
 
     def _make_room(self, most_bytes: int, kept: Collection[str]) -> None:
-        """Remove the copies that were not used for the longest time, except some, until they fit into a size."""
+        """Remove copies that are not in `kept`, the longest unused first, until all have at most `most_bytes`."""
         copies = sorted(self._others({self.path(digest).name for digest in kept}), key=lambda one: one[1])
         held_bytes = sum(path.stat().st_size for path in self._folder.iterdir())
         for path, _used, size_bytes in copies:

@@ -75,7 +75,7 @@ class Observer:
     """Receiver of numbers about committed transactions, for metrics; this base class ignores them."""
 
     def count_ended(self, state: str, reason: str | None) -> None:
-        """Count a job that has ended; `reason` is that of a failure."""
+        """Count a job that has ended; `reason` is the reason of its failure, if it has failed."""
 
     def count_requeued(self, outcome: str) -> None:
         """Count a job that is queued again after an attempt with this outcome."""
@@ -88,7 +88,7 @@ class Observer:
 
 
 def _untraced(_principal: Principal) -> None:
-    """Return that jobs belong to no trace."""
+    """Return None, because jobs belong to no trace."""
 
 
 IGNORED = Observer()

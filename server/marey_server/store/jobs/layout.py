@@ -218,13 +218,13 @@ def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
 
 
 def place_in_trace(tx: Transaction) -> dict[str, str] | None:
-    """Return what a new job stores in place of its environment, until a worker reports the latter."""
+    """Return the first value of the column `environment` of a new job, which contains only the job's trace header."""
     header = tx.trace_of_jobs(tx.principal)
     return None if header is None else {HEADER: header}
 
 
 def trace_header(environment: Mapping[str, str] | None) -> str | None:
-    """Return the place in a trace of a job that has not ended, as a header."""
+    """Return the trace header in the column `environment` of a job that has not ended, or None."""
     return (environment or {}).get(HEADER)
 
 

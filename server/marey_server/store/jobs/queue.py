@@ -285,7 +285,7 @@ _CLAIM_STATEMENTS = {one_job: Prepared(_claim_statement(one_job=one_job)) for on
 
 
 class _Wanted(NamedTuple):
-    """Statements of a claim, with the parameters for what it asks for."""
+    """Statements of a claim, and their parameters, such as the kinds and labels in the request."""
 
     turns: Prepared
     of_turns: Mapping[str, Any]
@@ -369,7 +369,7 @@ def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
 
 
 def _trace(tx: Transaction, row: Row[Any]) -> JobTrace | None:
-    """Return the trace to which the job belongs, with the time for which the job could have run before."""
+    """Return the trace of a job, with the seconds for which the job could have run before it was claimed."""
     header = trace_header(row.environment)
     return None if header is None else JobTrace(traceparent=header, waited_s=_delay_s(tx, row))
 

@@ -44,13 +44,13 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
     rights_of_caller(tx, project)  # here, because it must precede the locks of jobs
     if row.state not in UNSUCCESSFUL:
         raise ConflictProblem(
-            f"Only a failed or cancelled job can be retried; this one is {row.state}.", code="not-failed"
+            f"Only a failed or cancelled job can be retried; this job is {row.state}.", code="not-failed"
         )
     if row.parent_id is not None:
         raise ConflictProblem(
-            f"This job is a task of the job {row.parent_id} and cannot be retried alone; retry the other job.",
+            f"This job is a task of the job {row.parent_id} and cannot be retried alone; retry {row.parent_id}.",
             code="is-task",
-            unnamed="This job is a task of another job and cannot be retried alone; retry the other job.",
+            unnamed="This job is a task of a parent job and cannot be retried alone; retry the parent job.",
         )
     family = _Family(tx, project)
     family.add_with_needed([job_id])

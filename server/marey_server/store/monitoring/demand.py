@@ -34,7 +34,7 @@ class Demand:
 
 @dataclass(frozen=True)
 class JobReach:
-    """Jobs that the workers of a pool can run: those that require a subset of `labels`, of these kinds; empty: all."""
+    """Jobs that the workers of a pool can run: those that require a subset of `labels`, of the `kinds` (empty: any)."""
 
     labels: Mapping[str, str]
     kinds: Sequence[str] = ()
@@ -96,7 +96,7 @@ def _count_rows(tx: Transaction, rows: Select[*tuple[Any, ...]], most: int) -> i
 
 
 def _keys(project_id: str, startable: ColumnElement[bool]) -> Select[*tuple[Any, ...]]:
-    """Return the concurrency keys of which one job could start now.
+    """Return a query for the concurrency keys of a project for which a job could start now.
 
     Each step looks up the next key in the index, so the cost depends on the number of keys, not of jobs.
     """

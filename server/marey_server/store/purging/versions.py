@@ -82,7 +82,7 @@ class VersionSearch:
         try:  # `entry_of` would check each entry, but few of them have a wanted part
             near = [entry for entry in entries if not self._parts.isdisjoint(entry[1]["parts"].values())]
         except (KeyError, AttributeError, TypeError) as error:
-            raise DamagedChunk(f"an entry of a version has no parts that are texts: {error!r}") from error
+            raise DamagedChunk(f"the parts of an entry are missing, or are not strings: {error!r}") from error
         return frozenset(entry_of(*one).content for one in near) & self.wanted.keys() if near else _NOTHING
 
     def holders(self, tx: Transaction, contents: Mapping[str, Collection[str]]) -> dict[str, list[DatasetHolder]]:

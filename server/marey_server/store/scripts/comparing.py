@@ -43,7 +43,7 @@ class RunToCompare(NamedTuple):
 def find_runs(
     tx: Transaction, project: str, name: str, *, sort: str, limit: int = MOST_COMPARED
 ) -> tuple[list[RunToCompare], bool]:
-    """Return the first succeeded runs of a script in an order, and whether these are all.
+    """Return the first succeeded runs of a script in the given order, and whether these are all succeeded runs.
 
     Raises `BadRequestProblem` for an unknown order.
     """

@@ -109,7 +109,7 @@ def _shown(trial: Row[Any], seed: int) -> JudgedTrial:
 
 
 def _require_maintainer(tx: Transaction, job_id: str) -> None:
-    """Refuse an attempt of a job whose author is no maintainer of the project, or not any more."""
+    """Raise `ForbiddenProblem` for an attempt of a job whose author is not a maintainer of the project at present."""
     role = (
         select(user.c.administrator, member.c.role)
         .select_from(job)

@@ -26,7 +26,7 @@ LEASED = text("state = 'running' AND lease_expires_us IS NOT NULL")
 """Condition of `ix_job_leased`: a worker runs the job. A parent job whose tasks run has no lease."""
 
 HAS_LONG_LOG = text("log_bytes > 43")
-"""Condition of `ix_attempt_log`: the log is longer than the text that replaces an old one."""
+"""Condition of `ix_attempt_log`: the log is longer than the text that replaces a deleted log."""
 
 NOT_SUCCEEDED = text("job.state <> 'succeeded'")
 """Condition of `ix_job_list_state`, for queries; SQLite uses the index only if the query contains this condition."""
