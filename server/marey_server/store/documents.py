@@ -28,7 +28,7 @@ EDIT_SCHEMA = PARTS[Kind.EDIT]["edit"].schema
 
 
 def store_document(tx: Transaction, content: Any, *, schema: str | None = None) -> str:
-    """Store a document and return its digest. `content` is a tree, or what `prepare_document` has returned for it.
+    """Store a document and return its digest. `content` is a tree, or the result of `prepare_document` for a tree.
 
     Storing the same document again adds no rows.
 

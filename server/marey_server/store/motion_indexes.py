@@ -1,4 +1,4 @@
-"""Indexes of motions: the index of a project, what has changed since it was updated, and local copies of its files.
+"""Indexes of motions: finds the index of a project and the clips changed since its update, and copies its files.
 
 Searches map the files of an index into memory. So each server keeps copies of them in its data folder, whatever the
 backing of its blobs. A copy is named by its digest and never changes.

@@ -1,4 +1,4 @@
-"""Failures of the database: which of them are worth another try, and to which errors the others are converted."""
+"""Failures of the database: which failed transactions are retried, and to which errors other failures are converted."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ MOST_DATASETS = 1000
 MOST_REFS = 10_000
 """Greatest number of branches and tags in a dataset."""
 BRANCH_MOVED = "branch-moved"
-"""Code of the error for a branch whose newest commit is not the expected one."""
+"""Code of the error for a branch whose newest commit is not the commit that the request expects."""
 
 _VERSION = re.compile(r"([A-Za-z0-9][A-Za-z0-9._:-]{0,127})(?:~([0-9]{1,4}))?")
 _DIGITS = re.compile(r"(?:sha256:)?([0-9a-f]{8,64})")
@@ -241,7 +241,7 @@ def is_tag(name: str) -> InvalidProblem:
 
 
 def branch_moved(branch: str, head: str | None) -> ConflictProblem:
-    """Return the error for a branch whose newest commit is not the expected one.
+    """Return the error for a branch whose newest commit is not the commit that the request expects.
 
     `head` is the digest of the newest commit; the client finds this digest in `context.commit`.
     """

@@ -145,7 +145,7 @@ def set_parts(
 def revert_item(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemRevert, *, expected_rev: ExpectedRev
 ) -> Item:
-    """Create a revision with the content of an earlier one; if the content is unchanged, no revision is created.
+    """Create a revision with the content of an earlier revision; if this is the present content, create none.
 
     Raises `NotFoundProblem` if there is no such revision, and `PreconditionFailedProblem` if the item is no longer at
     `expected_rev`.

@@ -1,8 +1,8 @@
 """Consent of performers: finds clips whose consent has ended, and records permissions to export such clips.
 
 The take record of a clip (the facts about its recording) contains the last day of the consent. The take record of the
-newest revision counts for every revision of the clip, because a consent concerns the recording. An aligned clip has no
-take record of its own; the take record of its source clip counts.
+newest revision applies to every revision of the clip, because a consent concerns the recording. An aligned clip has no
+take record of its own; the take record of its source clip applies.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ class _Family:
         self._needs |= needs
         if len(self._rows) > MOST_AT_ONCE:
             detail = (
-                f"More than {MOST_AT_ONCE} jobs depend on each other here; first retry the jobs that the others need."
+                f"More than {MOST_AT_ONCE} jobs depend on each other here; first retry the jobs on which others depend."
             )
             raise ConflictProblem(detail, code="too-many")
 

@@ -30,14 +30,14 @@ _ORDER = (
 """Kinds in the order of a purge.
 
 Documents of an item refer to items of later kinds in this order. So an item is purged before the items to which its
-documents refer, and does not hold them.
+documents refer, and does not prevent their purge.
 """
 assert set(_ORDER) == set(Kind), "every kind needs a place in the order of a purge"
 
 
 @dataclass(frozen=True)
 class PreparedPurge:
-    """Items that a request may purge, and what was found about them before the purge."""
+    """Items that a request may purge, and the results of the search that was made for them before the purge."""
 
     ids: tuple[str, ...]
     search: VersionSearch

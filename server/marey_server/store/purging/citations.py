@@ -92,9 +92,10 @@ def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
 
 
 def holders_of(tx: Transaction, citing: Collection[str]) -> FoundHolders:
-    """Return what holds the versions that jobs have read: jobs that have not ended, and items that the jobs made.
+    """Return the holders of versions that jobs have read: those jobs that have not ended, and items that the jobs made.
 
-    `citing` are the ids of the jobs; their retries and tasks count, too. Purged items hold nothing.
+    Holders prevent the deletion of the versions. `citing` are the ids of the jobs; their retries and tasks are
+    included. Purged items are no holders.
     """
     held = FoundHolders()
     ordered = sorted(_with_retries(tx, citing))

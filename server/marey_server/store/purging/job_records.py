@@ -14,7 +14,7 @@ from marey_server.store.transaction import Transaction, in_lists
 
 
 def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) -> None:
-    """Remove the names of items from the records of `jobs`, and release what these jobs keep of the items' content.
+    """Remove the names of items from the records of `jobs`, and the files, facets and results of the items.
 
     The items must still have their documents.
     """

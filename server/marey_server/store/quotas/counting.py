@@ -19,7 +19,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """Text about a quota in errors: its name, and what the user can do."""
+    """Text for errors about a quota: the things that are counted, and what the user can do."""
 
     noun: str
     remedy: str
