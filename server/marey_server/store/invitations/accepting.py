@@ -37,7 +37,7 @@ def invitation_invalid() -> NotFoundProblem:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try to use an invitation code, which must be counted for the rate limits before the code is checked."""
+    """Return the try to use an invitation code, which must be counted for rate limits before the code is checked."""
     prefix, _ = split_invitation(code) or ("", "")
     return SignInTry(f"invitation {prefix}", address, per_minute)
 
