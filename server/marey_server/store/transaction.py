@@ -120,7 +120,7 @@ class Transaction:
         self.pod_rules = pod_rules
         """Rules by which jobs get a pod of their own; None if the server starts no such pods."""
         self.before_statement: Callable[[], object] = bool
-        """Called before each statement of `execute`; an error that it raises stops the transaction."""
+        """Function that is called before each statement; if it raises an error, the transaction stops."""
         self.folder_rights: dict[tuple[str, str | None], FolderRights] = {}
         """Rights that this transaction has read, by project and user; see `store.folder_roles.rights`."""
         self.shared_outputs = 0

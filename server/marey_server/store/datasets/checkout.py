@@ -240,7 +240,7 @@ class _Checkout:
         self.given[made.item] = one.after.content
 
     def _keep_facets(self) -> None:
-        """Store the facets of the new revisions, if an earlier revision with the same content has facets."""
+        """Copy facets to the new revisions from earlier revisions with the same content."""
         known = facets_of_contents(self.tx, self.project.id, self.given.values())
         measured = sorted(item_id for item_id, content in self.given.items() if content in known)
         for some in in_lists(measured):

@@ -63,7 +63,8 @@ def select_entries(tx: Transaction, project: str, name: str, request: CheckoutRe
     """Select the entries of a version that a checkout asks for; return None if it asks for the whole version.
 
     Raises `NotFoundProblem` if the version has no entry at one of the paths, and `BadRequestProblem` for a query that
-    cannot be read. Raises `InvalidProblem` if no entry is selected, or if the query must be compared with too many.
+    cannot be read. Raises `InvalidProblem` if no entry is selected, or if too many entries must be compared with the
+    query.
     """
     if not request.partial:
         return None

@@ -135,7 +135,7 @@ def list_staleness(
     cursor: str | None = None,
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
-    """List the items of a kind of which an input has a newer revision, in the order of their names.
+    """List the items of a kind that have an input with a newer revision, in the order of the names of the items.
 
     See `read_staleness` for the inputs that count. A page examines `limit` items, so it may list fewer, even none.
     """
@@ -149,7 +149,7 @@ def list_staleness(
 
 
 def _with_inputs(tx: Transaction, items: Collection[str]) -> set[str]:
-    """Return those of the items of which any revision has an input: only these can be outdated."""
+    """Return the items that have a revision with inputs; only such items can be outdated."""
     found: set[str] = set()
     for some in in_lists(sorted(items)):
         found.update(tx.execute(select(lineage.c.item_id).where(lineage.c.item_id.in_(some)).distinct()).scalars())

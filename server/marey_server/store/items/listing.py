@@ -217,7 +217,7 @@ def read_query(text: str, alike: Mapping[str, frozenset[str]] = MappingProxyType
 
 
 def explain_query(tx: Transaction, project: str, kind: Kind, filters: ItemFilters, query: str) -> QueryExplanation:
-    """Count the items that match `filters`, how many of them the query selects, and how many each condition excludes.
+    """Count the items that match `filters`, and those of them that the query selects, or that each condition excludes.
 
     The conditions are the operands of the outermost `and` of the query, or else the whole query.
     """

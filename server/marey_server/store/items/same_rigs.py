@@ -64,7 +64,7 @@ class RigDocument:
 
 
 def on_known_rigs(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
-    """Replace the hierarchies of skeletons to be reused by content with those of the same rigs in the project."""
+    """Replace, in drafts of skeletons with `reuse="by_content"`, hierarchies by equal rigs that the project has."""
     moved: dict[str, set[str]] = {}
     for one in loaded:
         joints = set(one.bodies.get("motion", {}).get("translated_joints", ()))

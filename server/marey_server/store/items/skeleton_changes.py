@@ -78,10 +78,10 @@ def _rig(given: LoadedDraft | None, stored: _StoredSkeleton | None) -> RigDocume
 def _on_own_skeletons(
     tx: Transaction, loaded: Sequence[LoadedDraft], own: Mapping[str, _StoredSkeleton]
 ) -> list[LoadedDraft]:
-    """Return the drafts; those named in `own` refer to the skeleton given there, the skeleton of the item they revise.
+    """Return the drafts; a draft named in `own` refers to the skeleton given there, which its item already uses.
 
-    If only such drafts used a new skeleton, its draft gets the rig of an existing skeleton, so that no skeleton is
-    created from it.
+    If only such drafts used a new skeleton, the draft of the new skeleton gets the rig of an existing skeleton, so that
+    no skeleton is created from it.
     """
     others = {name for one in loaded if one.draft.name_in_batch not in own for name in one.refers}
     replaced: dict[str, RigDocument] = {}

@@ -97,8 +97,8 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
     clips. The merged skeletons are deleted.
 
     Raises `NotFoundProblem` for an unknown skeleton, `InvalidProblem` for named skeletons that are not the same rig,
-    `ConflictProblem` for a joint map made by hand that would be lost, `TooLargeProblem`, and `ForbiddenProblem` unless
-    the caller is a maintainer of all folders.
+    `ConflictProblem` for a joint map made by hand that would be lost, `TooLargeProblem` for too many skeletons or
+    items, and `ForbiddenProblem` unless the caller is a maintainer of all folders.
     """
     row = projects.require(tx, project)
     if request.dry_run:
@@ -270,7 +270,7 @@ def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonM
 
 
 def _move(tx: Transaction, project: ProjectRow, merged: _Skeleton, kept: _Skeleton) -> None:
-    """Create revisions that use the kept skeleton for all items that use the merged skeleton, and their annotations."""
+    """Revise the items that use the merged skeleton, so that they use the kept one, and the annotations of clips."""
     reference = {"item": kept.row.id, "revision": kept.row.head}
     message = f"The skeleton {merged.named['path']} was merged into {kept.named['path']}"
     users = list(_users(tx, project, merged.row.id, lock=True))

@@ -212,7 +212,7 @@ JOB_COLUMNS = (
     job.c.message,
     job.c.commit_to,
 )
-"""Columns of a job that the functions below need."""
+"""Columns of a job that are read to publish and commit its outputs."""
 
 
 def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> PublishedOutputs:

@@ -62,7 +62,7 @@ def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreat
 
 
 def items_by_id(tx: Transaction, project_id: str, ids: Iterable[str]) -> dict[str, FoundItem]:
-    """Return, by id, those of the items with the given ids that exist in the project."""
+    """Return the items of the project that have the given ids, by id."""
     wanted = sorted(set(ids))
     rows = [
         FoundItem(row.id, row.kind, row.name, row.head, row.path)

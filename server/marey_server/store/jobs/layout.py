@@ -2,9 +2,9 @@
 
 Jobs with the same cache key are identical: kind, version of the kind, parameters, seed and inputs are equal. Inputs are
 equal if the item, its name, its path, and the content of the documents that the kind reads are equal, because results
-are named after inputs and refer to them. A kind can also require that the collection of the results is equal, or the
-newest revision of an item that the parameters name. Jobs whose result depends on data that is read while they run have
-no cache key.
+are named after inputs and refer to them. A kind can require that further values are equal: the collection of the
+results, or the newest revision of an item that the parameters name. Jobs whose result depends on data that is read
+while they run have no cache key.
 """
 
 from __future__ import annotations

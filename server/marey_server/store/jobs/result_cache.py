@@ -206,7 +206,7 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
 def share_waiting(tx: Transaction) -> list[Ended]:
     """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist; return the jobs that have ended.
 
-    This includes jobs that wait for a job which was deleted because it was old; they compute the result.
+    Jobs that wait for the result of a job that was deleted meanwhile are queued, or wait for another identical job.
     """
     source = job.alias("source")
     statement = (

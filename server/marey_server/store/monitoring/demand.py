@@ -56,7 +56,7 @@ def read_demand(
 
 
 def _wanted(reach: JobReach, others: Sequence[JobReach]) -> ColumnElement[bool]:
-    """Return the condition for the labels and kinds of the jobs that count for the workers with this reach."""
+    """Return the SQL condition on labels and kinds for the jobs that count as demand for workers with this reach."""
     keys: dict[tuple[str, ...], list[str]] = {}
     for key in keys_within(reach.labels):
         simpler = [one for one in others if len(one.labels) < len(reach.labels) and key in keys_within(one.labels)]

@@ -161,8 +161,8 @@ def claim_and_remember(
 ) -> list[Lease]:
     """Claim jobs as `claim_after_reaping` does, and remember the worker.
 
-    Raises `TooManyRequestsProblem` if too many workers of the caller are alive. Pods of a job's own belong to no user,
-    and the setting `own_pods` limits their number.
+    Raises `TooManyRequestsProblem` if too many workers of the caller are alive. This limit does not apply to pods that
+    were started for one job; the setting `own_pods` limits their number.
     """
     caller = tx.principal
     if caller.kind != "pod":

@@ -69,12 +69,12 @@ class LookAgain(BytesAwaited):
     """Signal that bytes are not where the snapshot of the transaction says; perhaps another process has moved them."""
 
     def move(self, carried: Carried) -> None:
-        """Record that the transaction runs again with a new snapshot, so that it does not look again once more."""
+        """Record that the transaction was repeated for this reason, so that it is repeated only once."""
         carried.looked_again = True
 
 
 class ProbeAwaited(BytesAwaited):
-    """Signal that the bucket must be checked before the transaction: whether it accepts objects."""
+    """Signal that the server must check whether the bucket accepts objects, before the transaction runs again."""
 
     def __init__(self, storage: ObjectStorage) -> None:
         super().__init__()

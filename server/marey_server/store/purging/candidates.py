@@ -68,7 +68,7 @@ def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> Prepa
 
 
 def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest) -> list[Row[Any]]:
-    """Return the next deleted items that a request selects, and one more; each kind is read from an index."""
+    """Return the next deleted items that a request selects, and one more if any remain; an index finds each kind."""
     filters = ItemFilters(collection=request.collection or None, path=request.path, query=request.query, deleted=True)
     last = None if request.after is None else _kind_of(request.after)
     rows: list[Row[Any]] = []

@@ -39,9 +39,9 @@ def delete_uncited_ref(
 ) -> None:
     """Delete a branch or a tag; `citing` are the jobs that `find_citations` has found.
 
-    A job that is submitted meanwhile names its version by digest, and keeps it. Raises the errors of `delete_ref`. Also
-    raises `ConflictProblem` if a job that has not ended, or an item that a job made, cites the version of the tag, and
-    no other tag names this version.
+    A job that is submitted meanwhile is not affected, because it names its version by digest. Raises the errors of
+    `delete_ref`. Also raises `ConflictProblem` if a job that has not ended, or an item that a job made, cites the
+    version of the tag, and no other tag names this version.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)

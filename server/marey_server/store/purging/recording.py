@@ -48,7 +48,7 @@ def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared:
 
     Items that were restored since they were chosen are left out. If the request names a single item, raises
     `NotFoundProblem` if the item does not exist, and `GoneProblem` if it was purged already. Raises `ConflictProblem`
-    if this item is not deleted, or if something holds it.
+    if this item is not deleted, or if it has holders.
     """
     assert not request.preview, "a preview is a read"
     project_row = projects.require(tx, project)

@@ -1,6 +1,6 @@
 """Quotas of amounts per day: the bytes that a user sends, and the inputs of the jobs that a user submits.
 
-Each quota is one row for each user, as for sign-ins. So a count takes the same time, however much was counted before.
+Each quota has one row for each user (`rate_limits`). So a count takes the same time, however much was counted before.
 The server and attempts of jobs have no quotas.
 """
 

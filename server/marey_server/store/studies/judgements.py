@@ -56,7 +56,7 @@ class CollectedAnswers:
     revision: int
     motion_count: int
     answers: list[tuple[int, list[int], tuple[int, int]]]
-    """For each trial: number of the participant from 0, motions shown by place, and the chosen places."""
+    """For each trial: number of the participant (from 0), the shown motions by place, and the chosen places."""
 
 
 def collect_answers(tx: Transaction, project: str, kind: Kind, item_id: str, *, revision: int) -> CollectedAnswers:

@@ -55,7 +55,7 @@ def read_waiting(
 
     Projects take turns; the jobs of a project are in the order of claims.
 
-    Jobs of a project whose limit of running jobs is reached are left out, and jobs whose concurrency key is in use.
+    A job is left out if its project has reached its limit of running jobs, or if its concurrency key is in use.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ Unclaimed = tuple[str, str | None]
 
 
 def _unclaimed(tx: Transaction, served: Collection[str]) -> Iterator[Unclaimed]:
-    """Yield the jobs in `served`, which have pods, that their pods have not claimed yet."""
+    """Yield project and concurrency key of those jobs in `served` that their pods have not claimed yet."""
     statement = select(job.c.project_id, job.c.concurrency_key).where(job.c.state == QUEUED)
     for some in in_lists(served):
         for row in tx.execute(statement.where(job.c.id.in_(some))):

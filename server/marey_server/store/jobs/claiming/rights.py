@@ -35,7 +35,7 @@ def pod_token(key: bytes, job_id: str) -> str:
 
 
 def resolve_pod_token(tx: Transaction, text: str) -> Principal | None:
-    """Return the principal of a pod's token, or None if the token is not one, is wrong, or its job does not exist."""
+    """Return the principal of a pod's token; None if the text is no such token, or if the job does not exist."""
     job_id = text.removeprefix(_POD).partition(".")[0]
     if not text.startswith(_POD) or not text.isascii():
         return None
@@ -47,7 +47,7 @@ def resolve_pod_token(tx: Transaction, text: str) -> Principal | None:
 
 
 def require_worker(caller: Principal, request: ClaimRequest) -> list[str]:
-    """Return the caller's `work` scopes, each for all projects or for one.
+    """Return the caller's scopes `work`; each of them is for all projects or for one project.
 
     Raises `ForbiddenProblem` if the caller has none, announces a label that its token does not allow, or is a pod that
     claims another job than its own.
