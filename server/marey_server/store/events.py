@@ -286,7 +286,7 @@ def _waiting_for_key(tx: Transaction, keys: Iterable[tuple[str, str]]) -> set[st
 
 
 _MOST_READ = 100
-"""Greatest number of queued jobs of a project whose kinds are read when a place for a running job may be free."""
+"""Greatest number of queued jobs of a project whose kinds are read when another job of the project may start."""
 
 
 def _waiting_for_place(tx: Transaction, projects: Collection[str]) -> set[str]:

@@ -128,7 +128,7 @@ class Transaction:
         self.new_document_bytes = 0
         """Number of bytes of new documents and arrays that this transaction has stored."""
         self.trace_of_jobs: Callable[[Principal], str | None] = _untraced
-        """Returns the place in a trace, as a header, of the jobs that this transaction submits for its principal."""
+        """Function that returns the trace header of the jobs that this transaction submits for a principal."""
         self._clock = clock
         self._now_us = now_us
         self._after_commit: list[Callable[[], None]] = []

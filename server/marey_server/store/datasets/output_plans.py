@@ -44,7 +44,7 @@ class OutputEntries:
     project_id: str
     branch: str
     base: str | None
-    """Newest commit of the branch when the inputs of the job were fixed."""
+    """Newest commit of the branch when the inputs of the job were pinned to exact revisions."""
     entries: Mapping[str, DatasetEntry]
     """The entries by key."""
     revisions: Mapping[str, RevisionKey]
@@ -167,7 +167,7 @@ def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConfl
 
 
 def too_many_changes(most: int, condition: str = "") -> CommitConflict:
-    """Return the conflict of a job whose commit would have more than `most` changes, if `condition` holds."""
+    """Return the conflict of a job that would commit more than `most` changes; `condition` states when this limit holds."""
     return CommitConflict(
         code="too-many-changes",
         detail=f"The commit of a job can change at most {most:,} entries{condition}. The outputs are in the project; "

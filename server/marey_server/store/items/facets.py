@@ -174,7 +174,7 @@ def repeat_facets(tx: Transaction, item_id: str, number: int, again: int) -> Non
 
 
 def add_facets(tx: Transaction, stated: Iterable[tuple[str, int, Mapping[str, float]]]) -> None:
-    """Add facets to revisions: item id, number and values by name; facets that a revision has keep their values."""
+    """Add facets to revisions, each given by item id, number and values by name; existing facets keep their values."""
     rows = [
         {"item_id": one, "number": number, "name": name, "value": value}
         for one, number, values in stated

@@ -146,8 +146,8 @@ def is_same_rig(known: RigDocument, new: RigDocument, moved: Collection[str]) ->
 def first_of_rig(known: Sequence[RigDocument], new: RigDocument, moved: Callable[[], Collection[str]]) -> int | None:
     """Return the index of the first skeleton in `known` that is the same rig as a new skeleton, or None.
 
-    All skeletons must have the same `structure`. Skeletons with the same offsets are preferred. `moved` returns the
-    joints `moved` of `is_same_rig`; it is called only if no skeleton has the same offsets.
+    All skeletons must have the same `structure`. Skeletons with the same offsets are preferred. Only if there are none,
+    `moved` is called; it returns the joints whose offsets the motions of all clips of the new skeleton replace.
     """
     if not known:
         return None

@@ -23,7 +23,7 @@ Tree = dict[str, Any]
 
 
 def without_skeleton_changes(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
-    """Return the drafts, so changed that those with `same_skeleton` do not change the skeletons of existing items.
+    """Prevent drafts with `same_skeleton` from changing the skeletons of existing items; return the changed drafts.
 
     If the skeleton of a draft is the same rig (`is_same_rig`) as the skeleton of the existing item, the draft refers to
     the skeleton of the item instead. Otherwise, the draft is left out, together with the annotations of its clip, and

@@ -53,7 +53,7 @@ from marey_versions.tree.chunks import DamagedChunk
 
 Target = dict[str, Any]
 """Stored commit of a job: the fields of `OutputsCommit`, `dataset_id`, `base` (the newest commit of the branch when the
-inputs were fixed), `within` (the dataset's folder), and `kinds` (of the outputs)."""
+inputs were pinned), `within` (the dataset's folder), and `kinds` (of the outputs)."""
 
 
 # -- submission -------------------------------------------------------------------------------------------------------

@@ -316,7 +316,7 @@ def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], polic
 
 
 def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most: int) -> list[Row[Any]]:
-    """Claim up to `most` jobs, and return their rows: from each project as many as its turns in this claim.
+    """Claim up to `most` jobs, from each project as many as it has turns in this claim; return the rows of the jobs.
 
     If a project has fewer jobs than turns, the other projects share its turns.
     """

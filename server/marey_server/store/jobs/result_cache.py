@@ -230,7 +230,7 @@ _UNUSABLE = (ApiProblem, DamagedChunk, LookupError, TypeError, ValueError)
 
 
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
-    """Give one job the result it waits for; return the jobs that ended, or an empty list if that is impossible.
+    """Give one job the result for which it waits; return the jobs that ended, none if the job cannot have the result.
 
     An error that concerns this job must not affect the job that computed the result, or others that wait for it.
     """

@@ -33,10 +33,10 @@ UNSUCCESSFUL = ("failed", "cancelled")
 def retry_job(tx: Transaction, job_id: str) -> Job:
     """Submit a failed or cancelled job again, and return the new job; results of the old job's tasks are used again.
 
-    The new job has the same inputs. Inputs that were never available, because other jobs should have created them, are
-    created by the retries of these jobs. Unsuccessful dependencies are retried before the job. Dependants that ended
-    only because of this job are retried after it, so that the rest of a pipeline continues. Jobs that the caller may
-    not retry are left out. Raises `ConflictProblem` for a task, and for a job that has not ended or has succeeded.
+    The new job has the same inputs. If other jobs should have created an input but did not, the retries of these jobs
+    create it. Unsuccessful dependencies are retried before the job. Dependants that ended only because of this job are
+    retried after it, so that the rest of a pipeline continues. Jobs that the caller may not retry are left out. Raises
+    `ConflictProblem` for a task, and for a job that has not ended or has succeeded.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")

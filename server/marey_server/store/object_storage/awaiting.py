@@ -44,7 +44,7 @@ class Carried:
     stored: dict[str, StoredObject] = field(default_factory=dict)
     """Objects that were stored, by the digest of their bytes."""
     pieces: dict[WantedBytes, bytes] = field(default_factory=dict)
-    """Bytes that were read, by their position."""
+    """Bytes that were read, by blob and range."""
     absent: set[StoredObject] = field(default_factory=set)
     """Objects that were to be read, but do not exist."""
     fault: str | None = None

@@ -60,7 +60,7 @@ class ObjectBlobs:
         return None if self.stores_objects else self.local.new_copy()
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Yield the digests of local files that may have no row; `sweep_objects` finds such objects."""
+        """Yield the digests of local files that may have no row; objects without a row are found by `sweep_objects`."""
         return self.local.stray_digests(older_than_s=older_than_s)
 
 
@@ -142,7 +142,7 @@ class _InTransaction:
         self.backing.local.adopt(copy, digest)
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Yield the digests of local files that may have no row; `sweep_objects` finds such objects."""
+        """Yield the digests of local files that may have no row; objects without a row are found by `sweep_objects`."""
         return self.backing.stray_digests(older_than_s=older_than_s)
 
     def remove_stray(self, digest: str) -> None:

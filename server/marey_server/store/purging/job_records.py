@@ -1,4 +1,4 @@
-"""Removal of the names of purged items from the records of jobs, and of the content that the jobs hold for them."""
+"""Removal of purged items from the records of jobs: their names, and their content that the jobs keep."""
 
 from __future__ import annotations
 

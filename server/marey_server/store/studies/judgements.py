@@ -25,7 +25,7 @@ from marey_server.store.transaction import Transaction
 def list_judgements(
     tx: Transaction, project: str, kind: Kind, item_id: str, *, revision: int, cursor: str | None, limit: int
 ) -> Page:
-    """Return a page of the participants who saw a revision of a study and began, each with all trials, without dates.
+    """Return a page of the participants who have begun a revision of a study, each with all trials, without dates.
 
     Raises `NotFoundProblem` or `ForbiddenProblem`.
     """

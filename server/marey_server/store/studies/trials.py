@@ -22,7 +22,7 @@ from marey_server.store.transaction import Transaction
 GRACE_US = 2_000_000
 """Time after the deadline in which an answer still counts, because answers need time through the network."""
 MOST_TIMEOUTS = 500
-"""Greatest number of trials that a participant may let pass."""
+"""Greatest number of trials that a participant may leave without an answer."""
 
 
 def open_trial(tx: Transaction) -> TrialStep:

@@ -33,7 +33,7 @@ NOT_SUCCEEDED = text("job.state <> 'succeeded'")
 
 
 def _listing_index(name: str, *columns: str, of: str = "parent_id IS NULL") -> Index:
-    """Return an index for lists of jobs, which contain no tasks; it ends with the order of the lists."""
+    """Return an index for lists of jobs without tasks; its last columns are those by which the lists are sorted."""
     condition = text(of)
     return Index(
         f"ix_job_list_{name}", "project_id", *columns, "id", sqlite_where=condition, postgresql_where=condition

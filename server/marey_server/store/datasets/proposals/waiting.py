@@ -69,7 +69,7 @@ class WaitingMerges:
         self._database = database
         self._last = ("", 0)
         self._in_vain: LruCache[tuple[str, int], _InVain] = LruCache(max_entries=IN_VAIN_KEPT)
-        """Last merge of each proposal that was computed but could not be performed, by dataset and number of the proposal."""
+        """Last merge of each proposal that was computed but not performed, by dataset and number of the proposal."""
 
     def attempt(self) -> int:
         """Examine the next `EXAMINED_AT_ONCE` waiting proposals, and merge those that are ready.

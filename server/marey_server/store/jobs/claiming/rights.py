@@ -1,8 +1,8 @@
 """Rights of the callers that claim jobs: workers with a user's token, and pods that were started for one job.
 
-The token of a pod of a job's own is derived from the id of the job and the key of the servers. So it needs no row, and
-a server that repeats the start of a pod creates the same token again. Its only right is to claim this job, or one of
-its tasks.
+The token of a pod is derived from the id of the job for which the pod is started, and from the key of the servers. So
+the token needs no row, and a server that repeats the start of a pod creates the same token again. With the token, the
+pod can claim only this job, or one of the tasks of this job.
 """
 
 from __future__ import annotations
