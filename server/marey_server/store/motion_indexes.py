@@ -151,7 +151,8 @@ class IndexFiles:
         needed_bytes = sum(file.size_bytes for file in files)
         if needed_bytes > self._most_bytes:
             raise TooLargeProblem(
-                f"The index has {needed_bytes:,} bytes; indexes of up to {self._most_bytes:,} bytes can be searched.",
+                f"The index has {needed_bytes:,} bytes; indexes of up to {self._most_bytes:,} bytes can be searched. "
+                "Index fewer folders of the project.",
                 code="index-too-large",
             )
         self._folder.mkdir(mode=0o700, exist_ok=True)

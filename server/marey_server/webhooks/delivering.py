@@ -63,7 +63,7 @@ class Deliverer:
         self._sender = Sender(services.settings.webhook_networks)
         self._places = asyncio.Semaphore(MOST_AT_ONCE)
         self._shares: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
-        """Semaphores that limit the requests to webhooks of one user, by user; an entry exists while a request uses it."""
+        """Semaphores that limit the requests to webhooks of one user, by user, while any request uses them."""
         self._holder = secrets.token_hex(8)
         self._lead: Lead | None = None
         self._renew_at_s = 0.0

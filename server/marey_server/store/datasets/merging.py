@@ -117,7 +117,7 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
             code="is-merge",
         )
     if parent is not None and parent > max(1, len(picked.parents)):
-        raise InvalidProblem(f"The commit has no parent {parent}.", code="no-parent")
+        raise InvalidProblem(f"The commit has no parent {parent}; parents are numbered from 1.", code="no-parent")
     return picked.parents[(parent or 1) - 1] if picked.parents else None
 
 
@@ -148,7 +148,7 @@ def _start(
     """
     ours = head_of(tx, found.id, request.into, request.expected)
     if ours is None:
-        raise InvalidProblem(f"The branch {request.into!r} has no commits yet.", code="no-commits")
+        raise InvalidProblem(f"The branch {request.into!r} has no commits yet; commit to it first.", code="no-commits")
     commit = PreparedCommit(
         found.id, request.into, ours, (ours,), request.message or message, request.write_id,
         last_purge=last_purge(tx, found.project_id),

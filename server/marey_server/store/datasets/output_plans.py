@@ -167,7 +167,7 @@ def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConfl
 
 
 def too_many_changes(most: int, condition: str = "") -> CommitConflict:
-    """Return the conflict of a job that would commit more than `most` changes; `condition` states when this limit holds."""
+    """Return the conflict of a job that would commit more than `most` changes; `condition` restricts this limit."""
     return CommitConflict(
         code="too-many-changes",
         detail=f"The commit of a job can change at most {most:,} entries{condition}. The outputs are in the project; "

@@ -131,7 +131,7 @@ class _Ready:
         return tuple(self.digests.get(part) for part in _required(self.draft.kind))
 
     def published(self, head: _Head, *, created: bool) -> Published:
-        """Return the revision that was published from the draft; `head.skeleton_id` is the previous skeleton of the item."""
+        """Return the revision that was published from the draft; `head` has the previous skeleton of the item."""
         skeleton = skeleton_of(self.draft.kind, self.bodies)
         changed = (
             created and None not in (skeleton, head.skeleton_id) and (skeleton or {}).get("item") != head.skeleton_id

@@ -235,8 +235,8 @@ def _rigs(
     found = [rig for rig in rigs if rig[1] and (request.kept in (None, rig[0].row.id))]
     if sum(one.user_count for _, merged in found for one in merged) > MOST_MOVED:
         raise TooLargeProblem(
-            f"One merge moves at most {MOST_MOVED} clips and models, and there are more; name some of the skeletons to "
-            "merge."
+            f"One merge changes at most {MOST_MOVED} clips and models, and more use these skeletons; name some of the "
+            "skeletons to merge."
         )
     return found
 

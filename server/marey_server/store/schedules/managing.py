@@ -64,7 +64,9 @@ def create_schedule(tx: Transaction, project: str, request: ScheduleCreate) -> S
     }  # fmt: skip
     made = tx.execute(tx.insert_or_ignore(schedule, values).returning(schedule.c.id)).first()
     if made is None:
-        raise ConflictProblem(f"The project has a schedule {request.name!r} already.", code="schedule-exists")
+        raise ConflictProblem(
+            f"The project has a schedule {request.name!r} already; choose another name.", code="schedule-exists"
+        )
     tx.audit("schedule.created", schedule_id, about=request.name, project_id=row.id)
     return _shown(project, _find(tx, row, request.name))
 

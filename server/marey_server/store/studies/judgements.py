@@ -44,7 +44,7 @@ def list_for_attempt(
     require_attempt(tx.principal, job_id, fence)
     is_study = select(item.c.id).where(item.c.id == item_id, item.c.kind == Kind.STUDY)
     if (item_id, revision) not in reach.pinned_places(tx) or tx.execute(is_study).first() is None:
-        raise NotFoundProblem("The job has no such study as its input.", code="no-item")
+        raise NotFoundProblem("The study, at this revision, is not an input of the job.", code="no-item")
     _require_maintainer(tx, job_id)
     return _page(tx, item_id, revision, cursor, limit)
 
