@@ -73,7 +73,7 @@ def check_out(
     if len(changes) > MOST_CHANGES:
         raise InvalidProblem(
             f"{counted(len(changes), 'entry')} of the folder differ from this version; a checkout changes at most "
-            f"{MOST_CHANGES:,}.",
+            f"{MOST_CHANGES:,}. First check out versions between them, or parts of this version (`paths`).",
             code="large-checkout",
         )
     compared = compare_entries(changes)

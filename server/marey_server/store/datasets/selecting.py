@@ -144,7 +144,7 @@ def _with_possible_content(
     """Yield the entries whose content is that of a revision of the project which may meet all `queries`.
 
     The database has facts only of the newest revisions of items, so it evaluates the queries for these. All older
-    revisions are assumed to meet the queries. If the memory does not hold the contents of all these revisions, the
+    revisions are assumed to meet the queries. If there are more than `MOST_IN_MEMORY` contents of such revisions, the
     database is queried for each group of entries.
     """
     newest, older = _possible_contents(project_id, queries)

@@ -25,7 +25,7 @@ T = TypeVar("T")
 AT_ONCE = 4
 """Number of objects that are moved at the same time for one call."""
 MOST_TRANSFERS = 3
-"""Greatest number of times that a call stores the same blob; it repeats this if the row names the object too late."""
+"""Greatest number of transfers of one blob in a call; another one is needed if the row is written too late."""
 
 
 class WantedBytes(NamedTuple):

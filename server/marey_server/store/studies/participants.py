@@ -75,7 +75,7 @@ def try_of(code: str, address: str, per_minute: int) -> SignInTry:
 
 
 def _find_link(tx: Transaction, code: str) -> Row[Any]:
-    """Lock and return the participant of a link, whether or not the study was begun. Raises `NotFoundProblem`."""
+    """Lock and return the participant of a link, who may have begun the study already. Raises `NotFoundProblem`."""
     prefix, secret = split_study_link(code) or ("", "")
     locked = _rows().where(study_participant.c.link_prefix == prefix).with_for_update(of=study_participant)
     row = tx.execute(locked).first()

@@ -204,8 +204,9 @@ other.
 def note_served(tx: Transaction, turns: Sequence[Turn], served: Iterable[Turn]) -> None:
     """Record which projects a claim has served; `turns` are all projects that had jobs, updated by the claim.
 
-    Each project gets another time, in the order of their ranks after the claim, so that the next claim serves them in
-    this order. If only one project had jobs, nothing is recorded, because no other project has waited.
+    Each project gets another time, in the order of their ranks after the claim. The next claim serves projects with
+    equally many running jobs in this order. If only one project had jobs, nothing is recorded, because no other project
+    has waited.
     """
     if len(turns) < 2:
         return
