@@ -218,7 +218,7 @@ def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
 
 
 def place_in_trace(tx: Transaction) -> dict[str, str] | None:
-    """Return the first value of the column `environment` of a new job: only its trace header, or None without a trace."""
+    """Return the first value of the column `environment` of a new job: only its trace header, or None."""
     header = tx.trace_of_jobs(tx.principal)
     return None if header is None else {HEADER: header}
 
