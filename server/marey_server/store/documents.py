@@ -28,7 +28,7 @@ EDIT_SCHEMA = PARTS[Kind.EDIT]["edit"].schema
 
 
 def store_document(tx: Transaction, content: Any, *, schema: str | None = None) -> str:
-    """Store a document and return its digest. `content` is a tree, or what `prepare_document` has returned for it.
+    """Store a document and return its digest. `content` is a tree, or the result of `prepare_document` for a tree.
 
     Storing the same document again adds no rows.
 
@@ -41,7 +41,7 @@ def store_document(tx: Transaction, content: Any, *, schema: str | None = None) 
 
 
 def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
-    """Store documents as `store_document` does, all with the same few statements.
+    """Store many documents, as `store_document` stores one, with few SQL statements in total.
 
     Returns, by digest, the number of bytes that each new document uses of a quota.
     """
@@ -76,7 +76,7 @@ def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> di
 
 
 def _text_bytes(one: PreparedDocument) -> int:
-    """Return the size of a document without its arrays."""
+    """Return the size, in bytes, of a document without its arrays."""
     return one.size_bytes - sum(map(len, dict(one.arrays.values()).values()))
 
 

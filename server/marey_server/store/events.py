@@ -104,9 +104,10 @@ def list_events(
 
 
 def _placed(tx: Transaction, conditions: Sequence[ColumnElement[bool]], most: int) -> Select[*tuple[Any, ...]]:
-    """Select the first `most` events that meet the conditions, each with the sum of the sizes up to its own.
+    """Return a query for the first `most` events that meet the conditions, without the bodies of the events.
 
-    `found` is the number of these events. The bodies are not selected, because not all of them may fit into a page.
+    The column `until_bytes` is the total size of the bodies up to and including that of the row, so that callers can
+    select the bodies that fit into a page. The column `found` is the number of rows.
     """
     text_size = func.octet_length(cast(event.c.body, Text))
     size_bytes = text_size if tx.is_postgres else func.length(cast(event.c.body, LargeBinary))
@@ -285,7 +286,7 @@ def _waiting_for_key(tx: Transaction, keys: Iterable[tuple[str, str]]) -> set[st
 
 
 _MOST_READ = 100
-"""Greatest number of queued jobs of a project whose kinds are read when a place for a running job may be free."""
+"""Greatest number of queued jobs of a project whose kinds are read when another job of the project may start."""
 
 
 def _waiting_for_place(tx: Transaction, projects: Collection[str]) -> set[str]:

@@ -54,7 +54,7 @@ MOST_UPLOADS = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """Numbers of deleted rows and files, by sort."""
+    """Numbers of deleted rows and files."""
 
     documents: int
     blobs: int

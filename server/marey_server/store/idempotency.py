@@ -1,4 +1,4 @@
-"""Idempotency keys: a repeated request gets the answer of the first one (docs/reference).
+"""Idempotency keys: a repeated request gets the answer of the first request with the key (docs/reference).
 
 Key, answer and effects are written in one transaction, so that all exist or none. A concurrent request with the same
 key waits for that transaction.

@@ -115,9 +115,10 @@ def read_page(
 ) -> tuple[Sequence[Row[Any]], str | None]:
     """Return at most `limit` rows of `statement` after the cursor, and the cursor of the next page.
 
-    `identity` is JSON that distinguishes this list from every other: its subject and filters. `parts`, if given, select
-    the last column of the order, in place of conditions of `statement`: the list contains the rows of all parts. Each
-    part is read only up to the limit, so it should have an index that ends with the order.
+    `identity` is JSON that distinguishes this list from all other lists: its subject and filters. `parts` are queries
+    that each select the last column of the order. If they are given, the list contains the rows of `statement` that at
+    least one of them selects. Each part is read only up to the limit, so it should have an index that ends with the
+    order.
     """
     if not 1 <= limit <= MAX_LIMIT:
         raise BadRequestProblem(f"The parameter `limit` must be between 1 and {MAX_LIMIT}.", code="bad-limit")

@@ -1,4 +1,4 @@
-"""Indexes of motions: the index of a project, what has changed since it was updated, and local copies of its files.
+"""Indexes of motions: finds the index of a project and the clips changed since its update, and copies its files.
 
 Searches map the files of an index into memory. So each server keeps copies of them in its data folder, whatever the
 backing of its blobs. A copy is named by its digest and never changes.
@@ -29,7 +29,7 @@ from marey_server.store.transaction import Transaction, in_lists
 MOST_CHANGES = 20_000
 """Greatest number of clips that may have changed since an index was updated; a search checks each of them."""
 MOST_COPIED_BYTES = 8 * GIB
-"""Greatest size of the copies of index files on one server, and so of one index."""
+"""Greatest total size, in bytes, of the copies of index files on one server, and so of one index."""
 
 
 class FoundIndex(NamedTuple):
@@ -78,7 +78,9 @@ def find_index(tx: Transaction, project: str, index: str | None) -> FoundIndex:
     found = items.read_part(tx, project, Kind.INDEX, row.id, "index", revision=row.head)
     document = MotionIndexDocument.model_validate(found.tree)
     if document.version != INDEX_VERSION:
-        raise ConflictProblem("The index has an older form; update it.", code="index-outdated")
+        raise ConflictProblem(
+            "The index was made by an earlier version of Marey; update it with `marey index`.", code="index-outdated"
+        )
     since_us = row.created_us if row.submitted_us is None else row.submitted_us
     return FoundIndex(row.id, row.head, document, _changed_since(tx, project_row.id, since_us))
 
@@ -91,7 +93,7 @@ def _changed_since(tx: Transaction, project_id: str, since_us: int) -> dict[str,
     rows = tx.execute(statement).all()
     if len(rows) > MOST_CHANGES:
         raise ConflictProblem(
-            f"More than {MOST_CHANGES:,} clips have changed since the index was updated; update it.",
+            f"More than {MOST_CHANGES:,} clips have changed since the index was updated; update it with `marey index`.",
             code="index-outdated",
         )
     return {row.id: row.head if row.deleted_us is None else 0 for row in rows}
@@ -149,7 +151,8 @@ class IndexFiles:
         needed_bytes = sum(file.size_bytes for file in files)
         if needed_bytes > self._most_bytes:
             raise TooLargeProblem(
-                f"The index has {needed_bytes:,} bytes; indexes of up to {self._most_bytes:,} bytes can be searched.",
+                f"The index has {needed_bytes:,} bytes; indexes of up to {self._most_bytes:,} bytes can be searched. "
+                "Index fewer folders of the project.",
                 code="index-too-large",
             )
         self._folder.mkdir(mode=0o700, exist_ok=True)
@@ -181,7 +184,7 @@ class IndexFiles:
             with os.fdopen(handle, "wb") as file:
                 written = sum(file.write(chunk) for chunk in tx.blobs.read(tx.connection, digest, 0, size))
             if written != size:
-                raise NotFoundProblem("Files of the index are missing; build it again.", code="no-index")
+                raise NotFoundProblem("Files of the index are missing; build the index again.", code="no-index")
             os.replace(name, self.path(digest))
         except BaseException:
             with suppress(FileNotFoundError):
@@ -189,7 +192,7 @@ class IndexFiles:
             raise
 
     def _make_room(self, most_bytes: int, kept: Collection[str]) -> None:
-        """Remove the copies that were not used for the longest time, except some, until they fit into a size."""
+        """Remove copies that are not in `kept`, the longest unused first, until all have at most `most_bytes`."""
         copies = sorted(self._others({self.path(digest).name for digest in kept}), key=lambda one: one[1])
         held_bytes = sum(path.stat().st_size for path in self._folder.iterdir())
         for path, _used, size_bytes in copies:

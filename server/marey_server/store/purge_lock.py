@@ -34,7 +34,7 @@ def last_purge(tx: Transaction, project_id: str) -> int:
 
 
 def hold_off_purges(tx: Transaction, *project_ids: str) -> None:
-    """Let no purge of these projects begin before the end of this write; several writes may do this at the same time.
+    """Prevent purges of these projects until this write ends; several writes may do this at the same time.
 
     Must be called before the write reads items or locks rows.
     """

@@ -61,7 +61,7 @@ class Retired:
 
 
 def retire(database: Database, retention: Retention) -> Retired:
-    """Delete what is too old, and return how many of each; may run in several processes at once."""
+    """Delete old events, logs, jobs and audit entries; return how many. May run in several processes at once."""
     database.write(SYSTEM, forget_old_secrets)
     return Retired(
         events=_retire_events(database, retention.events_days) if retention.events_days else 0,
@@ -102,7 +102,7 @@ def _retire_audit_entries(database: Database, days: int) -> int:
 
 
 def _first_young_job(tx: Transaction, age_us: int) -> str:
-    """Return an id that is greater than the ids of all jobs that ended before `age_us` ago.
+    """Return an id that is greater than the ids of all jobs that ended more than `age_us` ago.
 
     Ids sort by the time of creation, so a search for old jobs reads no younger ones. Ids are made with the clock of the
     server, which may differ from that of the database; the greatest difference that is allowed for is a day.

@@ -75,7 +75,7 @@ class Observer:
     """Receiver of numbers about committed transactions, for metrics; this base class ignores them."""
 
     def count_ended(self, state: str, reason: str | None) -> None:
-        """Count a job that has ended; `reason` is that of a failure."""
+        """Count a job that has ended; `reason` is the reason of its failure, if it has failed."""
 
     def count_requeued(self, outcome: str) -> None:
         """Count a job that is queued again after an attempt with this outcome."""
@@ -88,7 +88,7 @@ class Observer:
 
 
 def _untraced(_principal: Principal) -> None:
-    """Return that jobs belong to no trace."""
+    """Return None, because jobs belong to no trace."""
 
 
 IGNORED = Observer()
@@ -120,7 +120,7 @@ class Transaction:
         self.pod_rules = pod_rules
         """Rules by which jobs get a pod of their own; None if the server starts no such pods."""
         self.before_statement: Callable[[], object] = bool
-        """Called before each statement of `execute`; an error that it raises stops the transaction."""
+        """Function that is called before each statement; if it raises an error, the transaction stops."""
         self.folder_rights: dict[tuple[str, str | None], FolderRights] = {}
         """Rights that this transaction has read, by project and user; see `store.folder_roles.rights`."""
         self.shared_outputs = 0
@@ -128,7 +128,7 @@ class Transaction:
         self.new_document_bytes = 0
         """Number of bytes of new documents and arrays that this transaction has stored."""
         self.trace_of_jobs: Callable[[Principal], str | None] = _untraced
-        """Returns the place in a trace, as a header, of the jobs that this transaction submits for its principal."""
+        """Function that returns the trace header of the jobs that this transaction submits for a principal."""
         self._clock = clock
         self._now_us = now_us
         self._after_commit: list[Callable[[], None]] = []

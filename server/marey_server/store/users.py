@@ -210,7 +210,10 @@ def delete_user(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> Non
 def _require_some_administrator(tx: Transaction) -> None:
     left = select(func.count()).where(user.c.administrator.is_(True), user.c.disabled.is_(False))
     if tx.execute(left).scalar_one() == 0:
-        raise ConflictProblem("At least one user must be an administrator.", code="last-administrator")
+        raise ConflictProblem(
+            "At least one user must be an administrator; make another user an administrator first.",
+            code="last-administrator",
+        )
 
 
 # -- signing in -------------------------------------------------------------------------------------------------------

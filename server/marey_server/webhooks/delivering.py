@@ -63,17 +63,17 @@ class Deliverer:
         self._sender = Sender(services.settings.webhook_networks)
         self._places = asyncio.Semaphore(MOST_AT_ONCE)
         self._shares: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
-        """By user, the places for requests to the webhooks that this user created, while any request needs a place."""
+        """Semaphores that limit the requests to webhooks of one user, by user, while any request uses them."""
         self._holder = secrets.token_hex(8)
         self._lead: Lead | None = None
         self._renew_at_s = 0.0
         self._lead_until_s = 0.0
         self._after: int | None = None
         self._scanned: dict[str, int] = {}
-        """By webhook, the number of the event up to which the feed was searched and nothing is left to send."""
+        """Number of the event up to which the feed was searched and nothing is left to send, by webhook."""
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._again: set[str] = set()
-        """Webhooks that may have got something new to send while their task was running."""
+        """Webhooks that may have new events to send, which came while their task was running."""
         self._interrupted: set[str] = set()
         """Webhooks whose task ended before it had sent everything; the next search for work starts them again."""
 

@@ -551,7 +551,7 @@ def test_the_folder_of_a_dataset_goes_on_from_the_commit_of_a_job(desk: Desk) ->
         walks.read(datasets.prepare_commit, "lab", "walks", request)
     walks.submit(into="elsewhere", cache="off")
     walks.work("a")
-    with pytest.raises(ConflictProblem, match="not the newest one of this branch"):
+    with pytest.raises(ConflictProblem, match="not the newest version of this branch"):
         walks.read(datasets.prepare_commit, "lab", "walks", request)
 
 

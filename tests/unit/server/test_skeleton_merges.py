@@ -145,7 +145,7 @@ def test_only_documents_of_what_moves_are_read_and_not_before_the_limits_are_che
 
     monkeypatch.setattr(skeleton_merges, "_users", note(skeleton_merges._users))
     monkeypatch.setattr(skeleton_merges, "MOST_MOVED", 1)
-    with pytest.raises(TooLargeProblem, match="moves at most 1 clips"):
+    with pytest.raises(TooLargeProblem, match="changes at most 1 clips"):
         merge(lab)
     assert read == []
     monkeypatch.setattr(skeleton_merges, "MOST_MOVED", 2)

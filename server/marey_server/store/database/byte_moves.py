@@ -1,4 +1,7 @@
-"""Calls of functions that need bytes in object storage: the bytes are moved between two runs of the function."""
+"""Repeated calls of functions that need bytes moved to or from object storage.
+
+If a function needs such a move, its run ends with an error, the bytes are moved, and the function runs again.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,10 @@ def run_and_move(
     run: Callable[[Callable[[Transaction], T]], T],
     function: Callable[[Transaction], T],
 ) -> T:
-    """Return `run(function)`. If the function awaits bytes, move them in this thread, and run the function again."""
+    """Call `run(function)`, and call it again after each move of bytes that the function needs; return the last result.
+
+    The bytes are moved to or from object storage in the calling thread.
+    """
     if not isinstance(blobs, ObjectBlobs):
         return run(function)
     carried = Carried()
@@ -41,10 +47,10 @@ def _run_with(blobs: ObjectBlobs, carried: Carried, function: Callable[[Transact
 
 
 class MovingCall(Generic[T]):
-    """Call of a function in a lane, which is repeated after the bytes that it awaits were moved.
+    """Queued call of a function; if the function needs bytes moved, they are moved and the function is queued again.
 
-    `submit` queues the function in the lane. Bytes are moved by the lane `moving`, so that a slow object storage keeps
-    no transaction from running.
+    `submit` queues the function in its lane. Another lane, `moving`, moves the bytes, so that transactions do not wait
+    for a slow object storage.
     """
 
     def __init__(
@@ -70,7 +76,7 @@ class MovingCall(Generic[T]):
         return self._result
 
     def _ended(self, running: Future[T]) -> None:
-        """Pass on what the function returned or raised, unless it awaits bytes."""
+        """Set the future to the result or error of the function; if the function needs bytes moved, move them."""
         error = _error_of(running)
         if error is None:
             self._result.set_result(running.result())
@@ -80,7 +86,7 @@ class MovingCall(Generic[T]):
             self._result.set_exception(error)
 
     def _moved(self, moving: Future[None]) -> None:
-        """Run the function again."""
+        """Queue the function again after its bytes were moved; if the move failed, set the future to the error."""
         if (error := _error_of(moving)) is None:
             self._then(partial(self._submit, self._run), self._ended)
         else:

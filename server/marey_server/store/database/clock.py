@@ -93,7 +93,7 @@ def stored_high_water_us(connection: Connection) -> int:
 
 
 def save_high_water(connection: Connection, now_us: int) -> int:
-    """Store a time after `now_us`, so that no restart uses an earlier time, whatever the wall clock says.
+    """Store a time after `now_us`, so that the clock never starts at an earlier time, even if the wall clock is behind.
 
     Returns the stored time: a second after `now_us`, or the previously stored time if this is even later. Until the
     clock reaches the returned time, no other time needs to be stored.

@@ -54,7 +54,7 @@ MOVING_THREADS = 16
 RESERVED_THREADS = 3
 """Number of threads, and of connections, for short transactions that must not wait for other transactions."""
 SHARED_BY_ALL = 2
-"""Greatest number of ordinary threads of which one client may use all; half of two would make a lone client slow."""
+"""Greatest number of ordinary threads that one client may use all at once; with more threads, one is left to others."""
 
 
 class Database:
@@ -159,7 +159,7 @@ class Database:
             except FAILURES as error:
                 if attempt == READ_TRIES - 1 or not worth_retrying(error):
                     raise translated(error) from error
-        raise AssertionError("unreachable")
+        raise AssertionError("the last try of a read returns or raises")
 
     def write(
         self,
@@ -193,7 +193,7 @@ class Database:
             else:
                 tx.run_after_commit()
                 return answer
-        raise AssertionError("unreachable")
+        raise AssertionError("the last try of a write returns or raises")
 
     def _transaction(self, connection: Connection, principal: Principal, now_us: int | None = None) -> Transaction:
         blobs = self.blobs.local if isinstance(self.blobs, ObjectBlobs) else self.blobs  # see `run_and_move`
@@ -284,7 +284,7 @@ class Database:
         function: Callable[[Transaction], T],
         submit: Callable[[Callable[[Transaction], T]], Future[T]],
     ) -> Future[T]:
-        """Submit a function; while bytes are moved for it, it occupies no thread of the lane and no connection."""
+        """Submit a function to a lane; it uses no thread of the lane and no connection while bytes are moved for it."""
         if not isinstance(self.blobs, ObjectBlobs):
             return submit(function)
         return MovingCall(self.blobs, self._moving, client, function, submit).begin()
@@ -294,9 +294,9 @@ class Database:
         return self._moving.submit(SERVER, function)
 
     def submit_signed_url(self, object_name: str, valid_s: int) -> Future[str]:
-        """Sign a URL with which anybody can read an object for `valid_s` seconds; return its future.
+        """Sign a URL with which anybody can read an object for `valid_s` seconds; return the future of the URL.
 
-        Only a database whose blobs are in object storage has such objects.
+        The blobs of the database must be in object storage.
         """
         assert isinstance(self.blobs, ObjectBlobs)
         return self.submit_move(partial(self.blobs.storage.signed_url, object_name, valid_s))

@@ -80,8 +80,8 @@ def postgres_engine(url: URL, connections: int, echo: bool) -> Engine:
 def begin_snapshot(connection: Connection) -> int:
     """Begin a read-only transaction of Postgres that sees one snapshot; return the time of Postgres in microseconds.
 
-    Both take a single round trip. The connection must be in the mode AUTOCOMMIT, in which the driver does not begin a
-    transaction by itself.
+    The statement that begins the transaction and the query for the time are sent in one round trip. The connection must
+    be in the mode AUTOCOMMIT, in which the driver does not begin a transaction by itself.
     """
     ((now_us,),) = run_texts(connection, ("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY", POSTGRES_NOW))
     return int(now_us)

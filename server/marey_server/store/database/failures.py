@@ -1,4 +1,4 @@
-"""Failures of the database: which of them are worth another try, and to which errors the others are converted."""
+"""Failures of the database: which failed transactions are retried, and to which errors other failures are converted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marey_server.store import tables
 WRITE_TRIES = 5
 WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
-"""How often a read runs at most; it needs no pause, because only a broken connection makes it run again."""
+"""Greatest number of runs of a read; only a broken connection makes it run again, at once, on a new connection."""
 FAILURES = (exc.DBAPIError, exc.TimeoutError, OSError, OverflowError, UnicodeEncodeError)
 """Errors with which a transaction can fail."""
 

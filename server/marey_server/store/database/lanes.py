@@ -34,29 +34,30 @@ class Client:
 
     key: str
     known: bool = True
-    """Whether the client's token was accepted before, or is that of an attempt, and was not often refused lately."""
+    """Whether the client has a token that was accepted before or issued to an attempt, and is not often refused."""
     is_gone: Callable[[], bool] = bool
-    """Returns whether nobody waits for the result any more; such a call is not begun, and a read is stopped."""
+    """Returns whether the client has closed the connection; its queued calls then do not begin, and its reads stop."""
 
     def require_present(self) -> None:
-        """Raise `ClientGoneProblem` if nobody waits for the result any more."""
+        """Raise `ClientGoneProblem` if the client has closed the connection."""
         if self.is_gone():
             raise ClientGoneProblem("The client closed the connection before the server could answer.")
 
 
 SERVER = Client("server")
-"""Client that stands for the server itself, in calls such as housekeeping."""
+"""Client for calls that the server makes itself, such as housekeeping."""
 
 
 def stopping() -> UnavailableProblem:
-    """Return the problem of a call for which the server has no threads any more."""
+    """Return the error for a call that cannot run because the server is stopping."""
     return UnavailableProblem("The server is stopping and accepts no more work.", code="draining")
 
 
 def begin(pool: ThreadPoolExecutor, run: Callable[[], None], future: Future[Any]) -> None:
-    """Run a function in a thread, which finishes `future` among others.
+    """Run a function in a thread of the pool; the function must finish `future`, and may finish other futures, too.
 
-    Raises `UnavailableProblem` if the threads were stopped and nobody else has begun to compute the future.
+    If the pool is stopped, cancels the future and raises `UnavailableProblem`, unless another thread already computes
+    the future.
     """
     try:
         pool.submit(run)

@@ -29,7 +29,8 @@ def opening(url: str) -> Iterator[None]:
         ) from None
     except UnavailableProblem as error:
         raise DatabaseUnusable(
-            f"the server of the database {_shown(url)} does not answer: {_reason(error.__cause__)}"
+            f"the server of the database {_shown(url)} does not answer: {_reason(error.__cause__)}; start the server "
+            "of the database, or correct the setting `database_url`"
         ) from error
     except StorageFullProblem as error:
         raise DatabaseUnusable(f"the database {_shown(url)} cannot be opened for writing: {error.detail}") from error

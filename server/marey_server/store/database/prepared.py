@@ -124,7 +124,7 @@ class _Form:
 
     text: str
     constants: Mapping[str, Any]
-    """Values that are part of the statement itself."""
+    """Values of the constants in the statement, by parameter name."""
     expansion: Mapping[str, Sequence[str]]
     """For each list parameter, the names under which the statement contains its values."""
     converts: Mapping[str, Convert]

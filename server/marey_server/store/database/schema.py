@@ -2,13 +2,15 @@
 
 Each migration has a phase, in its variable `phase`:
 
-* `before`: it only adds. It runs before servers of the new version start, and servers of the earlier version go on.
-* `after`: it removes what only earlier versions use. It runs when no server of an earlier version runs any more;
-  servers of the new version do not need it.
-* `stopped`, also without the variable: it changes what servers use, so no server of an earlier version may run.
+* `before`: the migration only adds to the schema. It runs before servers of the new version start, while servers of
+  the earlier version run.
+* `after`: the migration removes parts of the schema that only earlier versions use. It runs when no server of an
+  earlier version runs any more; servers of the new version can run without it.
+* `stopped` (the default): the migration changes parts of the schema that servers use. No server of an earlier version
+  may run at that time.
 
-The database records the last migration that was not only an addition. A server of an earlier version that knows this
-migration can serve the database, although it does not know the newest ones.
+The database records its last migration of a phase other than `before`. A server of an earlier version that knows this
+migration can serve the database, although it does not know the newest migrations.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ _INSTALLED = Path(__file__).parents[2] / "migrations"
 _CHECKOUT = Path(__file__).parents[4] / "migrations"
 
 SERVED_FROM = "schema_served_from"
-"""Key of the last migration that was not only an addition; its text sorts like its number."""
+"""Key in `server_state` of the database's last migration of a phase other than `before`."""
 
 Phase = Literal["before", "stopped", "after"]
 
@@ -48,9 +50,9 @@ class SchemaUpgrade:
     applied: tuple[str, ...]
     waiting: tuple[str, ...]
     additive: bool
-    """Whether servers of the earlier version can go on serving."""
+    """Whether servers of the earlier version can continue to use the database."""
     known: bool = True
-    """Whether this version knows the schema; if not, a newer version has only added to it."""
+    """Whether this version knows the schema; if false, a newer version has only added to it."""
     created: bool = False
     """Whether the database was new, so that no server of an earlier version has used it."""
 
@@ -58,8 +60,9 @@ class SchemaUpgrade:
 def upgrade_schema(url: str, *, while_serving: bool = False, finish: bool = False) -> SchemaUpgrade:
     """Create or upgrade the tables of the database at `url`, all or nothing; concurrent calls run one after another.
 
-    Migrations of the phase `after` run only with `finish`, on SQLite (which one server uses), and in a new database.
-    With `while_serving`, raises `DatabaseUnusable` if servers of the earlier version could not go on.
+    Migrations of the phase `after` run in three cases only: with `finish`, in a new database, and on SQLite, where only
+    one server uses the database. With `while_serving`, raises `DatabaseUnusable` if servers of the earlier version
+    could not continue to use the database.
     """
     database = Database(url, readers=1)
     try:
@@ -142,7 +145,7 @@ def _head() -> str:
 
 
 def _last_needed() -> str:
-    """Return the last migration that this version needs: all but the last ones of the phase `after`."""
+    """Return the last migration of a phase other than `after`; this version needs the migrations up to it."""
     return [name for name, phase in _steps().items() if phase != "after"][-1]
 
 

@@ -23,9 +23,9 @@ from marey_server import faults
 log = logging.getLogger(__name__)
 
 PAGE_BYTES = 4096
-"""Size of the pages of new databases; others keep theirs (docs/decisions/0056)."""
+"""Size, in bytes, of the pages of new databases; existing databases keep their page size (docs/decisions/0056)."""
 HEADER_BYTES = 24
-"""Size of the header of a page in the log."""
+"""Size, in bytes, of the header of a page in the log."""
 SHORT_BYTES = 4 * 2**20
 """Length of the log up to which nothing is copied. SQLite shortens the file to this length after restarting the log."""
 LITTLE_BYTES = 3 * 2**20
@@ -36,7 +36,7 @@ TOO_LONG_BYTES = 64 * 2**20
 """Length of the log above which the writing thread waits longer for readers in order to restart the log."""
 PATIENCE_MS = 10
 LONG_PATIENCE_MS = 250
-"""Milliseconds to wait for readers if the log is longer than `TOO_LONG_BYTES`: enough for reads, not for a backup."""
+"""Milliseconds to wait for readers if the log is longer than `TOO_LONG_BYTES`: enough for requests, not for backups."""
 PAUSES = 20
 """Pause after readers prevented a restart of the log, as a multiple of the time spent waiting for the readers."""
 

@@ -108,7 +108,7 @@ class AnnotationMerger:
         return self._too_many if self._loaded > self._most or self._loaded_bytes > MOST_BYTES else None
 
     def _merge_versions(self, bodies: Sequence[Mapping[str, Any]], contents: Contents) -> str | AnnotationClash:
-        """Merge the documents of the base, our side and their side; return the result's content digest, or a clash."""
+        """Merge the documents of the base, our side and their side; return the new content digest, or a clash."""
         merged = merge_annotations(*(_version(body, contents) for body in bodies))
         if isinstance(merged, AnnotationClash):
             return merged

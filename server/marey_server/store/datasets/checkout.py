@@ -51,9 +51,9 @@ def check_out(
     of this entry is restored if possible; otherwise a new item is created.
 
     Raises `ForbiddenProblem` unless the caller is a maintainer in all folders of the dataset. Raises `InvalidProblem`
-    if too many entries differ. Raises `ConflictProblem` if another request changes the folder, or if the dataset
-    was replaced since the entries were selected. Unless the request discards them, changes in the folder that no commit
-    has recorded are a `ConflictProblem`, too.
+    if too many entries differ. Raises `ConflictProblem` if another request changes the folder, if the dataset was
+    replaced since the entries were selected, or if the folder has uncommitted changes that the request does not
+    discard.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -73,7 +73,7 @@ def check_out(
     if len(changes) > MOST_CHANGES:
         raise InvalidProblem(
             f"{counted(len(changes), 'entry')} of the folder differ from this version; a checkout changes at most "
-            f"{MOST_CHANGES:,}.",
+            f"{MOST_CHANGES:,}. First check out versions between them, or parts of this version (`paths`).",
             code="large-checkout",
         )
     compared = compare_entries(changes)
@@ -96,7 +96,7 @@ def _make_manifest(
     request: CheckoutRequest,
     selected: SelectedEntries | None,
 ) -> FolderManifest:
-    """Return the manifest that the folder gets, and store the tree of a selection."""
+    """Return the new manifest of the folder; if only a part of the version is checked out, store its tree."""
     if not request.partial:
         digest = resolve(tx, found.id, request.version)
         return FolderManifest(digest, tree_of(tx, found.id, digest))
@@ -240,7 +240,7 @@ class _Checkout:
         self.given[made.item] = one.after.content
 
     def _keep_facets(self) -> None:
-        """Give the new revisions the facets of their content, which an earlier revision may have."""
+        """Copy facets to the new revisions from earlier revisions with the same content."""
         known = facets_of_contents(self.tx, self.project.id, self.given.values())
         measured = sorted(item_id for item_id, content in self.given.items() if content in known)
         for some in in_lists(measured):

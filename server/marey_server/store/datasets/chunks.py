@@ -21,7 +21,7 @@ _CHUNKS = Prepared(
     select(tree_chunk.c.digest, tree_chunk.c.data).where(tree_chunk.c.digest.in_(bindparam("digests", expanding=True)))
 )
 _START_OF_FRAME = zstandard.FRAME_HEADER
-"""First bytes of compressed data; a chunk itself begins with `{`."""
+"""First bytes of compressed data; an uncompressed chunk begins with `{` instead."""
 
 
 class StoredChunks:
@@ -64,8 +64,8 @@ def store_chunks(tx: Transaction, chunks: Mapping[str, bytes]) -> None:
 def chunk_in(stored: bytes, decompressor: zstandard.ZstdDecompressor | None = None) -> bytes:
     """Return the bytes of a chunk from the value of `tree_chunk.data`.
 
-    If a `decompressor` is given, no new one is made, which would take longer than its use. A damaged value is returned
-    as it is. Its digest is not that of the chunk, so `decode` refuses it.
+    Callers that read many chunks pass one `decompressor`, because making a decompressor takes longer than using it. A
+    damaged value is returned unchanged. `decode` then refuses it, because its digest is not that of the chunk.
     """
     data = bytes(stored)
     if not data.startswith(_START_OF_FRAME):

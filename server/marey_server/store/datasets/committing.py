@@ -57,7 +57,7 @@ class FolderCommit:
     was: str | None
     """Value of `dataset.folder_commit` when the folder was read."""
     partial: FolderManifest | None
-    """FolderManifest that the folder gets, apart from its commit; None if the folder has whole versions."""
+    """New manifest of the folder, but with the old commit; None if a whole version is checked out in the folder."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,9 @@ class PreparedCommit:
     combined: Sequence[CombinedEntry] = ()
     """Entries that combine changes of both sides of a merge; the project may not have revisions of them yet."""
     documents: Mapping[str, PreparedDocument] = field(default_factory=dict)
-    """Documents that are not stored yet, of the entries in `combined`, by content digest."""
+    """New documents of the entries in `combined`, which are not stored yet, by content digest."""
     folder: FolderCommit | None = None
-    """State of the folder with the entries; None if the entries are not from the folder."""
+    """Folder from which the entries were read; None if the entries were not read from a folder."""
     existing: str | None = None
     """Existing commit to which the branch moves; None if the branch moves to a new commit."""
     recorded: str | None = None
@@ -262,15 +262,15 @@ def _require_checked_out(found: Row[Any], manifest: FolderManifest | None, paren
     there = None if manifest is None else manifest.commit
     if there != parent:
         raise ConflictProblem(
-            f"The version that is checked out in the folder {found.path!r} is not the newest one of this branch. "
+            f"The version that is checked out in the folder {found.path!r} is not the newest version of this branch. "
             "Check out the branch, or commit to the branch that is checked out.",
             code="folder-elsewhere",
             context={
                 "folder_commit": there, "commit": parent,
                 "checked_out": None if manifest is None else manifest.shown,
             },
-            unnamed="The version that is checked out in the folder is not the newest one of this branch. Check out the "
-            "branch, or commit to the branch that is checked out.",
+            unnamed="The version that is checked out in the folder is not the newest version of this branch. Check out "
+            "the branch, or commit to the branch that is checked out.",
         )  # fmt: skip
 
 
@@ -296,25 +296,25 @@ def _from_folder(
 
 
 def _require_selected(found: Row[Any], changes: Mapping[str, Value | None], selected: Tree, before: Tree) -> None:
-    """Raise `ConflictProblem` if the folder has an item in the place of an entry that was not checked out."""
+    """Raise `ConflictProblem` if the folder has an item at the path of an entry that was not checked out."""
     hidden = sorted(before.get_several(changes).keys() - selected.get_several(changes).keys())
     if hidden:
         path, kind = path_and_kind(hidden[0])
         raise ConflictProblem(
-            f"The version has a {kind} at {path!r} that is not checked out in the folder {found.path!r}, but another "
-            "one is there. Rename it, or check out a selection that includes this entry.",
+            f"The folder {found.path!r} has a {kind} at {path!r}, where the version has another {kind} that is not "
+            f"checked out. Rename the {kind} in the folder, or check out a selection that includes this path.",
             code="not-checked-out",
             context={"count": len(hidden), "path": path, "kind": kind},
-            unnamed="The folder has an item in the place of an entry that is not checked out. Rename the item, or "
+            unnamed="The folder has an item at the path of an entry that is not checked out. Rename the item, or "
             "check out a selection that includes this entry.",
         )
 
 
 def _follow_with_folder(tx: Transaction, dataset_id: str, folder: FolderCommit, digest: str) -> None:
-    """Note that a commit is checked out in the folder from which it was made.
+    """Record that a commit is checked out in the folder from which the commit was made.
 
     If somebody has checked out a version since the folder was read, the folder no longer has the entries of the commit.
-    Then nothing is noted, because the next commit of the folder would otherwise undo this commit.
+    Then nothing is recorded, because the next commit of the folder would otherwise undo this commit.
     """
     unchanged = (
         dataset.c.id == dataset_id,
@@ -369,7 +369,7 @@ def _items_named(tx: Transaction, project_row: ProjectRow, put: Sequence[PutEntr
         rows.update((row.id, row) for row in tx.execute(statement))
     if missing := [one for one in wanted if one not in rows]:
         raise NotFoundProblem(
-            f"{counted(len(missing), 'item')} of the changes are not in this project; the first is {missing[0]!r}.",
+            f"The project lacks {counted(len(missing), 'item')} that the changes name; the first is {missing[0]!r}.",
             code="no-item",
         )
     return rows

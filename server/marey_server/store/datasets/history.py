@@ -327,8 +327,8 @@ def compare_versions(
 ) -> DatasetDifference:
     """Return the entries that differ in two versions; at most `limit` of them are listed.
 
-    With `path`, compare only the entries at this path or below it. An entry that was
-    moved from elsewhere then counts as added, and one that was moved away as removed.
+    With `path`, compare only the entries at this path or below it. An entry that was moved to this path from elsewhere
+    then counts as added, and an entry that was moved away counts as removed.
     """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
@@ -337,7 +337,8 @@ def compare_versions(
     found = list(islice(changes, MOST_DIFFERENCES + 1))
     if len(found) > MOST_DIFFERENCES:
         raise BadRequestProblem(
-            f"The versions differ in more than {MOST_DIFFERENCES:,} entries; compare versions that are closer.",
+            f"The versions differ in more than {MOST_DIFFERENCES:,} entries; compare versions with fewer commits "
+            "between them, or select a `path`.",
             code="large-difference",
         )
     compared = compare_entries(found)

@@ -29,7 +29,7 @@ class FolderManifest:
 
     commit: str
     tree: str
-    """Tree of the entries that were checked out."""
+    """Digest of the root of the tree of the entries that were checked out."""
     query: str | None = None
     paths: Sequence[str] = ()
 

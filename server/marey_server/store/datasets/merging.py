@@ -51,7 +51,7 @@ LARGE_MERGE = "large-merge"
 
 @dataclass(frozen=True)
 class PreparedMerge:
-    """Merge that was computed, but not recorded; without conflicts it has a commit to record."""
+    """Merge that was computed, but not recorded; `commit` is the commit to record if there are no conflicts."""
 
     answer: MergeAnswer
     commit: PreparedCommit
@@ -103,7 +103,9 @@ def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest,
         tx, project_row.id, request, replace(started, answer=started.answer.model_copy(update={"base": base}))
     )
     if not merge.answer.changes and not merge.answer.conflict_count:
-        raise InvalidProblem(f"The branch {request.into!r} would not change.", code="no-changes")
+        raise InvalidProblem(
+            f"The branch {request.into!r} would not change, so there is nothing to commit.", code="no-changes"
+        )
     return merge
 
 
@@ -115,7 +117,7 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
             code="is-merge",
         )
     if parent is not None and parent > max(1, len(picked.parents)):
-        raise InvalidProblem(f"The commit has no parent {parent}.", code="no-parent")
+        raise InvalidProblem(f"The commit has no parent {parent}; parents are numbered from 1.", code="no-parent")
     return picked.parents[(parent or 1) - 1] if picked.parents else None
 
 
@@ -146,7 +148,7 @@ def _start(
     """
     ours = head_of(tx, found.id, request.into, request.expected)
     if ours is None:
-        raise InvalidProblem(f"The branch {request.into!r} has no commits yet.", code="no-commits")
+        raise InvalidProblem(f"The branch {request.into!r} has no commits yet; commit to it first.", code="no-commits")
     commit = PreparedCommit(
         found.id, request.into, ours, (ours,), request.message or message, request.write_id,
         last_purge=last_purge(tx, found.project_id),
@@ -198,9 +200,10 @@ def _combine(
 
 
 def _require_all_used(merged: MergedEntries) -> None:
-    """Raise `InvalidProblem` if a resolution has decided no conflict.
+    """Raise `InvalidProblem` if a resolution of the request has resolved no conflict.
 
-    While conflicts remain, a further resolution of a decided key may be for one that only the next answer shows.
+    While other conflicts remain, an unused resolution of an entry with a resolved conflict is allowed, because it may
+    be for a further conflict of this entry.
     """
     unknown = [one for one in merged.unused if one.key not in merged.decided or not merged.conflicts]
     if not unknown:

@@ -38,7 +38,7 @@ MOST_DATASETS = 1000
 MOST_REFS = 10_000
 """Greatest number of branches and tags in a dataset."""
 BRANCH_MOVED = "branch-moved"
-"""Code of the error for a branch whose newest commit is not the expected one."""
+"""Code of the error for a branch whose newest commit is not the commit that the request expects."""
 
 _VERSION = re.compile(r"([A-Za-z0-9][A-Za-z0-9._:-]{0,127})(?:~([0-9]{1,4}))?")
 _DIGITS = re.compile(r"(?:sha256:)?([0-9a-f]{8,64})")
@@ -241,7 +241,7 @@ def is_tag(name: str) -> InvalidProblem:
 
 
 def branch_moved(branch: str, head: str | None) -> ConflictProblem:
-    """Return the error for a branch whose newest commit is not the expected one.
+    """Return the error for a branch whose newest commit is not the commit that the request expects.
 
     `head` is the digest of the newest commit; the client finds this digest in `context.commit`.
     """
@@ -375,9 +375,11 @@ def _require_no_commit(tx: Transaction, dataset_id: str, name: str) -> None:
     """
     if found := _commits_by_digits(tx, dataset_id, name):
         raise ConflictProblem(
-            f"The commit {found[0]} is named by its first digits {name!r}; choose another name.",
+            f"The digest of the commit {found[0]} begins with {name!r}, so this name would be ambiguous; choose "
+            "another name.",
             code="name-taken",
-            unnamed=f"A commit is named by its first digits {name!r}; choose another name.",
+            unnamed=f"The digest of a commit begins with {name!r}, so this name would be ambiguous; choose another "
+            "name.",
         )
 
 
@@ -386,7 +388,9 @@ def _by_digits(tx: Transaction, dataset_id: str, name: str) -> str:
     if not found:
         raise _no_version(name)
     if len(found) > 1:
-        raise InvalidProblem(f"Several commits begin with {name!r}; write more digits.", code="ambiguous-version")
+        raise InvalidProblem(
+            f"The digests of several commits begin with {name!r}; write more digits.", code="ambiguous-version"
+        )
     return str(found[0])
 
 

@@ -44,7 +44,7 @@ class OutputEntries:
     project_id: str
     branch: str
     base: str | None
-    """Newest commit of the branch when the inputs of the job were fixed."""
+    """Newest commit of the branch when the inputs of the job were pinned to exact revisions."""
     entries: Mapping[str, DatasetEntry]
     """The entries by key."""
     revisions: Mapping[str, RevisionKey]
@@ -167,7 +167,7 @@ def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConfl
 
 
 def too_many_changes(most: int, condition: str = "") -> CommitConflict:
-    """Return the conflict of a job whose commit would have more than `most` changes, if `condition` holds."""
+    """Return the conflict of a job that would commit more than `most` changes; `condition` restricts this limit."""
     return CommitConflict(
         code="too-many-changes",
         detail=f"The commit of a job can change at most {most:,} entries{condition}. The outputs are in the project; "
@@ -184,8 +184,8 @@ def _merged(
 ) -> MergedEntries:
     """Merge the entries of a job, part by part, with the changes of other commits.
 
-    Other commits have changed the tree `base` to the tree `head`. Only their changes of the entries in `entries` are
-    considered.
+    Other commits have changed the tree `base` to the tree `head`. Changes of entries that are not in `entries` are
+    ignored.
     """
     before = {key: entry_of(key, value) for key, value in Tree(reader, base).get_several(entries).items()}
     if base == head:

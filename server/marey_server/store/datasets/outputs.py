@@ -175,4 +175,4 @@ def _create_branch(tx: Transaction, wanted: OutputEntries, digest: str) -> str:
         insertion = tx.insert_or_ignore(dataset_ref, row).returning(dataset_ref.c.name)
         if tx.execute(insertion).first() is not None:
             return name
-    raise AssertionError("unreachable")
+    raise AssertionError("the loop ends only with a return")

@@ -43,7 +43,7 @@ class Base:
 
     @cached_property
     def tiles(self) -> list[bytes]:
-        """The tiles of the array; many partial arrays can have one base."""
+        """The tiles of the array, computed once, because many partial arrays can have the same base."""
         return blocks.split(self.array.data)
 
 
@@ -127,13 +127,13 @@ class _Described(NamedTuple):
 
     place: BasePlace
     size_bytes: int
-    """Size of the whole array."""
+    """Size of the whole array in bytes."""
     difference: ArrayDifference | None
-    """None if the array is a partial array."""
+    """Difference between the array and its base; None for a partial array."""
 
 
 def _described(value: Any, part: str) -> _Described | None:
-    """Return what a partial array or an array difference describes; None for any other value of a document."""
+    """Return the array that a partial array or an array difference describes; None for other values of a document."""
     try:
         difference = ArrayDifference.of(value)
         if difference is None and not is_partial(value):
@@ -143,16 +143,16 @@ def _described(value: Any, part: str) -> _Described | None:
     except ArrayError as error:
         raise _bad_array(str(error)) from error
     if not all(isinstance(one, str) for one in place):
-        raise _bad_array("the members `base` and `pointer` of a partial array must be texts")
+        raise _bad_array("the members `base` and `pointer` of a partial array must be strings")
     return _Described(place, size_bytes, difference)
 
 
 @dataclass
 class DocumentComparison:
-    """DocumentComparison of the documents of one answer with documents that the reader has."""
+    """Comparison of the documents of one answer with the documents that the reader has."""
 
     left_bytes: int
-    """Size of the arrays that may still be compared, which bounds the time; further arrays are sent whole."""
+    """Bytes of the arrays that may still be compared. Further arrays are sent whole, to limit the time."""
 
     def compared(self, value: Any, before: Any, references: Mapping[str, Mapping[str, Any]], content: str) -> Any:
         """Return a document with array differences in place of the arrays that are similar in the document `before`.
@@ -187,8 +187,8 @@ class DocumentComparison:
 def _require_size(size_bytes: int) -> None:
     if size_bytes > MAX_ARRAY_BYTES:
         raise _bad_array(
-            "the arrays that a request describes by a base, and their bases, may have at most "
-            f"{MAX_ARRAY_BYTES // MIB} MiB each in total"
+            f"the arrays that a request describes by a base may have at most {MAX_ARRAY_BYTES // MIB} MiB in total, "
+            "and their bases may have as much; split the request"
         )
 
 

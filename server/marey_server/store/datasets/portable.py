@@ -63,7 +63,7 @@ class _LoadedDocument:
     """Document that was loaded for an answer, and the document of which the reader has the arrays."""
 
     tree: Tree | None
-    """None if the project does not have the document."""
+    """Loaded document; None if the project does not have the document."""
     base: Tree | None = None
     base_content: str = ""
     """Content digest of the revision with the document `base`."""
@@ -82,7 +82,10 @@ class LoadedContents:
 
 
 def contents_document(loaded: LoadedContents) -> dict[str, Any]:
-    """Return the answer to a request for contents. It takes long for large arrays, so no transaction should be open."""
+    """Return the answer to a request for contents.
+
+    Call this function outside of transactions, because it takes long for large arrays.
+    """
     comparison = DocumentComparison(MOST_BYTES_COMPARED)
     found = [
         one.tree if one.base is None else comparison.compared(one.tree, one.base, one.arrays, one.base_content)

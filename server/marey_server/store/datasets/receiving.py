@@ -55,7 +55,7 @@ from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
 
 IMPORTED = "imported"
-"""Folder of the items of revisions that are not entries; it has a subfolder for each kind of item."""
+"""Folder for new items whose revisions are not the content of entries; it has a subfolder for each kind of item."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,13 @@ class LocalRevisions:
 
     held: Mapping[str, RevisionKey]
     documents: Mapping[str, Mapping[str, str]]
-    """Digest of the document of each part."""
+    """For each revision, by its content digest: the digest of the document of each part, by the name of the part."""
     last_purge: int
     """Time of the last purge of the project before the revisions were found."""
     facets: Mapping[str, Mapping[str, float]]
-    """Facets of the received revisions."""
+    """Facets of the received revisions, by content digest."""
     bases: Bases
-    """Arrays that have the tiles which partial arrays of the request lack."""
+    """Arrays of the project from which partial arrays and array differences of the request are restored."""
 
 
 def find_local(
@@ -100,9 +100,9 @@ def find_local(
 def _require_no_own_ids(tx: Transaction, project_id: str, received: Sequence[ReceivedRevision]) -> None:
     """Raise `InvalidProblem` if a received document refers to an item of this project by its id.
 
-    The sender refers to all items of its own project by content. An id of another project, which anybody can write into
-    free members of a document, stays in the document, and is a reference only in the project that has the item. There,
-    the document would have another digest.
+    Senders replace ids of their own project by content digests. An id of any other project, which anybody can write
+    into free members of a document, stays in the document as text. If the project of the id receives the document, the
+    text becomes a reference, and the content digest of the document would change.
     """
     named = {key: one for one in received for key in references_in(one.parts)}
     ids = sorted({key.item for key in named})
@@ -113,8 +113,8 @@ def _require_no_own_ids(tx: Transaction, project_id: str, received: Sequence[Rec
             if one is not None:
                 raise InvalidProblem(
                     f"The {one.kind.value} {one.path or one.content!r} refers to the item {row.item_id} of this "
-                    "project by its id, so its content would have another digest here. Receive the versions in "
-                    "another project.",
+                    f"project by id, so the content digest of the {one.kind.value} would change here. Receive the "
+                    "versions in another project.",
                     code="other-content",
                     context={"content": one.content, "item": row.item_id, "revision": row.number},
                 )
@@ -176,7 +176,7 @@ def store_revisions(
 
 @dataclass(frozen=True)
 class PreparedReceipt:
-    """Commit from an archive or another server; its tree was computed, and has the digest that the commit names."""
+    """Commit from an archive or another server, with its computed tree, which has the digest that the commit names."""
 
     dataset_id: str
     record: CommitRecord

@@ -42,7 +42,7 @@ SEARCHED_AT_ONCE = 1000
 MOST_IN_MEMORY = 200_000
 """Greatest number of content digests that are in memory at the same time; they take about 30 MB."""
 OF_ENTRIES = frozenset({"name", "path", "folder", "tag"})
-"""Fields of queries that an entry has apart from its content."""
+"""Fields of queries whose values come from an entry itself, not from its content."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ def select_entries(tx: Transaction, project: str, name: str, request: CheckoutRe
     """Select the entries of a version that a checkout asks for; return None if it asks for the whole version.
 
     Raises `NotFoundProblem` if the version has no entry at one of the paths, and `BadRequestProblem` for a query that
-    cannot be read. Raises `InvalidProblem` if no entry is selected, or if the query must be compared with too many.
+    cannot be read. Raises `InvalidProblem` if no entry is selected, or if too many entries must be compared with the
+    query.
     """
     if not request.partial:
         return None
@@ -142,9 +143,9 @@ def _with_possible_content(
 ) -> Iterator[DatasetEntry]:
     """Yield the entries whose content is that of a revision of the project which may meet all `queries`.
 
-    The database evaluates the queries for the newest revisions, because it has their facts. Older revisions may all
-    meet them. If the contents of these revisions are too many for the memory, the database is asked for each group of
-    entries.
+    The database has facts only of the newest revisions of items, so it evaluates the queries for these. All older
+    revisions are assumed to meet the queries. If there are more than `MOST_IN_MEMORY` contents of such revisions, the
+    database is queried for each group of entries.
     """
     newest, older = _possible_contents(project_id, queries)
     possible = set(tx.execute(newest.limit(MOST_IN_MEMORY + 1)).scalars())
@@ -162,7 +163,7 @@ def _with_possible_content(
 def _possible_contents(
     project_id: str, queries: Sequence[Query]
 ) -> tuple[Select[*tuple[Any, ...]], Select[*tuple[Any, ...]]]:
-    """Return SQL statements for the contents of newest revisions that meet all `queries`, and of all older ones."""
+    """Return two queries: for the contents of newest revisions that meet all `queries`, and of all older revisions."""
     of_project = (
         select(revision.c.content)
         .join(item, item.c.id == revision.c.item_id)
@@ -203,9 +204,10 @@ def _facts_of(entry: DatasetEntry, folder: str, **more: Any) -> QueriedFacts:
 def _facts(
     tx: Transaction, project_id: str, folder: str, entries: Sequence[DatasetEntry]
 ) -> Iterator[tuple[DatasetEntry, QueriedFacts]]:
-    """Yield entries with their facts: their own ones, and those of a revision with the content of the entry.
+    """Yield entries with their facts.
 
-    An entry whose content was purged is left out.
+    The name, the folder and the tags come from the entry, the other facts from a revision that has the content of the
+    entry. An entry whose content was purged is left out.
     """
     contents = [entry.content for entry in entries]
     rows = _revisions(tx, project_id, contents)
@@ -246,7 +248,7 @@ def _revisions(tx: Transaction, project_id: str, contents: Collection[str]) -> d
 
 
 def _summaries(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, Summary]:
-    """Return the summary of each revision: the stored one of a newest revision, else one made from its documents."""
+    """Return the summaries of revisions; the summaries of older revisions are computed from their documents."""
     older = {content: (row.item_id, row.number) for content, row in rows.items() if row.head != row.number}
     parts = read_part_digests(tx, set(older.values()))
     bodies = bodies_of(tx, {digest for digests in parts.values() for digest in digests.values()}) if older else {}

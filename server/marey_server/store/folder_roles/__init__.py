@@ -1,1 +1,1 @@
-"""Roles of members in folders of a project: what owners set, and the rights that follow."""
+"""Roles of members in folders of a project, which owners set, and the rights that members get from these roles."""

@@ -23,7 +23,7 @@ from marey_server.store.transaction import Transaction
 MOST_FOLDER_ROLES = 1000
 """Greatest number of roles in the existing folders of a project; a restored folder may add roles beyond this number."""
 MOST_WITH_DELETED = 10_000
-"""Greatest number of roles in all folders of one project; it lets a request read all roles that concern its caller."""
+"""Greatest number of roles in all folders of one project, so that a request can read all roles of its caller."""
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -137,7 +137,7 @@ def put_folder_role(
 def remove_folder_role(
     tx: Transaction, project: str, collection_id: str, user_name: str, *, expected_rev: ExpectedRev
 ) -> None:
-    """Remove the role of a member, or of all members, in a folder; the roles of the folders above it then count."""
+    """Remove the role of a member, or of all members, in a folder; the roles in the folders above it then apply."""
     project_row, path = _lock(tx, project, collection_id)
     user_id = tx.execute(select(user.c.id).where(user.c.name == user_name)).scalar()
     which = _has(_key(project_row, collection_id, EVERY_MEMBER if user_name == EVERY_MEMBER else user_id or ""))

@@ -49,7 +49,7 @@ def lock_name(project_id: str) -> str:
 
 
 def lock_places(tx: Transaction, project: ProjectRow) -> None:
-    """Lock the roles in folders and the paths of the folders that have them, until the transaction ends.
+    """Lock the roles in folders, and the paths of the folders with roles, until the transaction ends.
 
     Members who write compare the path of a folder with the paths at which they have roles. While another request moves,
     deletes or restores a folder, one of these paths could be out of date. So such requests call this function before

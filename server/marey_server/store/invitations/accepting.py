@@ -37,7 +37,7 @@ def invitation_invalid() -> NotFoundProblem:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try that is to be counted before the invitation code is checked."""
+    """Return the try to use an invitation code, which must be counted for rate limits before the code is checked."""
     prefix, _ = split_invitation(code) or ("", "")
     return SignInTry(f"invitation {prefix}", address, per_minute)
 
@@ -157,8 +157,8 @@ def sign_up_again(
 ) -> SignedUp:
     """Return a new token for a user who repeats `sign_up` with the same password, which matched `verified_hash`.
 
-    `login` is the counted try to use the password, `attempt` the counted try to use the code. Raises `NotFoundProblem`
-    if the password did not match. So the answer does not show who has used the code.
+    `login` is the try to use the password, and `attempt` the try to use the code, both counted against the rate limits.
+    Raises `NotFoundProblem` if the password did not match. So the answer does not show who has used the code.
     """
     row = _find(tx, request.code.get_secret_value())
     if verified_hash is None:

@@ -21,9 +21,9 @@ DELETED_AT_ONCE = 500
 
 
 def _exists(*which: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return the SQL condition that some row meets `which`.
+    """Return the SQL condition that there is a row that meets all conditions in `which`.
 
-    `which` may compare the columns of this row with columns of the invitation in the surrounding query.
+    The conditions may compare columns of this row with columns of the invitation in the surrounding query.
     """
     return exists().where(*which).correlate(invitation)
 

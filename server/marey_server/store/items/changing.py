@@ -65,7 +65,8 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
 def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) -> Item:
     """Create an item, and count the bytes of its documents that were not stored before.
 
-    Raises `ConflictProblem` if the name is taken in its collection, and `QuotaExceededProblem`.
+    Raises `ConflictProblem` if the name is taken in its collection, and `QuotaExceededProblem` if the project or the
+    caller would have too many items or bytes.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -145,7 +146,7 @@ def set_parts(
 def revert_item(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemRevert, *, expected_rev: ExpectedRev
 ) -> Item:
-    """Create a revision with the content of an earlier one; if the content is unchanged, no revision is created.
+    """Create a revision with the content of an earlier revision; if this is the present content, create none.
 
     Raises `NotFoundProblem` if there is no such revision, and `PreconditionFailedProblem` if the item is no longer at
     `expected_rev`.

@@ -1,8 +1,8 @@
-"""Consent of performers: clips whose consent has ended, and permissions to export them nevertheless.
+"""Consent of performers: finds clips whose consent has ended, and records permissions to export such clips.
 
 The take record of a clip (the facts about its recording) contains the last day of the consent. The take record of the
-newest revision counts for every revision of the clip, because a consent concerns the recording. An aligned clip has no
-take record of its own; the take record of its source clip counts.
+newest revision applies to every revision of the clip, because a consent concerns the recording. An aligned clip has no
+take record of its own; the take record of its source clip applies.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _shown(row: Any) -> EndedConsent:
 def require_consent(ended: Collection[EndedConsent]) -> None:
     """Raise `ConflictProblem` if `ended` is not empty: the consent for these clips has ended.
 
-    The text of the error names the first of the clips, and the remedies.
+    The text of the error names the first clips, and says how they can be exported or left out.
     """
     if not ended:
         return

@@ -150,10 +150,10 @@ def facets_of_contents(tx: Transaction, project_id: str, contents: Iterable[str]
 
 
 def fill_facets(tx: Transaction, project_id: str, values: Mapping[str, Mapping[str, float]]) -> None:
-    """Give facets to all revisions of a project with certain content; facets that a revision has keep their values.
+    """Add facets to all revisions of a project that have certain contents; existing facets keep their values.
 
-    `values` maps content digests to the values by name. Other revisions than those of `publish_facets` get facets only
-    here: revisions that come from archives and other servers, and revisions to which a checkout gives known content.
+    `values` maps content digests to the values by name. This function is for revisions that come from archives or other
+    servers. Facets that a job of this server states are recorded by `publish_facets`.
     """
     contents = sorted(content for content, named in values.items() if named)
     for some in in_lists(contents):
@@ -167,14 +167,14 @@ def fill_facets(tx: Transaction, project_id: str, values: Mapping[str, Mapping[s
 
 
 def repeat_facets(tx: Transaction, item_id: str, number: int, again: int) -> None:
-    """Give the revision `again` of an item the facets of an earlier revision with the same content."""
+    """Copy the facets of the revision `number` of an item to its later revision `again`, which has the same content."""
     of_revision = (item_facet.c.item_id == item_id, item_facet.c.number == number)
     rows = tx.execute(select(item_facet.c.name, item_facet.c.value).where(*of_revision))
     add_facets(tx, [(item_id, again, {row.name: row.value for row in rows})])
 
 
 def add_facets(tx: Transaction, stated: Iterable[tuple[str, int, Mapping[str, float]]]) -> None:
-    """Add facets to revisions: item id, number and values by name; facets that a revision has keep their values."""
+    """Add facets to revisions, each given by item id, number and values by name; existing facets keep their values."""
     rows = [
         {"item_id": one, "number": number, "name": name, "value": value}
         for one, number, values in stated

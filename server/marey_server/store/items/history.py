@@ -95,7 +95,7 @@ def read_lineage(
 
 
 def _versions(environment: Mapping[str, str] | None) -> dict[str, str]:
-    """Return the versions of libraries in the environment of a job, without its place in a trace."""
+    """Return the versions of libraries from the environment of a job, without its trace header."""
     return {name: text for name, text in (environment or {}).items() if name != HEADER}
 
 
@@ -135,9 +135,9 @@ def list_staleness(
     cursor: str | None = None,
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
-    """List the items of a kind of which an input has a newer revision, in the order of their names.
+    """List the items of a kind that have an input with a newer revision, in the order of the names of the items.
 
-    `read_staleness` says what counts. A page examines `limit` items, so it may list fewer, even none.
+    See `read_staleness` for the inputs that count. A page examines `limit` items, so it may list fewer, even none.
     """
     examined = list_items(
         tx, project_name, kind, filters, sort="name", cursor=cursor, limit=limit, fields=("id", "revision")
@@ -149,7 +149,7 @@ def list_staleness(
 
 
 def _with_inputs(tx: Transaction, items: Collection[str]) -> set[str]:
-    """Return those of the items of which any revision has an input: only these can be outdated."""
+    """Return the items that have a revision with inputs; only such items can be outdated."""
     found: set[str] = set()
     for some in in_lists(sorted(items)):
         found.update(tx.execute(select(lineage.c.item_id).where(lineage.c.item_id.in_(some)).distinct()).scalars())

@@ -54,7 +54,7 @@ class ItemFilters:
     query: str | None = None
     """Query of `marey_schemas.queries`."""
     alike: Mapping[str, frozenset[str]] = field(default_factory=dict)
-    """Ids of the clips that meet each condition `like(...)` of the query, by its source."""
+    """Ids of the clips that meet the conditions `like(...)` of the query, by the text of the condition."""
     deleted: bool = False
 
     @property
@@ -109,9 +109,9 @@ class Namesakes:
 def find_namesakes(
     tx: Transaction, project: str, kind: Kind, names: Collection[str], *, directly_in: str | None, most: int
 ) -> dict[str, Namesakes]:
-    """Return the items with each of the names that any item has, at most `most` for each name.
+    """Find the items that have one of `names`; return them by name, with at most `most` items for each name.
 
-    With `directly_in`, only the items of this folder count.
+    Names that no item has are left out. With `directly_in`, only items directly in this folder are found.
     """
     project_row = projects.require(tx, project)
     conditions = conditions_of(project_row.id, ItemFilters(directly_in=directly_in), kind)
@@ -217,7 +217,7 @@ def read_query(text: str, alike: Mapping[str, frozenset[str]] = MappingProxyType
 
 
 def explain_query(tx: Transaction, project: str, kind: Kind, filters: ItemFilters, query: str) -> QueryExplanation:
-    """Count the items that match `filters`, how many of them the query selects, and how many each condition excludes.
+    """Count the items that match `filters`, and those of them that the query selects, or that each condition excludes.
 
     The conditions are the operands of the outermost `and` of the query, or else the whole query.
     """

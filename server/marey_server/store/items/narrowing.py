@@ -131,9 +131,9 @@ def _with_facet(condition: Condition, _: str, __: Kind) -> Select[*tuple[Any, ..
 
 
 def _in_range(condition: Condition, project_id: str, kind: Kind) -> Select[*tuple[Any, ...]]:
-    """Return a query for the items whose number or time is in the range of the condition, deleted ones included.
+    """Return a query for the items whose number or time is in the range of the condition.
 
-    The index of an order has these numbers or times, but not the time of the deletion.
+    The query also finds deleted items, because the index that it uses does not contain the time of the deletion.
     """
     present = (item.c.project_id == project_id, item.c.kind == kind.value)
     in_range = RANGES[condition.field](condition, project_id)
@@ -143,6 +143,6 @@ def _in_range(condition: Condition, project_id: str, kind: Kind) -> Select[*tupl
 RANGES: dict[str, Comparison] = {
     "frames": frames_in_range, "created": COMPARISONS["created"], "updated": COMPARISONS["updated"],
 }  # fmt: skip
-"""Comparisons for the fields that are columns in the index of an order of lists."""
+"""Comparisons for the fields by which lists can be sorted, and which therefore are columns of an index."""
 CANDIDATES: dict[str, Candidates] = {**dict.fromkeys(INDEXED_FACTS, _with_fact), "tag": _with_tag}
-"""Functions by the name of the field."""
+"""Functions that return the candidates for a condition, by the name of the field."""

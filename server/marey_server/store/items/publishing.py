@@ -62,9 +62,9 @@ def publish(
     In a document, `{"output": name}` refers to another draft and is replaced by the item and revision published from
     it. The draft of a model may have a sample tree. The tree's `model_digest` may be such a reference, too, and is
     replaced by the digest of the draft's model. With `refer_to_deleted`, documents may refer to items that are deleted.
-    If an item already has the content of a draft, no new revision is created. Nothing is published, and returned, for
-    drafts with `same_skeleton` that would change a skeleton (`skeleton_changes`). `rights` are the rights of the user
-    who publishes; they may be None only if all drafts are hidden.
+    If an item already has the content of a draft, no new revision is created. Drafts with `same_skeleton` that would
+    change a skeleton (`skeleton_changes`) are left out, also from the result. `rights` are the rights of the user who
+    publishes; they may be None only if all drafts are hidden.
 
     Raises `InvalidProblem` for a draft that is not valid, and `ConflictProblem` for a name that is taken. Raises
     `ForbiddenProblem` if `rights` do not allow writing to the folder of a new item or revision.
@@ -89,7 +89,7 @@ def require_places(drafts: Iterable[Draft], rights: FolderRights | None) -> None
     """Raise `ForbiddenProblem` unless `rights` allow writing to the folder of each draft that is not hidden."""
     for folder in sorted({draft.collection for draft in drafts if not draft.hidden}):
         if rights is None:
-            raise TypeError("drafts that are not hidden are published with the rights of a user")
+            raise TypeError("the argument `rights` may be None only if all drafts are hidden")
         rights.require(folder, Role.CONTRIBUTOR)
 
 
@@ -131,7 +131,7 @@ class _Ready:
         return tuple(self.digests.get(part) for part in _required(self.draft.kind))
 
     def published(self, head: _Head, *, created: bool) -> Published:
-        """Return the revision that was published from the draft; `head.skeleton_id` is the skeleton before it."""
+        """Return the revision that was published from the draft; `head` has the previous skeleton of the item."""
         skeleton = skeleton_of(self.draft.kind, self.bodies)
         changed = (
             created and None not in (skeleton, head.skeleton_id) and (skeleton or {}).get("item") != head.skeleton_id
@@ -166,7 +166,7 @@ class _Publication:
     refer_to_deleted: bool
     done: dict[str, Published] = field(default_factory=dict)
     added: dict[str | None, Held] = field(default_factory=dict)
-    """Numbers of new items and bytes, by the creator of the items; like deleted items, hidden ones do not count."""
+    """Numbers of new items and their bytes, by the creator of the items; hidden or deleted items do not count."""
     _collection_ids: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

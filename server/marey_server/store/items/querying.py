@@ -41,7 +41,7 @@ Comparison = Callable[[Condition, str], ColumnElement[bool]]
 """Function that returns the SQL of a condition in a project; the SQL is never null."""
 
 _MOST_FRAMES = 2.0**31 - 2
-"""Number below the greatest that the column `frames` can hold; no item has so many frames."""
+"""Greatest number of frames in a comparison: less than the column `frames` can hold, and more than any item has."""
 
 
 def sql_of(query: Query, project_id: str) -> ColumnElement[bool]:

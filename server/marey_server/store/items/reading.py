@@ -219,9 +219,9 @@ class FoundPart:
 def find_part(
     tx: Transaction, project: str, kind: Kind, item_id: str, part: str, *, revision: int | None = None
 ) -> FoundPart:
-    """Return a part of the newest revision, or of `revision`, which for a skeleton is found after its deletion, too.
+    """Return a part of an item at the given revision, by default the newest one.
 
-    Raises `NotFoundProblem` if there is no such part.
+    With `revision`, parts of deleted skeletons are found, too. Raises `NotFoundProblem` if there is no such part.
     """
     project_row = projects.require(tx, project)
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
@@ -301,8 +301,8 @@ def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> Lo
 
     The parts of deleted items count as missing, with two exceptions: revisions of clips may use a deleted skeleton, and
     an attempt of a job can load parts of its inputs, because a version of a dataset may contain items that were deleted
-    later. If the documents together are too large,
-    the list ends before the first one that does not fit; the first document is always loaded.
+    later. If the documents together are too large, the list ends before the first document that does not fit; the first
+    document is always loaded.
     """
     project_row = projects.require(tx, project)
     keys = {

@@ -41,9 +41,10 @@ def with_model_digest(tree: Tree, digest: str | None) -> Tree:
 
 
 def with_imported_content(tree: Tree, before: Tree) -> Tree:
-    """Return a graph that still counts as imported unchanged after its references to drafts were resolved.
+    """Return the graph `tree` with an updated digest in its member `original`, if it was imported unchanged.
 
-    `before` is the graph with the references to drafts, from which the digest of its content was computed.
+    `before` is the graph with references to drafts, and `tree` the graph in which these references were resolved. If
+    `original` has the content digest of `before`, it gets the content digest of `tree`.
     """
     original = tree.get("original")
     if original is None or original["content"] != content_digest("graph", before):

@@ -1,4 +1,4 @@
-"""Skeletons of one rig: takes of a rig whose files differ only in numbers that mean nothing use one skeleton."""
+"""Comparison of skeletons: takes of one rig share a skeleton, although the numbers in their files differ slightly."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from marey_server.store.transaction import Transaction
 Tree = dict[str, Any]
 
 SAME_NUMBER = 1e-5
-"""Greatest difference of equal bones, in metres, and of equal rotations: writers round numbers."""
+"""Greatest difference, caused by rounding in files, of equal offsets in metres and of equal quaternion components."""
 
 _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class RigDocument:
-    """Document `hierarchy` of a skeleton, with what comparisons need of it."""
+    """Document `hierarchy` of a skeleton, with the values that comparisons use."""
 
     digest: str
     body: Tree
@@ -50,7 +50,7 @@ class RigDocument:
 
     @cached_property
     def offsets(self) -> NDArray[np.float64]:
-        """Offsets of the joints in metres, (joints, 3). Those of roots are 0: each clip has the place of its root."""
+        """Offsets of the joints in metres, (joints, 3). They are 0 for roots, because clips contain root positions."""
         return np.array(
             [joint["offset"] if joint["parent"] >= 0 else (0, 0, 0) for joint in self.body["joints"]], float
         ).reshape(-1, 3)
@@ -64,7 +64,7 @@ class RigDocument:
 
 
 def on_known_rigs(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
-    """Replace the hierarchies of skeletons to be reused by content with those of the same rigs in the project."""
+    """Replace, in drafts of skeletons with `reuse="by_content"`, hierarchies by equal rigs that the project has."""
     moved: dict[str, set[str]] = {}
     for one in loaded:
         joints = set(one.bodies.get("motion", {}).get("translated_joints", ()))
@@ -86,7 +86,7 @@ def on_known_rigs(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft
 
 
 def on_rig(one: LoadedDraft, rig: RigDocument, brought: PreparedDocument | StoredDocument | None = None) -> LoadedDraft:
-    """Return the draft of a skeleton with the hierarchy `rig`; `brought` is its document if it is not stored yet."""
+    """Return the draft of a skeleton with the hierarchy `rig`; `brought` is its document, or None if it is stored."""
     kept = brought or StoredDocument(rig.digest)
     return replace(one, contents={**one.contents, "hierarchy": kept}, bodies={**one.bodies, "hierarchy": rig.body})
 
@@ -94,10 +94,10 @@ def on_rig(one: LoadedDraft, rig: RigDocument, brought: PreparedDocument | Store
 def _known_rigs(
     tx: Transaction, project: ProjectRow, new: Mapping[str, RigDocument], moved: Mapping[str, Collection[str]]
 ) -> dict[str, RigDocument]:
-    """Return for some of the new skeletons, by name, the skeleton of the project or of an earlier one that is its rig.
+    """Return, by name, the hierarchies that new skeletons can use instead of their own, because the rig is the same.
 
-    A skeleton whose digest the project has is left alone. The root's offset does not count, because every clip states
-    the place of its root.
+    The hierarchy belongs to a skeleton of the project, or to an earlier new skeleton. New skeletons whose own hierarchy
+    the project has are left out. The offset of the root is ignored, because every clip contains the root's position.
     """
     if {rig.digest for rig in new.values()} <= _stored_digests(tx, project).keys():
         return {}
@@ -132,10 +132,10 @@ def _stored_digests(tx: Transaction, project: ProjectRow) -> dict[str, str]:
 
 
 def is_same_rig(known: RigDocument, new: RigDocument, moved: Collection[str]) -> bool:
-    """Return whether the clips of a new skeleton mean the same on a known one.
+    """Return whether the clips of a new skeleton have the same poses on a known skeleton.
 
-    `moved` are the joints whose offsets the motions of all clips of the new skeleton replace. What the clips of the
-    known skeleton move does not count: those of the new skeleton need the offset of such a joint.
+    The skeletons may differ only in the offsets of the joints `moved`: the joints for which the motions of all clips of
+    the new skeleton contain translations, which replace the offsets.
     """
     if known.digest == new.digest:
         return True
@@ -144,9 +144,10 @@ def is_same_rig(known: RigDocument, new: RigDocument, moved: Collection[str]) ->
 
 
 def first_of_rig(known: Sequence[RigDocument], new: RigDocument, moved: Callable[[], Collection[str]]) -> int | None:
-    """Return the place of the skeleton in `known` that is the rig of a new one, or None; all have one structure.
+    """Return the index of the first skeleton in `known` that is the same rig as a new skeleton, or None.
 
-    Skeletons with the same offsets are preferred. `moved`, as in `is_same_rig`, is called only if there are none.
+    All skeletons must have the same `structure`. Skeletons with the same offsets are preferred. Only if there are none,
+    `moved` is called; it returns the joints whose offsets the motions of all clips of the new skeleton replace.
     """
     if not known:
         return None
@@ -160,7 +161,7 @@ def first_of_rig(known: Sequence[RigDocument], new: RigDocument, moved: Callable
 
 
 def odd_offsets(known: RigDocument, new: RigDocument) -> frozenset[str] | None:
-    """Return the joints whose offsets differ; None if the skeletons differ in something that no motion replaces."""
+    """Return the joints whose offsets differ; None if the structures, rest rotations or end sites differ."""
     if known.structure != new.structure or np.any(np.abs(known.others - new.others) > SAME_NUMBER):
         return None
     odd = np.any(np.abs(known.offsets - new.offsets) > SAME_NUMBER, axis=1)
@@ -168,7 +169,7 @@ def odd_offsets(known: RigDocument, new: RigDocument) -> frozenset[str] | None:
 
 
 def rig_difference(known: RigDocument, new: RigDocument, moved: Collection[str]) -> str:
-    """Return, as part of a sentence, what makes two skeletons different rigs; `moved` as in `is_same_rig`."""
+    """Return a clause for an error that states how two rigs differ; `moved` are joints whose offsets are ignored."""
     if odd := sorted(set(known.names) ^ set(new.names)):
         return f"only one of them has {', '.join(odd[:5])}{', ...' if len(odd) > 5 else ''}"
     if known.structure != new.structure:

@@ -1,4 +1,4 @@
-"""Skeletons of items that get new revisions: an import must not change the skeleton of a clip unasked."""
+"""Checks that new revisions of items, for example from an import, do not change the skeletons of the items."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Tree = dict[str, Any]
 
 
 def without_skeleton_changes(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
-    """Keep the skeletons of items that drafts with `same_skeleton` revise.
+    """Prevent drafts with `same_skeleton` from changing the skeletons of existing items; return the changed drafts.
 
-    If the skeleton of the draft is the same rig (`is_same_rig`), the draft gets the reference to the item's own one.
-    Otherwise the draft is left out, and what belongs to it alone: the annotations of a clip, and a skeleton that no
-    other draft uses.
+    If the skeleton of a draft is the same rig (`is_same_rig`) as the skeleton of the existing item, the draft refers to
+    the skeleton of the item instead. Otherwise, the draft is left out, together with the annotations of its clip, and
+    with its skeleton if no other draft uses this skeleton.
     """
     before = _skeletons_before(tx, project, [one for one in loaded if one.draft.same_skeleton])
     if not before:
@@ -78,9 +78,10 @@ def _rig(given: LoadedDraft | None, stored: _StoredSkeleton | None) -> RigDocume
 def _on_own_skeletons(
     tx: Transaction, loaded: Sequence[LoadedDraft], own: Mapping[str, _StoredSkeleton]
 ) -> list[LoadedDraft]:
-    """Return drafts with references to the skeletons of the items that they revise, given by name of the draft.
+    """Return the drafts; a draft named in `own` refers to the skeleton given there, which its item already uses.
 
-    A skeleton that only such drafts used stands for the one that the first of them keeps, so that it is not stored.
+    If only such drafts used a new skeleton, the draft of the new skeleton gets the rig of an existing skeleton, so that
+    no skeleton is created from it.
     """
     others = {name for one in loaded if one.draft.name_in_batch not in own for name in one.refers}
     replaced: dict[str, RigDocument] = {}
@@ -100,7 +101,7 @@ def _on_own_skeletons(
 
 
 def _on_skeleton(tx: Transaction, one: LoadedDraft, reference: Tree) -> LoadedDraft:
-    """Return a draft that refers to another skeleton, and is otherwise the same."""
+    """Return a copy of a draft that refers to another skeleton."""
     part = SKELETON_PARTS[one.draft.kind]
     content, body = one.contents[part], {**one.bodies[part], "skeleton": reference}
     bodies = {**one.bodies, part: body}

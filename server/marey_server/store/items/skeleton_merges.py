@@ -43,7 +43,7 @@ from marey_server.store.transaction import Transaction, in_lists
 Tree = dict[str, Any]
 
 _LOADED_TOGETHER = 50
-"""Number of items whose documents are loaded at once: few, because the first often decides about a rig."""
+"""Number of items whose documents are loaded at once; few, because often the first item decides the result."""
 
 
 @dataclass
@@ -92,12 +92,13 @@ class _User:
 def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest) -> SkeletonMergeAnswer:
     """Merge skeletons of one rig, all or none; with `dry_run`, only find them.
 
-    Clips, aligned clips and models of a merged skeleton get a revision that refers to the newest revision of the kept
-    one, and is otherwise the same; annotations of the clips move with them. The merged skeletons are deleted.
+    Clips, aligned clips and models of a merged skeleton get a new revision, which differs only in that it refers to the
+    newest revision of the kept skeleton. Annotations of the clips get revisions that refer to the new revisions of the
+    clips. The merged skeletons are deleted.
 
     Raises `NotFoundProblem` for an unknown skeleton, `InvalidProblem` for named skeletons that are not the same rig,
-    `ConflictProblem` for a joint map made by hand that would be lost, `TooLargeProblem`, and `ForbiddenProblem` unless
-    the caller is a maintainer of all folders.
+    `ConflictProblem` for a joint map made by hand that would be lost, `TooLargeProblem` for too many skeletons or
+    items, and `ForbiddenProblem` unless the caller is a maintainer of all folders.
     """
     row = projects.require(tx, project)
     if request.dry_run:
@@ -129,7 +130,7 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
 def _find_skeletons(tx: Transaction, project: ProjectRow, request: SkeletonMergeRequest) -> list[_Skeleton]:
     """Return the skeletons to compare; lock their rows, so that nobody revises them before they are merged.
 
-    A deleted skeleton is compared if items use it, which an earlier version of a dataset may have brought back.
+    A deleted skeleton is compared if existing items use it. There are such items if a checkout has restored them.
     """
     named = {*request.skeletons, *([request.kept] if request.kept else ())}
     user = item.alias("user")
@@ -160,7 +161,7 @@ def _find_skeletons(tx: Transaction, project: ProjectRow, request: SkeletonMerge
 
 
 def _uses(project: ProjectRow, skeletons: Sequence[str]) -> ColumnElement[bool]:
-    """Return the condition that an item uses one of some skeletons, and moves when the skeleton is merged."""
+    """Return the SQL condition that an item uses one of the skeletons, so that a merge must change the item."""
     return and_(
         item.c.project_id == project.id, item.c.skeleton_id.in_(skeletons), item.c.deleted_us.is_(None),
         item.c.kind.in_([kind.value for kind in SKELETON_PARTS]),
@@ -178,7 +179,7 @@ def _count_users(tx: Transaction, project: ProjectRow, skeletons: Sequence[str])
 
 
 def _users(tx: Transaction, project: ProjectRow, skeleton: str, *, lock: bool) -> Iterator[_User]:
-    """Yield the items whose newest revision uses a skeleton, each with its documents; `lock` their rows."""
+    """Yield the items whose newest revision uses a skeleton, each with its documents; with `lock`, lock their rows."""
     statement = item_rows().where(_uses(project, [skeleton])).order_by(item.c.id).limit(MOST_MOVED)
     rows = tx.execute(statement.with_for_update(of=item) if lock else statement).all()
     for some in batched(rows, _LOADED_TOGETHER):
@@ -199,9 +200,9 @@ def _locked(statement: Any, request: SkeletonMergeRequest) -> Any:
 def _rigs(
     tx: Transaction, project: ProjectRow, skeletons: Sequence[_Skeleton], request: SkeletonMergeRequest
 ) -> list[tuple[_Skeleton, list[_Skeleton]]]:
-    """Return each skeleton that is kept, with those that are merged into it.
+    """Return each skeleton that is kept, with the skeletons that are merged into it.
 
-    The documents of items are read only where it depends on them whether skeletons are one rig.
+    The documents of clips and other items are read only if skeletons differ in offsets, which motions may replace.
     """
     best_first = sorted(
         skeletons,
@@ -234,16 +235,16 @@ def _rigs(
     found = [rig for rig in rigs if rig[1] and (request.kept in (None, rig[0].row.id))]
     if sum(one.user_count for _, merged in found for one in merged) > MOST_MOVED:
         raise TooLargeProblem(
-            f"One merge moves at most {MOST_MOVED} clips and models, and there are more; name some of the skeletons to "
-            "merge."
+            f"One merge changes at most {MOST_MOVED} clips and models, and more use these skeletons; name some of the "
+            "skeletons to merge."
         )
     return found
 
 
 def _moved(tx: Transaction, project: ProjectRow, skeleton: _Skeleton) -> frozenset[str]:
-    """Return the joints whose offsets the motions of all users of a skeleton replace.
+    """Return the joints whose offsets the motions of all items that use a skeleton replace.
 
-    They are none if there are no users, or so many that the skeleton cannot be merged.
+    The result is empty if no item uses the skeleton, or if more than `MOST_MOVED` items do.
     """
     if skeleton.user_count > MOST_MOVED:
         return frozenset()
@@ -269,15 +270,15 @@ def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonM
 
 
 def _move(tx: Transaction, project: ProjectRow, merged: _Skeleton, kept: _Skeleton) -> None:
-    """Give the users of a skeleton revisions that use the kept one, and move the annotations of clips to them."""
+    """Revise the items that use the merged skeleton, so that they use the kept one, and the annotations of clips."""
     reference = {"item": kept.row.id, "revision": kept.row.head}
     message = f"The skeleton {merged.named['path']} was merged into {kept.named['path']}"
     users = list(_users(tx, project, merged.row.id, lock=True))
     if Counter(user.row.kind for user in users) != merged.users or any(not merged.odd <= user.moved for user in users):
         raise ConflictProblem(
-            f"Other requests changed what uses the skeleton {merged.named['path']} at the same time; try again.",
+            f"Other requests changed items that use the skeleton {merged.named['path']} at the same time; try again.",
             code="contended",
-            unnamed="Other requests changed what uses a skeleton at the same time; try again.",
+            unnamed="Other requests changed items that use a skeleton at the same time; try again.",
         )
     _publish(tx, project, [_draft(tx, user, reference, message) for user in users])
     clips = {user.row.id: user.row.head for user in users if user.kind is Kind.CLIP}

@@ -53,7 +53,7 @@ from marey_versions.tree.chunks import DamagedChunk
 
 Target = dict[str, Any]
 """Stored commit of a job: the fields of `OutputsCommit`, `dataset_id`, `base` (the newest commit of the branch when the
-inputs were fixed), `within` (the dataset's folder), and `kinds` (of the outputs)."""
+inputs were pinned), `within` (the dataset's folder), and `kinds` (of the outputs)."""
 
 
 # -- submission -------------------------------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ JOB_COLUMNS = (
     job.c.message,
     job.c.commit_to,
 )
-"""Columns of a job that the functions below need."""
+"""Columns of a job that are read to publish and commit its outputs."""
 
 
 def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> PublishedOutputs:
@@ -285,7 +285,7 @@ def _outputs_of_tasks(tx: Transaction, parent_id: str) -> Iterable[Mapping[str, 
 
 
 class _CommitRefused(Exception):
-    """The outputs of a job may not be committed to its branch."""
+    """Error for outputs of a job that may not be committed to the branch of the job."""
 
     def __init__(self, target: Target, error: ApiProblem) -> None:
         super().__init__(error.detail)
@@ -364,7 +364,7 @@ def _free_path(output: Mapping[str, Any], taken: Mapping[str, RevisionKey]) -> s
         other = taken.get(key_of(path, output["kind"]))
         if other is None or other.item == output["item"]:
             return str(path)
-    raise AssertionError("unreachable")
+    raise AssertionError("the loop ends only with a return")
 
 
 def _message(row: Any) -> str:

@@ -175,8 +175,8 @@ def _keep_from_sharing(
 ) -> set[_Place]:
     """Remove the cache keys of jobs whose results must not be shared; return the attempts without a cache key.
 
-    These are the jobs for which the worker says so, the jobs of workers with another version of the kind, and the
-    parent jobs of such jobs.
+    These are the jobs whose worker reports a result that is not shareable, the jobs whose worker has another version
+    of the job kind, and the parent jobs of both.
     """
     unshared = {(row.id, row.fence) for row in won if row.cache_key is None}
     barred = {(row.id, row.fence) for row in won if not _may_share(row.kind, requests[row.id, row.fence])}

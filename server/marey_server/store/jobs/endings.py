@@ -27,7 +27,7 @@ class Ended:
     commit: str | None = None
     """Commit that has the outputs of the job."""
     shareable: bool = True
-    """Whether jobs that wait for the result of this job may have it."""
+    """Whether jobs that wait for the result of this job may use the result."""
 
     @property
     def succeeded(self) -> bool:

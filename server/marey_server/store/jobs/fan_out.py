@@ -49,8 +49,8 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
       returned list is empty.
     * Otherwise, the parent job succeeds, or fails if its outputs cannot be committed.
 
-    If the cancellation of the parent job was requested before, the job is cancelled in two cases: if a task did not
-    succeed, and if the job would be queued.
+    If the cancellation of the parent job was requested before, the job is cancelled in two cases: a task did not
+    succeed, or a worker must combine the results of the tasks.
     """
     columns = (*commits.JOB_COLUMNS, job.c.gathers, job.c.cancel_requested_us)
     head = tx.execute(select(*columns).where(job.c.id == parent_id)).one()

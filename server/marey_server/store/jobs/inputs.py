@@ -62,7 +62,7 @@ def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreat
 
 
 def items_by_id(tx: Transaction, project_id: str, ids: Iterable[str]) -> dict[str, FoundItem]:
-    """Return, by id, those of the items with the given ids that exist in the project."""
+    """Return the items of the project that have the given ids, by id."""
     wanted = sorted(set(ids))
     rows = [
         FoundItem(row.id, row.kind, row.name, row.head, row.path)
@@ -280,12 +280,12 @@ _KINDS = frozenset(kind.value for kind in Kind)
 
 
 class NamingJob(NamedTuple):
-    """Job, and what it names: its inputs, parameters and outputs, in the form in which its row stores them."""
+    """Job with its inputs, parameters and outputs, which can name items, in the form in which its row stores them."""
 
     id: str
     inputs: Mapping[str, Any] = {}
     params: Mapping[str, Any] = {}
-    """Parameters; empty for a task, because its parent job has the same."""
+    """Parameters of the job; empty for a task, because the parent job has the same parameters."""
     outputs: Sequence[Mapping[str, Any]] = ()
 
     def items(self) -> set[str]:

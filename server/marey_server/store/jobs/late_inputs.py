@@ -114,7 +114,7 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
 
 
 def _take_room(tx: Transaction, submission: Submission, room: dict[str, int]) -> None:
-    """Count the tasks of a job against the quota of its author; `room` holds what is left for each author.
+    """Count the tasks of a job against the quota of its author; `room` has the number of jobs left for each author.
 
     Raises `LateInputError` if the quota would be exceeded.
     """

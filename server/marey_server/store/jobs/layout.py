@@ -2,9 +2,9 @@
 
 Jobs with the same cache key are identical: kind, version of the kind, parameters, seed and inputs are equal. Inputs are
 equal if the item, its name, its path, and the content of the documents that the kind reads are equal, because results
-are named after inputs and refer to them. A kind can also require that the collection of the results is equal, or the
-newest revision of an item that the parameters name. Jobs whose result depends on data that is read while they run have
-no cache key.
+are named after inputs and refer to them. A kind can require that further values are equal: the collection of the
+results, or the newest revision of an item that the parameters name. Jobs whose result depends on data that is read
+while they run have no cache key.
 """
 
 from __future__ import annotations
@@ -218,13 +218,13 @@ def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
 
 
 def place_in_trace(tx: Transaction) -> dict[str, str] | None:
-    """Return what a new job stores in place of its environment, until a worker reports the latter."""
+    """Return the first value of the column `environment` of a new job: only its trace header, or None."""
     header = tx.trace_of_jobs(tx.principal)
     return None if header is None else {HEADER: header}
 
 
 def trace_header(environment: Mapping[str, str] | None) -> str | None:
-    """Return the place in a trace of a job that has not ended, as a header."""
+    """Return the trace header in the column `environment` of a job that has not ended, or None."""
     return (environment or {}).get(HEADER)
 
 

@@ -285,7 +285,7 @@ _CLAIM_STATEMENTS = {one_job: Prepared(_claim_statement(one_job=one_job)) for on
 
 
 class _Wanted(NamedTuple):
-    """Statements of a claim, with the parameters for what it asks for."""
+    """Statements of a claim, and their parameters, such as the kinds and labels in the request."""
 
     turns: Prepared
     of_turns: Mapping[str, Any]
@@ -316,7 +316,7 @@ def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], polic
 
 
 def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most: int) -> list[Row[Any]]:
-    """Claim up to `most` jobs, and return their rows: from each project as many as its turns in this claim.
+    """Claim up to `most` jobs, from each project as many as it has turns in this claim; return the rows of the jobs.
 
     If a project has fewer jobs than turns, the other projects share its turns.
     """
@@ -369,7 +369,7 @@ def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
 
 
 def _trace(tx: Transaction, row: Row[Any]) -> JobTrace | None:
-    """Return the trace to which the job belongs, with the time for which the job could have run before."""
+    """Return the trace of a job, with the seconds for which the job could have run before it was claimed."""
     header = trace_header(row.environment)
     return None if header is None else JobTrace(traceparent=header, waited_s=_delay_s(tx, row))
 

@@ -174,10 +174,11 @@ MOST_PARTS = 100
 
 
 def _parts(project_id: str, filters: JobFilters, order: listing.Order) -> list[Select[*tuple[Any, ...]]]:
-    """Divide a list into parts, each of which is stored in an index in the order of the list; return ids of jobs.
+    """Return queries for the ids of the jobs in a list, one query for each pair of a state and a kind if possible.
 
-    Without this division, a list of few jobs, such as those that wait, would read all jobs of the project. Succeeded
-    jobs are not indexed by state, because most jobs have succeeded.
+    An index contains the jobs of such a pair in the order of the list. Without these queries, a list of few jobs, such
+    as waiting jobs, would read all jobs of the project. Succeeded jobs are not indexed by state, because most jobs have
+    succeeded.
     """
     pairs = [(state, kind) for state in filters.states or (None,) for kind in filters.kinds or (None,)]
     if filters.parent is not None or order.columns[0][0] is not SORT_KEYS["created_at"] or len(pairs) > MOST_PARTS:

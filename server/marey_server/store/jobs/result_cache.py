@@ -85,14 +85,14 @@ READY_COLUMNS = (*CANDIDATE_COLUMNS, job.c.kind, job.c.size, job.c.unbound, job.
 """Columns of waiting jobs that are to be queued."""
 
 _BY_ID = job.c.id.concat("")
-"""The id, for ORDER BY. For the plain column, SQLite would read all jobs in the order of an index of ids."""
+"""Id of a job for ORDER BY. With the plain column, SQLite would read all jobs by the index of the ids."""
 
 _task = job.alias("task")
 _KEY_OF_TASKS = select(_task.c.concurrency_key).where(_task.c.parent_id == job.c.id).limit(1).scalar_subquery()
 _KEY_OF_SOURCE = case(
     (and_(job.c.size.is_not(None), job.c.state == RUNNING), _KEY_OF_TASKS), else_=job.c.concurrency_key
 ).label("concurrency_key")
-"""Concurrency key of a job, or of the tasks of a parent job, whose own row has no key, while these tasks run."""
+"""Concurrency key of a job. For a parent job whose tasks run, the key of the tasks: its own row has no key."""
 _SOURCE_COLUMNS = (*_COMMON_COLUMNS, _KEY_OF_SOURCE, job.c.state, job.c.lease_expires_us)
 
 
@@ -206,7 +206,7 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
 def share_waiting(tx: Transaction) -> list[Ended]:
     """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist; return the jobs that have ended.
 
-    This includes jobs that wait for a job which was deleted because it was old; they compute the result.
+    Jobs that wait for the result of a job that was deleted meanwhile are queued, or wait for another identical job.
     """
     source = job.alias("source")
     statement = (
@@ -230,7 +230,7 @@ _UNUSABLE = (ApiProblem, DamagedChunk, LookupError, TypeError, ValueError)
 
 
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
-    """Give one job the result it waits for; return the jobs that ended, or an empty list if that is impossible.
+    """Give one job the result for which it waits; return the jobs that ended, none if the job cannot have the result.
 
     An error that concerns this job must not affect the job that computed the result, or others that wait for it.
     """
@@ -295,7 +295,7 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
 def _compute_again(tx: Transaction, job_ids: Sequence[str]) -> None:
     """Let jobs compute a result that they waited to share: of identical jobs, one is queued and the others wait for it.
 
-    Finished results are not used, because the jobs could not have them.
+    Results of finished jobs are not used, because the jobs were unable to share such results before.
     """
     statement = select(*READY_COLUMNS).where(job.c.state == WAITING).order_by(job.c.id)
     for some in in_lists(job_ids):

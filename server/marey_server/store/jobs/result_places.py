@@ -1,4 +1,4 @@
-"""Checks, before a job is queued, whether its results could be stored; the results are not known at that time.
+"""Checks of the paths at which a job will store its results, made before the job is queued.
 
 The worker checks again for each clip. But it cannot compare all inputs, because each task of a job knows only its own
 share of them.
@@ -18,7 +18,7 @@ from marey_server.store.jobs.inputs import Pin, PinnedInputs
 
 
 class Clash(NamedTuple):
-    """Conflict between the places of results; `place` is the field of the submission that causes it."""
+    """Conflict between the paths of results; `place` points to the field of the submission that causes the conflict."""
 
     place: str
     code: str

@@ -33,10 +33,10 @@ UNSUCCESSFUL = ("failed", "cancelled")
 def retry_job(tx: Transaction, job_id: str) -> Job:
     """Submit a failed or cancelled job again, and return the new job; results of the old job's tasks are used again.
 
-    The new job has the same inputs. Inputs that were never available, because other jobs should have created them, are
-    created by the retries of these jobs. Unsuccessful dependencies are retried before the job. Dependants that ended
-    only because of this job are retried after it, so that the rest of a pipeline continues. Jobs that the caller may
-    not retry are left out. Raises `ConflictProblem` for a task, and for a job that has not ended or has succeeded.
+    The new job has the same inputs. If other jobs should have created an input but did not, the retries of these jobs
+    create it. Unsuccessful dependencies are retried before the job. Dependants that ended only because of this job are
+    retried after it, so that the rest of a pipeline continues. Jobs that the caller may not retry are left out. Raises
+    `ConflictProblem` for a task, and for a job that has not ended or has succeeded.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
@@ -44,13 +44,13 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
     rights_of_caller(tx, project)  # here, because it must precede the locks of jobs
     if row.state not in UNSUCCESSFUL:
         raise ConflictProblem(
-            f"Only a failed or cancelled job can be retried; this one is {row.state}.", code="not-failed"
+            f"Only a failed or cancelled job can be retried; this job is {row.state}.", code="not-failed"
         )
     if row.parent_id is not None:
         raise ConflictProblem(
-            f"This job is a task of the job {row.parent_id} and cannot be retried alone; retry the other job.",
+            f"This job is a task of the job {row.parent_id} and cannot be retried alone; retry {row.parent_id}.",
             code="is-task",
-            unnamed="This job is a task of another job and cannot be retried alone; retry the other job.",
+            unnamed="This job is a task of a parent job and cannot be retried alone; retry the parent job.",
         )
     family = _Family(tx, project)
     family.add_with_needed([job_id])
@@ -109,7 +109,7 @@ class _Family:
         self._needs |= needs
         if len(self._rows) > MOST_AT_ONCE:
             detail = (
-                f"More than {MOST_AT_ONCE} jobs depend on each other here; first retry the jobs that the others need."
+                f"More than {MOST_AT_ONCE} jobs depend on each other here; first retry the jobs on which others depend."
             )
             raise ConflictProblem(detail, code="too-many")
 

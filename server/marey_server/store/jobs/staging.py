@@ -203,7 +203,7 @@ def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
 
 
 def drop_staged_facets(tx: Transaction, job_ids: Sequence[str]) -> None:
-    """Delete the facets that the attempts of jobs staged; what the jobs have published stays."""
+    """Delete the facets that the attempts of jobs staged; published facets of the jobs stay."""
     for some in in_lists(job_ids):
         tx.execute(delete(staged_output).where(staged_output.c.job_id.in_(some), staged_output.c.name == _FACETS))
 

@@ -227,8 +227,8 @@ def _lock_upstream(
 ) -> dict[str, Upstream]:
     """Return the dependencies that exist, locked so that none ends before the dependent jobs are inserted.
 
-    `to_be` are the ids reserved for jobs of the same request, which do not exist yet.
-    A job can depend only on existing jobs and on earlier ones of the same request, so no cycle is possible.
+    `to_be` are the ids reserved for jobs of the same request, which do not exist yet. A job can depend only on existing
+    jobs, and on jobs that come earlier in the same request, so no cycle is possible.
     """
     places = {
         place: one

@@ -1,1 +1,1 @@
-"""Facts for operators: the workers, and the state of the queue and of stored data."""
+"""Information for operators: the workers, and the state of the queue and of stored data."""

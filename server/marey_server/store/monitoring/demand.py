@@ -34,7 +34,7 @@ class Demand:
 
 @dataclass(frozen=True)
 class JobReach:
-    """Jobs that the workers of a pool can run: those that require a subset of `labels`, of these kinds; empty: all."""
+    """Jobs that the workers of a pool can run: those that require a subset of `labels`, of the `kinds` (empty: any)."""
 
     labels: Mapping[str, str]
     kinds: Sequence[str] = ()
@@ -56,7 +56,7 @@ def read_demand(
 
 
 def _wanted(reach: JobReach, others: Sequence[JobReach]) -> ColumnElement[bool]:
-    """Return the condition for the labels and kinds of the jobs that count for the workers with this reach."""
+    """Return the SQL condition on labels and kinds for the jobs that count as demand for workers with this reach."""
     keys: dict[tuple[str, ...], list[str]] = {}
     for key in keys_within(reach.labels):
         simpler = [one for one in others if len(one.labels) < len(reach.labels) and key in keys_within(one.labels)]
@@ -96,7 +96,7 @@ def _count_rows(tx: Transaction, rows: Select[*tuple[Any, ...]], most: int) -> i
 
 
 def _keys(project_id: str, startable: ColumnElement[bool]) -> Select[*tuple[Any, ...]]:
-    """Return the concurrency keys of which one job could start now.
+    """Return a query for the concurrency keys of a project for which a job could start now.
 
     Each step looks up the next key in the index, so the cost depends on the number of keys, not of jobs.
     """

@@ -20,11 +20,11 @@ from marey_server.store.tables import holding, job, project, upload
 from marey_server.store.transaction import Transaction
 
 OTHER = "other"
-"""Value of a label that stands for all values which the server does not define."""
+"""Value of a metric's label in place of all values that the server does not know."""
 
 
 UNKNOWN = "unknown"
-"""Label of workers that claim jobs from another server, so that their versions are unknown."""
+"""Value of a metric's label for workers whose version is unknown, because they claim jobs from another server."""
 
 
 _SQLITE_BYTES = text("SELECT page_count * page_size FROM pragma_page_count, pragma_page_size")
@@ -48,16 +48,16 @@ class Figures:
     running: dict[str, int] = field(default_factory=dict)
     """Number of running attempts by kind."""
     workers: dict[str, int] = field(default_factory=dict)
-    """Number of workers that are alive: of the version of the server, `other`, or `unknown`."""
+    """Number of workers that are alive, by version: the version of the server, `other`, or `unknown`."""
     uploads: int = 0
     stored_bytes: int = 0
-    """Bytes that the quotas of all projects count."""
+    """Bytes of the items of all projects, as the quotas count them."""
     database_bytes: int = 0
-    """Space that the database takes."""
+    """Size of the database in bytes."""
 
 
 def read_figures(tx: Transaction, heard: Sequence[HeardWorker], version: str) -> Figures:
-    """Return the numbers; `heard` are the workers that this process has heard, `version` is that of this server."""
+    """Return the numbers; `heard` are workers that claimed jobs from this process, `version` is that of the server."""
     alive = [worker for worker in list_workers(tx, heard) if worker.alive]
     unfinished = select(func.count()).where(upload.c.finished_digest.is_(None), upload.c.dropped.is_(False))
     stored = select(func.coalesce(func.sum(holding.c.stored_bytes), 0)).join(
@@ -74,7 +74,7 @@ def read_figures(tx: Transaction, heard: Sequence[HeardWorker], version: str) ->
 
 
 def _shown_version(worker: Worker, version: str) -> str:
-    """Return the version of the server if the worker has the same, `other` or, for a worker never heard, `unknown`."""
+    """Return `version` if the worker has this version, `unknown` if its version is unknown, else `other`."""
     if worker.kinds is None:
         return UNKNOWN
     return version if worker.version == version else OTHER

@@ -32,8 +32,11 @@ from marey_server.store.transaction import Transaction
 MOST_REMEMBERED = 5000
 MOST_BYTES = 16 * MIB
 LARGEST_CLAIM_BYTES = 64 * KIB
-"""Limits of the claims that a process remembers. If there are too many, the user with the most workers loses the one
-that has been silent longest; a longer claim is not remembered."""
+"""Greatest number and total size of the claims that a process remembers, and greatest size of one such claim.
+
+Beyond the first two limits, the oldest claim of the user with the most workers is forgotten. A larger claim is not
+remembered.
+"""
 MOST_OF_USER = 2000
 """Default of the greatest number of workers of one user that are alive, in one server process."""
 FORGOTTEN_AFTER_S = 24 * 3600.0
@@ -74,9 +77,10 @@ class _Remembered(NamedTuple):
 class WorkerMemory:
     """Last claim of each worker that claimed jobs from this process. It is thread-safe.
 
-    A worker chooses its name, so one user could send claims with any number of names. The number of workers of a user
-    that are alive is limited, and workers of other users are never forgotten for them. A worker that has been silent
-    for `ALIVE_S` does not count, so workers may be replaced by others with new names.
+    A worker chooses its name, so one user could send claims with any number of names. So the number of workers of each
+    user that are alive is limited, and if there are too many claims, workers of the user with the most workers are
+    forgotten first. A worker that has sent no claim for `ALIVE_S` does not count, so workers may be replaced by workers
+    with new names.
 
     Parameters
     ----------
@@ -88,12 +92,12 @@ class WorkerMemory:
         self._clock_s = clock_s
         self._most_of_user = most_of_user
         self._of_user: dict[str | None, OrderedDict[WorkerKey, _Remembered]] = {}
-        """Workers of each user, those that have been silent longest first."""
+        """Workers of each user, in the order of their last claims, the oldest first."""
         self._count = self._held_bytes = 0
         self._lock = threading.Lock()
 
     def require_place(self, user_id: str | None, token_id: str | None, worker: str) -> None:
-        """Raise `TooManyRequestsProblem` if the worker is not alive yet, and too many others of its user are."""
+        """Raise `TooManyRequestsProblem` if the worker is not alive yet, but too many other workers of its user are."""
         now_s = self._clock_s()
         with self._lock:
             workers = self._of_user.get(user_id, OrderedDict())
@@ -113,7 +117,7 @@ class WorkerMemory:
         )
 
     def hear(self, user_id: str | None, token_id: str | None, claim: ClaimRequest) -> None:
-        """Remember an accepted claim."""
+        """Remember an accepted claim as the last claim of its worker."""
         size = _size_bytes(claim)
         if size > LARGEST_CLAIM_BYTES:
             return
@@ -139,7 +143,7 @@ class WorkerMemory:
         self._held_bytes -= forgotten.size_bytes
 
     def heard(self) -> list[HeardWorker]:
-        """Return the remembered workers that were heard in the last `FORGOTTEN_AFTER_S`."""
+        """Return the workers whose last claim was received within the last `FORGOTTEN_AFTER_S` seconds."""
         now_s = self._clock_s()
         with self._lock:
             every = [one for workers in self._of_user.values() for one in workers.items()]
@@ -157,8 +161,8 @@ def claim_and_remember(
 ) -> list[Lease]:
     """Claim jobs as `claim_after_reaping` does, and remember the worker.
 
-    Raises `TooManyRequestsProblem` if too many workers of the caller are alive. Pods of a job's own belong to no user,
-    and the setting `own_pods` limits their number.
+    Raises `TooManyRequestsProblem` if too many workers of the caller are alive. This limit does not apply to pods that
+    were started for one job; the setting `own_pods` limits their number.
     """
     caller = tx.principal
     if caller.kind != "pod":

@@ -25,7 +25,7 @@ T = TypeVar("T")
 AT_ONCE = 4
 """Number of objects that are moved at the same time for one call."""
 MOST_TRANSFERS = 3
-"""How often a call stores a blob at most; it stores a blob again if the row could not name the object in time."""
+"""Greatest number of transfers of one blob in a call; another one is needed if the row is written too late."""
 
 
 class WantedBytes(NamedTuple):
@@ -44,21 +44,21 @@ class Carried:
     stored: dict[str, StoredObject] = field(default_factory=dict)
     """Objects that were stored, by the digest of their bytes."""
     pieces: dict[WantedBytes, bytes] = field(default_factory=dict)
-    """Bytes that were read."""
+    """Bytes that were read, by blob and range."""
     absent: set[StoredObject] = field(default_factory=set)
     """Objects that were to be read, but do not exist."""
     fault: str | None = None
-    """Why no object can be stored; set by `ProbeAwaited`."""
+    """Reason why no object can be stored, found by `ProbeAwaited`; None if objects can be stored."""
     probed: bool = False
     looked_again: bool = False
     transfers: Counter[str] = field(default_factory=Counter)
-    """How often the bytes of each blob were stored, by digest."""
+    """Number of times that the bytes of each blob were stored, by digest."""
 
 
 class BytesAwaited(BaseException):
-    """Raised to end a transaction that needs bytes from outside; it is run again after `move`.
+    """Signal that rolls back a transaction, because bytes must be moved; after `move`, the transaction runs again.
 
-    This is no `Exception`, because handlers of errors in the transaction must not catch it.
+    It is raised, but is no subclass of `Exception`, because handlers of errors in the transaction must not catch it.
     """
 
     def move(self, carried: Carried) -> None:
@@ -66,27 +66,27 @@ class BytesAwaited(BaseException):
 
 
 class LookAgain(BytesAwaited):
-    """Raised if bytes are not where the snapshot of the transaction says: they may have been moved meanwhile."""
+    """Signal that bytes are not where the snapshot of the transaction says; perhaps another process has moved them."""
 
     def move(self, carried: Carried) -> None:
-        """Record that the next transaction is the second look."""
+        """Record that the transaction was repeated for this reason, so that it is repeated only once."""
         carried.looked_again = True
 
 
 class ProbeAwaited(BytesAwaited):
-    """Raised to end a transaction until a check has shown whether the bucket accepts objects."""
+    """Signal that the server must check whether the bucket accepts objects, before the transaction runs again."""
 
     def __init__(self, storage: ObjectStorage) -> None:
         super().__init__()
         self._storage = storage
 
     def move(self, carried: Carried) -> None:
-        """Check the bucket."""
+        """Check whether the bucket accepts objects, and record the result."""
         carried.fault, carried.probed = self._storage.fault(), True
 
 
 class ObjectsToStore(BytesAwaited):
-    """Raised to store the bytes of blobs as new objects; `contents` maps digests to pieces of bytes."""
+    """Signal that the bytes of blobs must be stored as new objects; `contents` maps digests to pieces of bytes."""
 
     def __init__(self, storage: ObjectStorage, contents: Mapping[str, Iterable[bytes]], now_us: int) -> None:
         super().__init__()
@@ -99,7 +99,7 @@ class ObjectsToStore(BytesAwaited):
         carried.transfers.update(self._contents.keys())
         if any(carried.transfers[digest] > MOST_TRANSFERS for digest in self._contents):
             raise ObjectStorageProblem(
-                "The object storage is too slow: bytes of blobs could not be stored in time.",
+                "The object storage is too slow: bytes of blobs could not be stored in time. Try again later.",
                 headers={"Retry-After": "60"},
             )
         objects = [StoredObject.new(digest, self._now_us) for digest in self._contents]
@@ -113,7 +113,7 @@ class ObjectsToStore(BytesAwaited):
 
 
 class ObjectsToRead(BytesAwaited):
-    """Raised to read ranges of bytes of objects."""
+    """Signal that ranges of bytes of objects must be read."""
 
     def __init__(self, storage: ObjectStorage, wanted: Sequence[tuple[WantedBytes, StoredObject]]) -> None:
         super().__init__()
@@ -145,7 +145,7 @@ def _in_parallel(function: Callable[[*A], T], arguments: Sequence[tuple[*A]]) ->
 
 
 def digest_of_chunks(chunks: Iterable[bytes]) -> tuple[str, int]:
-    """Return the digest and the number of bytes."""
+    """Return the digest of the concatenated chunks, and their total number of bytes."""
     hashed, size_bytes = hashlib.sha256(), 0
     for chunk in chunks:
         hashed.update(chunk)

@@ -56,17 +56,17 @@ class ObjectBlobs:
         return _InTransaction(self, carried, now_us)
 
     def new_copy(self) -> Path | None:
-        """Return None if uploads stay in the database until they are moved; otherwise see `BlobBacking`."""
+        """Return a new file for the copy of an upload; None if new blobs become objects, or `local` needs no copy."""
         return None if self.stores_objects else self.local.new_copy()
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Yield the digests of local files that may have no row; `sweep_objects` finds such objects."""
+        """Yield the digests of local files that may have no row; objects without a row are found by `sweep_objects`."""
         return self.local.stray_digests(older_than_s=older_than_s)
 
 
 @dataclass(frozen=True)
 class _InTransaction:
-    """Object storage as one transaction sees it: what was moved before, and where other bytes are."""
+    """Backing for one transaction: uses bytes that were moved before, and raises `BytesAwaited` for other bytes."""
 
     backing: ObjectBlobs
     carried: Carried
@@ -121,7 +121,7 @@ class _InTransaction:
     def _places(
         self, connection: Connection, ranges: Mapping[str, tuple[int, int] | None]
     ) -> list[tuple[WantedBytes, StoredObject | None]]:
-        """Return the ranges, by default whole blobs, with the objects that contain them; None: they are local."""
+        """Return the ranges, by default whole blobs, each with the object that contains it, or None if it is local."""
         places = []
         for row in connection.execute(_PLACES, {"digests": list(ranges)}).all() if ranges else ():
             start, stop = ranges[row.digest] or (0, row.size_bytes)
@@ -130,23 +130,23 @@ class _InTransaction:
         return places
 
     def release(self, connection: Connection, digest: str) -> None:
-        """Free local bytes; an object that no row names is deleted later."""
+        """Free the local bytes of a blob; if an object has the bytes, `sweep_objects` deletes it later."""
         self.backing.local.release(connection, digest)
 
     def new_copy(self) -> Path | None:
-        """Return a file for the copy of an upload; see `ObjectBlobs.new_copy`."""
+        """Return a new file for the copy of an upload, or None if no copy is needed (`ObjectBlobs.new_copy`)."""
         return self.backing.new_copy()
 
     def adopt(self, copy: Path, digest: str) -> None:
-        """Turn a copy of an upload into a local blob; see `BlobBacking`."""
+        """Turn the complete copy of an upload into the local bytes of a blob."""
         self.backing.local.adopt(copy, digest)
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Yield the digests of local files that may have no row; `sweep_objects` finds such objects."""
+        """Yield the digests of local files that may have no row; objects without a row are found by `sweep_objects`."""
         return self.backing.stray_digests(older_than_s=older_than_s)
 
     def remove_stray(self, digest: str) -> None:
-        """Remove local bytes."""
+        """Remove the local bytes of a blob that has no row."""
         self.backing.local.remove_stray(digest)
 
     def check_writable(self) -> None:
@@ -159,7 +159,7 @@ class _InTransaction:
 
 
 def may_be_named(one: StoredObject, now_us: int) -> bool:
-    """Return whether a row may name an object in a transaction at the time `now_us`: its transfer began lately."""
+    """Return whether a transaction at `now_us` may name an object: its transfer began within `COMMIT_WITHIN_US`."""
     return now_us - one.began_us <= COMMIT_WITHIN_US
 
 

@@ -107,7 +107,7 @@ class StoredObject:
 
 
 class ObjectStorageProblem(UnavailableProblem):
-    """The object storage does not work."""
+    """The object storage does not answer, or refuses a request."""
 
     code = "object-storage-unavailable"
 

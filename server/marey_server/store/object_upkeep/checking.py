@@ -59,7 +59,7 @@ def check_objects(database: Database) -> Iterator[list[StoreDefect]]:
 
 
 def _in_objects(tx: Transaction, behind: str, *, same: bool = False) -> list[Row[Any]]:
-    """Return the next rows, after the digest `behind`, of blobs in object storage; with `same`, the row `behind`."""
+    """Return the next rows of blobs in object storage after the digest `behind`; with `same`, only the row `behind`."""
     rows = select(blob.c.digest, blob.c.size_bytes, blob.c.object_id).where(blob.c.object_id.is_not(None))
     chosen = blob.c.digest == behind if same else blob.c.digest > behind
     return list(tx.execute(rows.where(chosen).order_by(blob.c.digest).limit(PAGE)))

@@ -177,12 +177,14 @@ def _same_place(row: Row[Any]) -> ColumnElement[bool]:
 
 
 def _name_object(tx: Transaction, row: Row[Any], one: StoredObject) -> bool:
-    """Make an object the bytes of a blob, unless the blob was deleted or moved; return whether this was done.
+    """Use an object as the bytes of a blob, unless the blob was deleted or moved; return whether this was done.
 
     Raises `ObjectStorageProblem` if the transfer of the object took too long.
     """
     if not may_be_named(one, tx.now_us):
-        raise ObjectStorageProblem(f"The object storage is too slow: the blob {row.digest} was not stored in time.")
+        raise ObjectStorageProblem(
+            f"The object storage is too slow: the blob {row.digest} was not stored in time. Try again later."
+        )
     if not _take(tx, row):
         return False
     name_object(tx.connection, one)
@@ -191,7 +193,7 @@ def _name_object(tx: Transaction, row: Row[Any], one: StoredObject) -> bool:
 
 
 def _name_file(tx: Transaction, row: Row[Any], target: DirectoryBlobs, copy: Path) -> bool:
-    """Make a file the bytes of a blob, unless the blob was deleted or moved; return whether this was done."""
+    """Use a file as the bytes of a blob, unless the blob was deleted or moved; return whether this was done."""
     if not _take(tx, row):
         return False
     target.adopt(copy, row.digest)
@@ -200,7 +202,7 @@ def _name_file(tx: Transaction, row: Row[Any], target: DirectoryBlobs, copy: Pat
 
 
 def _take(tx: Transaction, row: Row[Any]) -> bool:
-    """Record that a blob is no longer where it was, and free these bytes; return False if it was changed meanwhile."""
+    """Free the old bytes of a blob that was copied; return False if the blob was deleted or moved meanwhile."""
     nowhere = update(blob).where(_same_place(row)).values(upload_id=None, object_id=None)
     if not tx.execute(nowhere).rowcount:
         return False

@@ -1,7 +1,7 @@
 """Purges: deleted items are erased for good, so that garbage collection can free the bytes of their content.
 
-An empty row remains of a purged item, and one of each of its revisions, because lineage and jobs refer to these rows.
-An item that something still needs is not purged; the module `holders` finds what needs it.
+Of a purged item, one row without content remains, and one for each of its revisions, because lineage and jobs refer to
+these rows. An item that is still needed is not purged; the module `holders` finds the objects that need it.
 """
 
 from marey_server.store.purging.candidates import PreparedPurge, prepare_purge

@@ -30,14 +30,14 @@ _ORDER = (
 """Kinds in the order of a purge.
 
 Documents of an item refer to items of later kinds in this order. So an item is purged before the items to which its
-documents refer, and does not hold them.
+documents refer, and does not prevent their purge.
 """
 assert set(_ORDER) == set(Kind), "every kind needs a place in the order of a purge"
 
 
 @dataclass(frozen=True)
 class PreparedPurge:
-    """Items that a request may purge, and what was found about them before the purge."""
+    """Items that a request may purge, and the results of the search that was made for them before the purge."""
 
     ids: tuple[str, ...]
     search: VersionSearch
@@ -68,7 +68,7 @@ def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> Prepa
 
 
 def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest) -> list[Row[Any]]:
-    """Return the next deleted items that a request selects, and one more; each kind is read from an index."""
+    """Return the next deleted items that a request selects, and one more if any remain; an index finds each kind."""
     filters = ItemFilters(collection=request.collection or None, path=request.path, query=request.query, deleted=True)
     last = None if request.after is None else _kind_of(request.after)
     rows: list[Row[Any]] = []

@@ -39,9 +39,9 @@ def delete_uncited_ref(
 ) -> None:
     """Delete a branch or a tag; `citing` are the jobs that `find_citations` has found.
 
-    A job that is submitted meanwhile names its version by digest, and keeps it. Raises the errors of `delete_ref`. Also
-    raises `ConflictProblem` if a job that has not ended, or an item that a job made, cites the version of the tag, and
-    no other tag names this version.
+    A job that is submitted meanwhile is not affected, because it names its version by digest. Raises the errors of
+    `delete_ref`. Also raises `ConflictProblem` if a job that has not ended, or an item that a job made, cites the
+    version of the tag, and no other tag names this version.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -92,9 +92,10 @@ def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
 
 
 def holders_of(tx: Transaction, citing: Collection[str]) -> FoundHolders:
-    """Return what holds the versions that jobs have read: jobs that have not ended, and items that the jobs made.
+    """Return the holders of versions that jobs have read: those jobs that have not ended, and items that the jobs made.
 
-    `citing` are the ids of the jobs; their retries and tasks count, too. Purged items hold nothing.
+    Holders prevent the deletion of the versions. `citing` are the ids of the jobs; their retries and tasks are
+    included. Purged items are no holders.
     """
     held = FoundHolders()
     ordered = sorted(_with_retries(tx, citing))

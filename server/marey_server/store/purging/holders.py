@@ -1,4 +1,4 @@
-"""Search for what holds deleted items: versions of datasets, documents of other items, and jobs that have not ended."""
+"""Search for holders, which prevent the purge of items: versions of datasets, other items, and unfinished jobs."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class FoundHolders:
 def find_holders(
     tx: Transaction, project_id: str, rows: Mapping[str, Row[Any]], versions: Mapping[str, Iterable[Holder]]
 ) -> dict[str, FoundHolders]:
-    """Return what holds each item, by its id; `rows` are the items that are to be purged together.
+    """Return, by the id of an item, the holders that prevent its purge; items without holders are left out.
 
-    Items that nothing holds are left out. A document of an item in `rows` may refer to another item in `rows`. Such a
-    reference holds the other item only if something holds the first item. `versions` are the holders that a
-    `VersionSearch` has found.
+    `rows` are the items that are to be purged together. If an item in `rows` refers to another item in `rows`, the
+    reference prevents the purge of the other item only if the first item has a holder. `versions` are the holders that
+    a `VersionSearch` has found.
     """
     held: dict[str, FoundHolders] = {}
     for item_id, found in versions.items():
@@ -54,7 +54,7 @@ def find_holders(
 
 
 def _unfinished_jobs(tx: Transaction, project_id: str, items: Collection[str]) -> dict[str, dict[str, JobHolder]]:
-    """Return the jobs that hold items, by the id of the item and the id of the job; tasks count as their parent job."""
+    """Return the unfinished jobs that name items, by the ids of item and job; a task is replaced by its parent job."""
     found: dict[str, dict[str, JobHolder]] = {}
     for one in jobs_naming(tx, project_id, items, unfinished=True):
         whole = one.parent or one.id
@@ -108,7 +108,7 @@ def _references_among(tx: Transaction, items: Collection[str]) -> dict[str, list
 
 
 def _spread(refers: Mapping[str, Iterable[str]], rows: Mapping[str, Row[Any]], held: dict[str, FoundHolders]) -> None:
-    """Add to `held` the items to which held items refer (`refers`), directly or through other items."""
+    """Add to `held` the items to which the items in `held` refer according to `refers`, directly or indirectly."""
     waiting = sorted(held)
     spread = set(waiting)
     while waiting:

@@ -1,4 +1,4 @@
-"""Removal of the names of purged items from the records of jobs, and of the content that the jobs hold for them."""
+"""Removal of purged items from the records of jobs: their names, and their content that the jobs keep."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marey_server.store.transaction import Transaction, in_lists
 
 
 def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) -> None:
-    """Remove the names of items from the records of `jobs`, and release what these jobs keep of the items' content.
+    """Remove the names of items from the records of `jobs`, and the files, facets and results of the items.
 
     The items must still have their documents.
     """

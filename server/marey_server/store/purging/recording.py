@@ -1,4 +1,7 @@
-"""Purges and their previews: prepared items are erased unless something holds them; the answer names the holders."""
+"""Purges and their previews: prepared items are erased unless they have holders, which the answer names.
+
+A holder of an item is a version of a dataset, another item, or an unfinished job that needs the item.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +28,14 @@ from marey_server.store.tables import item
 from marey_server.store.transaction import Transaction
 
 STILL_HELD = "still-held"
-"""Code of the error for an item that something still needs; `context.holders` says what."""
+"""Code of the error for an item that is still needed; `context.holders` lists the objects that need the item."""
 
 
 def preview_purge(tx: Transaction, project: str, request: PurgeRequest) -> PurgeAnswer:
     """Return what a purge would delete and what it would refuse to delete; a preview only reads.
 
     Raises the errors of `prepare_purge`. For a single item, also raises the errors of `record_purge`, except the error
-    for an item that something holds.
+    for an item that is still needed.
     """
     prepared = prepare_purge(tx, project, request)
     project_row = projects.require(tx, project)
@@ -41,11 +44,11 @@ def preview_purge(tx: Transaction, project: str, request: PurgeRequest) -> Purge
 
 
 def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared: PreparedPurge) -> PurgeAnswer:
-    """Purge the prepared items that nothing holds, all in this transaction.
+    """Purge the prepared items that have no holders, all in this transaction.
 
     Items that were restored since they were chosen are left out. If the request names a single item, raises
     `NotFoundProblem` if the item does not exist, and `GoneProblem` if it was purged already. Raises `ConflictProblem`
-    if this item is not deleted, or if something holds it.
+    if this item is not deleted, or if it has holders.
     """
     assert not request.preview, "a preview is a read"
     project_row = projects.require(tx, project)
@@ -63,7 +66,7 @@ def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared:
 
 @dataclass(frozen=True)
 class _Examined:
-    """Prepared items that are still deleted: those that can be purged, and those that something holds."""
+    """Prepared items that are still deleted: items that can be purged, and items that have holders."""
 
     free: Sequence[Row[Any]]
     refused: tuple[HeldItem, ...]
@@ -86,7 +89,7 @@ def _examine(tx: Transaction, project_row: ProjectRow, request: PurgeRequest, pr
 def _answer(
     tx: Transaction, project_row: ProjectRow, request: PurgeRequest, prepared: PreparedPurge, found: _Examined
 ) -> PurgeAnswer:
-    """Return what a purge deletes and what it does not delete, as found before anything is deleted."""
+    """Return the answer to a purge, with purged and refused items and freed bytes; call this before the deletion."""
     return PurgeAnswer(
         preview=request.preview,
         purged=tuple(_purged(row, named=request.preview) for row in found.free),
@@ -97,7 +100,7 @@ def _answer(
 
 
 def _lock(tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge, *, preview: bool) -> dict[str, Row[Any]]:
-    """Return the rows of the prepared items that are still deleted, in their order; lock them, except for a preview."""
+    """Return the rows of the prepared items that were not restored, in their order; except for a preview, lock them."""
     statement = item_rows().where(
         item.c.id.in_(prepared.ids),
         item.c.project_id == project_row.id,
@@ -126,7 +129,7 @@ def _not_deleted(tx: Transaction, project_row: ProjectRow, item_id: str) -> ApiP
 def _versions(
     tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge, rows: Mapping[str, Row[Any]]
 ) -> dict[str, list[Any]]:
-    """Return the datasets that hold the items, after a search of the commits that were added since the preparation.
+    """Return the datasets whose versions contain the items; search the commits that were added since the preparation.
 
     If a revision has received a content digest since the preparation, all versions are searched again.
     """

@@ -82,11 +82,11 @@ class VersionSearch:
         try:  # `entry_of` would check each entry, but few of them have a wanted part
             near = [entry for entry in entries if not self._parts.isdisjoint(entry[1]["parts"].values())]
         except (KeyError, AttributeError, TypeError) as error:
-            raise DamagedChunk(f"an entry of a version has no parts that are texts: {error!r}") from error
+            raise DamagedChunk(f"the parts of an entry are missing, or are not strings: {error!r}") from error
         return frozenset(entry_of(*one).content for one in near) & self.wanted.keys() if near else _NOTHING
 
     def holders(self, tx: Transaction, contents: Mapping[str, Collection[str]]) -> dict[str, list[DatasetHolder]]:
-        """Return the datasets that hold items; `contents` maps the ids of items to the contents of their revisions."""
+        """Return the datasets whose versions contain items; `contents` maps ids of items to contents of revisions."""
         containing: dict[str, dict[str, set[str]]] = {}
         items_of: dict[str, set[str]] = {}
         for item_id, digests in contents.items():
@@ -103,7 +103,7 @@ class VersionSearch:
 
 
 class _Names:
-    """Names of datasets, and what refers to their commits: branches, tags and open proposals."""
+    """Names of datasets, and the branches, tags and open proposals that refer to commits of the datasets."""
 
     def __init__(self, tx: Transaction, ids: Collection[str]) -> None:
         chosen = sorted(ids)

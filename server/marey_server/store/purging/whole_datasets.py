@@ -1,8 +1,8 @@
 """Purges of deleted datasets: their versions, branches, tags and proposals are deleted for good.
 
-A dataset is held by what cites one of its commits: unfinished jobs, and items that jobs made from a version. So the
-lineage of a result always leads to the version from which it was made. A commit that another dataset of the project
-has, too, stays readable there, and does not count.
+A dataset is not purged while it has holders: unfinished jobs that read one of its commits, and items that jobs made
+from one of its commits. So the lineage of a result always leads to the version from which it was made. If another
+dataset of the project has the same commit, holders of this commit do not prevent the purge.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _OF_DATASETS = (
 
 @dataclass(frozen=True)
 class PreparedDatasetPurge:
-    """Deleted dataset, and what was found about it before its purge."""
+    """Deleted dataset, and the results of the search that was made before its purge."""
 
     id: str
     commits: frozenset[str]
@@ -62,7 +62,7 @@ class PreparedDatasetPurge:
 
 
 def preview_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRequest) -> DatasetPurgeAnswer:
-    """Return what the purge of a deleted dataset would delete, and what holds the dataset; nothing is changed.
+    """Return what the purge of a deleted dataset would delete, and the holders that prevent it; change nothing.
 
     Raises the errors of `prepare_dataset_purge`.
     """
@@ -98,7 +98,7 @@ def record_dataset_purge(
 ) -> DatasetPurgeAnswer:
     """Delete a deleted dataset for good.
 
-    Raises `ConflictProblem` if something holds the dataset, and `NotFoundProblem` if there is no such dataset.
+    Raises `ConflictProblem` if the dataset has holders, and `NotFoundProblem` if there is no such dataset.
     """
     assert not request.preview, "a preview is a read"
     project_row = projects.require(tx, project)

@@ -19,7 +19,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """Text about a quota in errors: its name, and what the user can do."""
+    """Text for errors about a quota: the things that are counted, and what the user can do."""
 
     noun: str
     remedy: str
@@ -67,9 +67,10 @@ def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
 
 
 def room_of(tx: Transaction, quota: str, user_id: str) -> int:
-    """Return how many things of a kind a user may still add; concurrent writes may take the same room.
+    """Return how many things of a kind a user may still add without exceeding a quota.
 
-    Unlike `require_room`, this concerns a user who is not the caller, and locks nothing.
+    Unlike `require_room`, this function is for a user who is not the caller, and locks nothing. So concurrent writes
+    may together exceed the quota.
     """
     return int(getattr(tx.quotas, quota) - tx.execute(_used(tx, quota, user_id)).scalar_one())
 

@@ -1,6 +1,6 @@
 """Quotas of amounts per day: the bytes that a user sends, and the inputs of the jobs that a user submits.
 
-Each quota is one row for each user, as for sign-ins. So a count takes the same time, however much was counted before.
+Each quota has one row for each user (`rate_limits`). So a count takes the same time, however much was counted before.
 The server and attempts of jobs have no quotas.
 """
 
@@ -56,7 +56,8 @@ def count_submitted(tx: Transaction, inputs: int) -> None:
     """Count the inputs of jobs that the caller submits, with those of the tasks of these jobs.
 
     The row of a job contains all of its inputs, and is kept after the job has ended or was cancelled. Call this once,
-    as `count_sent`. Raises `QuotaExceededProblem` if the caller has submitted too many inputs.
+    at the end of a transaction: until the transaction ends, other counts of the same user wait. Raises
+    `QuotaExceededProblem` if the caller has submitted too many inputs.
     """
     _count(tx, _INPUTS, _caller(tx), inputs)
 

@@ -1,4 +1,4 @@
-"""Limits of one project or user: what administrators set, and members see."""
+"""Limits of one project or user, which administrators set, and members of the project or the user can read."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ DUE_AT_ONCE = 100
 """Greatest number of due schedules that one call of `submit_due` handles."""
 MAX_PROBLEM_LENGTH = 500
 SKIPPED = "Skipped, because the previous job"
-"""Beginning of the problem of a schedule that skipped a time; this is no refusal."""
+"""Beginning of the field `problem` of a schedule that skipped a time; the submission of its job was not refused."""
 
 _SUBMITS = RequiredRole(Role.CONTRIBUTOR, "jobs", guests=False, in_folders=True)
 """Role and scope that the author of a schedule needs whenever a job is submitted."""

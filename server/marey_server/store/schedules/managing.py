@@ -64,7 +64,9 @@ def create_schedule(tx: Transaction, project: str, request: ScheduleCreate) -> S
     }  # fmt: skip
     made = tx.execute(tx.insert_or_ignore(schedule, values).returning(schedule.c.id)).first()
     if made is None:
-        raise ConflictProblem(f"The project has a schedule {request.name!r} already.", code="schedule-exists")
+        raise ConflictProblem(
+            f"The project has a schedule {request.name!r} already; choose another name.", code="schedule-exists"
+        )
     tx.audit("schedule.created", schedule_id, about=request.name, project_id=row.id)
     return _shown(project, _find(tx, row, request.name))
 
@@ -74,9 +76,9 @@ def change_schedule(
 ) -> Schedule:
     """Change, pause or resume a schedule.
 
-    After any change but a pause or a new description, jobs are submitted as the caller, so that nobody can let others
-    submit jobs at times that these have not chosen. Raises `ForbiddenProblem` if
-    the caller is neither the author of the schedule nor a maintainer of the project. Raises `InvalidProblem` as
+    After any change except a pause or a new description, the caller is the author of the schedule, as whom its jobs are
+    submitted. So nobody can make other users submit jobs that they have not chosen. Raises `ForbiddenProblem` if the
+    caller is neither the author of the schedule nor a maintainer of the project. Raises `InvalidProblem` as
     `create_schedule` does.
     """
     row = projects.require(tx, project)
@@ -110,7 +112,7 @@ def delete_schedule(tx: Transaction, project: str, name: str, *, expected_rev: E
 
 
 def _author(tx: Transaction) -> dict[str, Any]:
-    """Return the columns that say as whom, and with which scopes, the jobs are submitted."""
+    """Return the columns that contain the user and the scopes with which the jobs are submitted."""
     return {"author_id": tx.principal.user_id, "scopes": sorted(tx.principal.scopes)}
 
 

@@ -43,7 +43,7 @@ class RunToCompare(NamedTuple):
 def find_runs(
     tx: Transaction, project: str, name: str, *, sort: str, limit: int = MOST_COMPARED
 ) -> tuple[list[RunToCompare], bool]:
-    """Return the first succeeded runs of a script in an order, and whether these are all.
+    """Return the first succeeded runs of a script in the given order, and whether these are all succeeded runs.
 
     Raises `BadRequestProblem` for an unknown order.
     """
@@ -102,7 +102,7 @@ def _listed(given: Any) -> list[Mapping[str, Any]]:
 
 
 def _words_of(pins: list[Mapping[str, Any]]) -> str:
-    """Return the name of an input; several items get a number that differs for different lists."""
+    """Return path and revision of an input with one item, otherwise the number of items and a hash of their list."""
     if len(pins) != 1:
         revisions = canonical_json([(pin["item"], pin["revision"]) for pin in pins])
         return f"{counted(len(pins), 'item')} #{hashlib.sha256(revisions).hexdigest()[:6]}"

@@ -71,7 +71,7 @@ def create_links(
     planned: PlannedDraw,
     plans: Sequence[Plan],
 ) -> NewStudyLinks:
-    """Create one link for each drawn plan; their codes are stored only as hashes.
+    """Create one link for each drawn plan; the codes of the links are stored only as hashes.
 
     Raises `ConflictProblem` if the study or its participants have changed since the draw was planned.
     """

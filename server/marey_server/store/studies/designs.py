@@ -1,4 +1,4 @@
-"""Designs of studies: the documents of their revisions, as participants and those who carry them out need them."""
+"""Designs of studies, which are the documents of the revisions of studies."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def require_study(tx: Transaction, project: str, kind: Kind, item_id: str) -> tu
     """
     project_row = projects.require(tx, project)
     if kind is not Kind.STUDY:
-        raise NotFoundProblem(f"A {kind} has no participants; only studies have.", code="not-a-study")
+        raise NotFoundProblem(f"The item is a {kind}, but only studies have participants.", code="not-a-study")
     return project_row, find_item(tx, project_row, Kind.STUDY, item_id)
 
 

@@ -25,7 +25,7 @@ from marey_server.store.transaction import Transaction
 def list_judgements(
     tx: Transaction, project: str, kind: Kind, item_id: str, *, revision: int, cursor: str | None, limit: int
 ) -> Page:
-    """Return a page of the participants who saw a revision of a study and began, each with all trials, without dates.
+    """Return a page of the participants who have begun a revision of a study, each with all trials, without dates.
 
     Raises `NotFoundProblem` or `ForbiddenProblem`.
     """
@@ -44,7 +44,7 @@ def list_for_attempt(
     require_attempt(tx.principal, job_id, fence)
     is_study = select(item.c.id).where(item.c.id == item_id, item.c.kind == Kind.STUDY)
     if (item_id, revision) not in reach.pinned_places(tx) or tx.execute(is_study).first() is None:
-        raise NotFoundProblem("The job has no such study as its input.", code="no-item")
+        raise NotFoundProblem("The study, at this revision, is not an input of the job.", code="no-item")
     _require_maintainer(tx, job_id)
     return _page(tx, item_id, revision, cursor, limit)
 
@@ -56,7 +56,7 @@ class CollectedAnswers:
     revision: int
     motion_count: int
     answers: list[tuple[int, list[int], tuple[int, int]]]
-    """For each trial: number of the participant from 0, motions shown by place, and the chosen places."""
+    """For each trial: number of the participant (from 0), the shown motions by place, and the chosen places."""
 
 
 def collect_answers(tx: Transaction, project: str, kind: Kind, item_id: str, *, revision: int) -> CollectedAnswers:
@@ -109,7 +109,7 @@ def _shown(trial: Row[Any], seed: int) -> JudgedTrial:
 
 
 def _require_maintainer(tx: Transaction, job_id: str) -> None:
-    """Refuse an attempt of a job whose author is no maintainer of the project, or not any more."""
+    """Raise `ForbiddenProblem` for an attempt of a job whose author is not a maintainer of the project at present."""
     role = (
         select(user.c.administrator, member.c.role)
         .select_from(job)

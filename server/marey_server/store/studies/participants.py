@@ -1,7 +1,8 @@
 """Participants of studies: their links and tokens, their consent, their progress, and their withdrawal.
 
 A participant is one row. It exists from the creation of the link, and it remains after a withdrawal, so that nobody can
-use the link again. It then contains nothing of the participant. The database contains only hashes of codes and tokens.
+use the link again. A withdrawal deletes the consent and the trials of the participant. The database contains only
+hashes of codes and tokens.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _NO_HASH = hash_secret("")  # of no code, because secrets are not empty
 
 
 def _rows() -> Select[*tuple[Any, ...]]:
-    """Return a query for participants with the name and the project of their study, and whether it still exists."""
+    """Return a query for participants with the name and project of their study, and whether the study still exists."""
     alive = item.c.deleted_us.is_(None) & project.c.deleted_us.is_(None)
     return (
         select(study_participant, item.c.name, item.c.project_id, alive.label("study_exists"))
@@ -68,13 +69,13 @@ def link_invalid() -> NotFoundProblem:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try that is to be counted before the code of a link is checked."""
+    """Return the try to use the code of a link, which must be counted for rate limits before the code is checked."""
     prefix, _ = split_study_link(code) or ("", "")
     return SignInTry(f"study {prefix}", address, per_minute)
 
 
 def _find_link(tx: Transaction, code: str) -> Row[Any]:
-    """Lock and return the participant of a link, who may have begun. Raises `NotFoundProblem`."""
+    """Lock and return the participant of a link, who may have begun the study already. Raises `NotFoundProblem`."""
     prefix, secret = split_study_link(code) or ("", "")
     locked = _rows().where(study_participant.c.link_prefix == prefix).with_for_update(of=study_participant)
     row = tx.execute(locked).first()

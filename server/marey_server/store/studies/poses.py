@@ -30,7 +30,9 @@ def find_shown_part(tx: Transaction, clip: int, part: ShownPart) -> FoundPart:
     row = find_caller(tx)
     motions = load_design(tx, row.item_id, row.revision).motions
     if clip >= len(motions):
-        raise NotFoundProblem(f"The study has no motion {clip}; it has {len(motions)}.", code="no-clip")
+        raise NotFoundProblem(
+            f"The study has no motion {clip}; it has {len(motions)} motions, numbered from 0.", code="no-clip"
+        )
     place = _place_of(motions[clip])
     if find_ended_consents(tx, [place[0]]):
         raise _gone()

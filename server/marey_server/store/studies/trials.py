@@ -22,7 +22,7 @@ from marey_server.store.transaction import Transaction
 GRACE_US = 2_000_000
 """Time after the deadline in which an answer still counts, because answers need time through the network."""
 MOST_TIMEOUTS = 500
-"""Greatest number of trials that a participant may let pass."""
+"""Greatest number of trials that a participant may leave without an answer."""
 
 
 def open_trial(tx: Transaction) -> TrialStep:
@@ -94,7 +94,7 @@ def answer_trial(tx: Transaction, number: int, answer: TrialAnswer) -> TrialOutc
 
 
 def _time_out(tx: Transaction, row: Row[Any], trial: Row[Any]) -> Row[Any]:
-    """Record that nobody answered a trial in time; return the participant after that."""
+    """Record that a participant did not answer a trial in time; return the participant's changed row."""
     which = (study_trial.c.participant_id == row.id, study_trial.c.number == trial.number)
     tx.execute(update(study_trial).where(*which).values(ended_us=tx.now_us))
     return _count(tx, row.id, timeouts=row.timeouts + 1)

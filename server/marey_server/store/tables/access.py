@@ -1,4 +1,4 @@
-"""Tables of users, tokens, projects, and who may do what in them."""
+"""Tables of users, tokens and projects, and of the roles and rights of users in projects."""
 
 from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, String, Table, Text, false, text
 

@@ -1,4 +1,4 @@
-"""Tables of stored bytes, of who may refer to them, and of uploads that are not finished."""
+"""Tables of stored bytes, of the users and projects that may refer to them, and of unfinished uploads."""
 
 from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, LargeBinary, String, Table, false, text
 

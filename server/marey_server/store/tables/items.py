@@ -1,4 +1,4 @@
-"""Tables of folders, items, their revisions, and the documents of these."""
+"""Tables of folders, of items and their revisions, and of the documents of revisions."""
 
 from sqlalchemy import (
     BigInteger,

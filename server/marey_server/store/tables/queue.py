@@ -26,14 +26,14 @@ LEASED = text("state = 'running' AND lease_expires_us IS NOT NULL")
 """Condition of `ix_job_leased`: a worker runs the job. A parent job whose tasks run has no lease."""
 
 HAS_LONG_LOG = text("log_bytes > 43")
-"""Condition of `ix_attempt_log`: the log is longer than the text that replaces an old one."""
+"""Condition of `ix_attempt_log`: the log is longer than the text that replaces a deleted log."""
 
 NOT_SUCCEEDED = text("job.state <> 'succeeded'")
 """Condition of `ix_job_list_state`, for queries; SQLite uses the index only if the query contains this condition."""
 
 
 def _listing_index(name: str, *columns: str, of: str = "parent_id IS NULL") -> Index:
-    """Return an index for lists of jobs, which contain no tasks; it ends with the order of the lists."""
+    """Return an index for lists of jobs without tasks; its last columns are those by which the lists are sorted."""
     condition = text(of)
     return Index(
         f"ix_job_list_{name}", "project_id", *columns, "id", sqlite_where=condition, postgresql_where=condition

@@ -1,4 +1,4 @@
-"""Tables of what the server keeps for itself: events, webhooks, repeated requests, streams, and its own state."""
+"""Tables of events, webhooks, answers to repeated requests, streams, and the state of the server."""
 
 from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, LargeBinary, String, Table, Text, text
 

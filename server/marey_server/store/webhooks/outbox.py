@@ -1,4 +1,4 @@
-"""Work of the process that sends deliveries: what to send next, and the outcomes.
+"""Database access of the process that sends deliveries: reads the next deliveries, and records their outcomes.
 
 The position of a webhook is the number of the last event that was delivered or given up, so events are sent in their
 order. The transaction that records an outcome also moves the position. So if a process dies, no delivery is lost. The

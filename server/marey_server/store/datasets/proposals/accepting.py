@@ -51,7 +51,7 @@ WAITING_MERGE = ProposalMerge()
 
 @dataclass(frozen=True)
 class PreparedAcceptance:
-    """Computed, but not recorded merge of a proposal; or the error if the merge could not be computed."""
+    """Merge of a proposal that was computed but not recorded, or the error if it could not be computed."""
 
     request: MergeRequest
     merge: PreparedMerge | None

@@ -24,7 +24,7 @@ from marey_versions.records import key_of
 from marey_versions.tree.reading import Tree
 
 MOST_OF_EACH = 1000
-"""Greatest number of comments on a proposal. Its reviews have the same limit, and so have its checks."""
+"""Greatest number of comments, of reviews and of checks that a proposal can have."""
 
 
 def add_comment(tx: Transaction, project: str, name: str, number: int, request: CommentCreate) -> Comment:

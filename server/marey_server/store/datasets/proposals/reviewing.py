@@ -105,7 +105,8 @@ def _require_job(tx: Transaction, project_id: str, job_id: str, state: CheckStat
     read = commits_of(found.inputs)
     if read and head not in read:
         raise ConflictProblem(
-            f"The job {job_id} read versions of the dataset, but not the newest commit of the proposal.",
+            f"The job {job_id} read versions of the dataset, but not the newest commit of the proposal; run the check "
+            "on this commit.",
             code="job-of-another-commit",
             context={"commits": sorted(read)},
             unnamed=True,

@@ -1,7 +1,8 @@
 """Limits of the texts of proposals: descriptions, comments, reviews and checks.
 
-Each text counts with its bytes in UTF-8 and with `BYTES_OF_ROW`, so that many short or empty texts are limited, too. A
-quarter of each limit is reserved for maintainers. Otherwise, others could prevent a review by filling a proposal.
+Limits are in bytes. A text takes its length in UTF-8 plus `BYTES_OF_ROW`, so that many short or empty texts are
+limited, too. A quarter of each limit is reserved for maintainers. Otherwise, other members could prevent a review by
+filling a proposal with texts.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _TEXTS: tuple[tuple[Table, ColumnElement[Any], ColumnElement[int]], ...] = (
 
 
 def require_room(tx: Transaction, project_row: ProjectRow, dataset_id: str, number: int, text: str) -> None:
-    """Check that the caller may add a text to a proposal, which may be a new one.
+    """Check that the caller may add a text to an existing proposal, or open a new proposal with the text.
 
     Concurrent checks of one project run one after another. Raises `ConflictProblem` if the text would exceed the limit
     of the proposal, and `QuotaExceededProblem` if it would exceed the limit of all proposals of the project.
@@ -45,8 +46,9 @@ def require_room(tx: Transaction, project_row: ProjectRow, dataset_id: str, numb
     limit = _limit_for(project_row.role, MOST_TEXT_OF_PROPOSAL)
     if used + more > limit:
         raise ConflictProblem(
-            f"You can add texts to a proposal up to {limit:,} bytes in total. The texts of this one have {used:,}, and "
-            f"the new text needs {more:,} more. Close the proposal and open another, or write a shorter text.",
+            f"You can add texts to a proposal up to {limit:,} bytes in total. The texts of this proposal have {used:,} "
+            f"bytes, and the new text needs {more:,} more. Close the proposal and open another, or write a shorter "
+            "text.",
             code="long-proposal",
             context={"used": used, "limit": limit},
         )
@@ -67,8 +69,8 @@ def _require_room_in_project(tx: Transaction, project_row: ProjectRow, more: int
     if used + more > limit:
         raise QuotaExceededProblem(
             f"The texts of the project's proposals have {used:,} bytes, your limit is {limit:,}, and the new text "
-            f"needs {more:,} more. Purge deleted datasets, whose proposals count, or ask the operator to raise the "
-            "setting `project_proposal_bytes`.",
+            f"needs {more:,} more. Purge deleted datasets, because the texts of their proposals count, too, or ask the "
+            "operator to raise the setting `project_proposal_bytes`.",
             context={"quota": "project_proposal_bytes", "used": used, "limit": limit},
         )
 

@@ -69,13 +69,13 @@ class WaitingMerges:
         self._database = database
         self._last = ("", 0)
         self._in_vain: LruCache[tuple[str, int], _InVain] = LruCache(max_entries=IN_VAIN_KEPT)
-        """Last merge of each proposal that was computed in vain, by dataset and number of the proposal."""
+        """Last merge of each proposal that was computed but not performed, by dataset and number of the proposal."""
 
     def attempt(self) -> int:
         """Examine the next `EXAMINED_AT_ONCE` waiting proposals, and merge those that are ready.
 
         Returns the number of merged proposals. A proposal that another request changes meanwhile is examined again in
-        the next round. An error does not keep the other proposals from being merged.
+        the next round. After an error with one proposal, the other proposals are still examined.
         """
         found = self._database.read(SYSTEM, _next_waiting, self._last)
         merged = sum(map(self._attempt_one, found))

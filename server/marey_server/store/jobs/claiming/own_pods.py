@@ -22,16 +22,16 @@ from marey_server.store.transaction import Transaction, in_lists
 
 _LABELS = literal(",") + job.c.labels_key
 _OWN_POD = f",{labels_key({OWN_POD_LABEL: ''})}"
-"""Comma and name of the label; without the comma, a longer name would match. SQLite's LIKE would ignore the case."""
+"""Text that `labels_key` contains, after a leading comma, if a job has the label; the comma excludes longer names."""
 
 
 @dataclass(frozen=True)
 class WaitingJob:
     """Queued job that needs a pod of its own.
 
-    `parent` and `position` are those of a task, and `siblings` is the number of tasks of its parent. `fence` counts the
-    claims of the job. `image` is the image that the script of the job names, if any. `limited` states whether its
-    `project` has a limit of running jobs.
+    For a task, `parent` is the parent job, `position` the place among the tasks of the parent job, and `siblings` the
+    number of these tasks. `fence` counts the claims of the job. `image` is the image that the script of the job names,
+    if any. `limited` states whether the `project` has a limit of running jobs.
     """
 
     id: str
@@ -55,7 +55,7 @@ def read_waiting(
 
     Projects take turns; the jobs of a project are in the order of claims.
 
-    Jobs of a project whose limit of running jobs is reached are left out, and jobs whose concurrency key is in use.
+    A job is left out if its project has reached its limit of running jobs, or if its concurrency key is in use.
 
     Parameters
     ----------
@@ -110,9 +110,9 @@ def read_unfinished(tx: Transaction, ids: Collection[str]) -> set[str]:
 
 
 def postpone(tx: Transaction, job_id: str, reason: str, pause_s: float, *, tasks: bool) -> bool:
-    """Let a job without an attempt wait, or all such tasks of it; return whether there was one.
+    """Delay a queued job by at least `pause_s` seconds, or with `tasks` all its queued tasks.
 
-    The job says why: the reason is the note of its progress until a worker claims it.
+    Returns false if there was no such job or task. Until a worker claims the job, the note of its progress is `reason`.
     """
     note = Progress(done=0, note=reason[:LONGEST_NOTE])
     until_us = tx.now_us + round(pause_s * SECOND_US)
@@ -134,7 +134,7 @@ Unclaimed = tuple[str, str | None]
 
 
 def _unclaimed(tx: Transaction, served: Collection[str]) -> Iterator[Unclaimed]:
-    """Yield the served jobs that their pods have not claimed yet."""
+    """Yield project and concurrency key of those jobs in `served` that their pods have not claimed yet."""
     statement = select(job.c.project_id, job.c.concurrency_key).where(job.c.state == QUEUED)
     for some in in_lists(served):
         for row in tx.execute(statement.where(job.c.id.in_(some))):
@@ -152,9 +152,10 @@ def _unclaimed_tasks(tx: Transaction, split: Mapping[str, int]) -> Iterator[Uncl
 
 
 def _one_of_each_key(rows: Collection[Row[Any]], unclaimed: Collection[Unclaimed]) -> list[Row[Any]]:
-    """Return the rows without those that cannot run beside an earlier one, or beyond the limit of their project.
+    """Return the rows of the jobs that can all run at the same time.
 
-    Jobs whose pods have not claimed them yet count as earlier ones; otherwise, pods would start that can only wait.
+    A job is left out if an earlier job has its concurrency key, or if its project would exceed its limit of running
+    jobs. Earlier jobs include those in `unclaimed`; otherwise, pods would start that can only wait.
     """
     kept: list[Row[Any]] = []
     keys = {one for one in unclaimed if one[1] is not None}

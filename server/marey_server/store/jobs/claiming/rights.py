@@ -1,8 +1,8 @@
 """Rights of the callers that claim jobs: workers with a user's token, and pods that were started for one job.
 
-The token of a pod of a job's own is derived from the id of the job and the key of the servers. So it needs no row, and
-a server that repeats the start of a pod creates the same token again. Its only right is to claim this job, or one of
-its tasks.
+The token of a pod is derived from the id of the job for which the pod is started, and from the key of the servers. So
+the token needs no row, and a server that repeats the start of a pod creates the same token again. With the token, the
+pod can claim only this job, or one of the tasks of this job.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def pod_token(key: bytes, job_id: str) -> str:
 
 
 def resolve_pod_token(tx: Transaction, text: str) -> Principal | None:
-    """Return the principal of a pod's token, or None if the token is not one, is wrong, or its job does not exist."""
+    """Return the principal of a pod's token; None if the text is no such token, or if the job does not exist."""
     job_id = text.removeprefix(_POD).partition(".")[0]
     if not text.startswith(_POD) or not text.isascii():
         return None
@@ -47,7 +47,7 @@ def resolve_pod_token(tx: Transaction, text: str) -> Principal | None:
 
 
 def require_worker(caller: Principal, request: ClaimRequest) -> list[str]:
-    """Return the caller's `work` scopes, each for all projects or for one.
+    """Return the caller's scopes `work`; each of them is for all projects or for one project.
 
     Raises `ForbiddenProblem` if the caller has none, announces a label that its token does not allow, or is a pod that
     claims another job than its own.
@@ -63,7 +63,8 @@ def require_worker(caller: Principal, request: ClaimRequest) -> list[str]:
         return scopes
     if OWN_POD_LABEL in request.labels:
         raise ForbiddenProblem(
-            f"The worker announces the label {OWN_POD_LABEL!r}, which only a pod has that was started for one job.",
+            f"The worker announces the label {OWN_POD_LABEL!r}, which is reserved for pods that were started for one "
+            "job. Start the worker without this label.",
             code="label-not-allowed",
             context={"label": OWN_POD_LABEL},
         )

@@ -55,7 +55,7 @@ class Turn:
     """Time of the last claim of one of its jobs, or None if the project has no row in `queue_share`."""
 
     def rank(self) -> tuple[int, int, str]:
-        """Return what orders the turns: the least comes first."""
+        """Return the sort key of the turn; the turn with the smallest key comes first."""
         return self.running, self.served_us or 0, self.project_id
 
     @property
@@ -95,7 +95,7 @@ def _is_workable(project_id: ColumnElement[str], restriction: Restriction) -> Co
 
 
 def projects_with_queued_jobs() -> CTE:
-    """Return the ids of the projects with queued jobs, and one null.
+    """Return a query for the ids of the projects with queued jobs; the last row is null.
 
     Each step looks up the next id in the index, so the cost depends on the number of projects, not of jobs.
     """
@@ -194,17 +194,19 @@ _SERVE_UNLESS_LOCKED = Prepared(
     )
     .values(served_us=bindparam("at_us"))
 )
-"""As `_SERVE`, but if another claim serves the project at the same time, the time of that claim suffices.
+"""Statement that stores the time of a claim of jobs of a project, unless another claim has locked the project's row.
 
-So claims of jobs of the same project do not wait for one another.
+The other claim stores its own time, which is nearly the same. So claims of jobs of one project do not wait for each
+other.
 """
 
 
 def note_served(tx: Transaction, turns: Sequence[Turn], served: Iterable[Turn]) -> None:
-    """Record which projects a claim has served; `turns` are all projects that had jobs, with the numbers after it.
+    """Record which projects a claim has served; `turns` are all projects that had jobs, updated by the claim.
 
-    Each project gets a time of its own, so that of two projects in one claim, the one that was served last waits. If
-    only one project had jobs, it took no turn of another one, and nothing is recorded.
+    Each project gets another time, in the order of their ranks after the claim. The next claim serves projects with
+    equally many running jobs in this order. If only one project had jobs, nothing is recorded, because no other project
+    has waited.
     """
     if len(turns) < 2:
         return
