@@ -48,8 +48,7 @@ class _Summary:
 
     licences: Counter[str | None] = field(default_factory=Counter)
     jobs: Counter[tuple[str, tuple[str, ...]] | None] = field(default_factory=Counter)
-    """Number of clips, by kind and input commits of the job that made them; key None: clips that no job made.
-    """
+    """Number of clips, by kind and input commits of the job that made them; key None: clips that no job made."""
 
     def add(self, clip: ExportedClip) -> None:
         self.licences[clip.record.licence] += 1

@@ -188,7 +188,7 @@ def version_to_export(
 def _located(entry: Entry) -> _Located:
     if entry.item is None or entry.revision is None:
         raise CannotExport(
-            f"{entry.path}: the project has no revision with the content of this clip any more; restore the clip, or "
+            f"{entry.path}: the project no longer has the revision of this clip; restore the clip, or "
             "export a version without it"
         )
     return _Located(entry, entry.item, entry.revision)

@@ -100,7 +100,7 @@ def test_the_role_of_a_member_changes_only_on_request(team: Team, tmp_path: Path
         ),
         ("name\nada,lab\n", "more cells than the table has columns"),
         ("name\n\n\nada\nBen B\n", "row 5: name: "),
-        ("name,name\nada,eve\n", "has several columns 'name'"),
+        ("name,name\nada,eve\n", "has several columns named 'name'"),
     ],
 )
 def test_a_wrong_table_is_refused_with_its_row(tmp_path: Path, text: str, told: str) -> None:

@@ -180,11 +180,11 @@ def rotate_token(
 
 
 def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedelta) -> NewToken:
-    """Replace the token of `marey` by a successor, on the server and in the file that contains the token.
+    """Replace the token of the client `marey` by a successor, on the server and in the file that contains the token.
 
-    The id of the rotation is stored next to the token's file before the request is sent. If the program ends before it
-    has stored the successor, another call therefore gets the same successor. Raises `BadCredentialFile` if no file
-    contains the token.
+    The id of the rotation is stored next to the token's file before the request is sent. So if the program ends before
+    the successor is stored, the next call gets the same successor. Raises `BadCredentialFile` if no file contains the
+    token.
     """
     from marey_client.access import Tokens
     from marey_client.credentials import replace_token
