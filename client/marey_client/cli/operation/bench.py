@@ -21,7 +21,7 @@ bench = typer.Typer(
 )
 
 Rates = Annotated[str, typer.Option("--rate", help="Jobs submitted per second: one rate, or several with commas.")]
-Seconds = Annotated[float, typer.Option(help="Duration of the submissions of a run.")]
+Seconds = Annotated[float, typer.Option(help="Number of seconds during which a run submits jobs.")]
 Replicates = Annotated[
     int, typer.Option(help="Number of runs at each rate, from which the confidence intervals are computed.")
 ]
