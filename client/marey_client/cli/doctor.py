@@ -85,7 +85,7 @@ def doctor(
 
 
 def _check_scripts() -> list[Finding]:
-    """Return how far this machine confines scripts, if its workers run any."""
+    """Return the finding about the isolation of scripts; no finding unless workers of this machine run scripts."""
     from marey_client import embedded
     from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE
 

@@ -23,7 +23,7 @@ from marey_schemas.wording import counted
 
 NO_DIFFERENCE = "no difference"
 MOST_LINES = 20
-"""Greatest number of joints, segments or fields that are listed; the others are only counted."""
+"""Greatest number of joints, segments or fields that are listed; only the number of the others is printed."""
 MOST_SPANS = 3
 """Greatest number of time ranges that are listed for a joint."""
 LEAST_TURN_DEG = 0.05
@@ -43,7 +43,7 @@ def described(difference: Difference) -> Iterator[str]:
 
 
 def changes_in_words(difference: Difference) -> Iterator[str]:
-    """Yield one line of text for each change, or a single line that says that nothing differs."""
+    """Yield one line of text for each change, or the single line `no difference`."""
     lines = list(_changes(difference))
     yield from lines or [NO_DIFFERENCE]
 
