@@ -133,7 +133,7 @@ class Tokens:
         return pages(self.transport, Token, "/tokens", params)
 
     def create(self, token: TokenCreate) -> NewToken:
-        """Create a token; only this answer contains its secret."""
+        """Create a token. The result contains the secret of the token, which cannot be read later."""
         return self.transport.post(NewToken, "/tokens", token, repeatable=False)
 
     def rotate(self, rotation_id: str | None = None, *, grace: timedelta = timedelta(hours=1)) -> NewToken:

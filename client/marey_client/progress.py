@@ -1,4 +1,4 @@
-"""Progress of long work: functions that receive it, and a bar that shows it."""
+"""Progress of long work: functions that are called with the progress, and a progress bar."""
 
 from __future__ import annotations
 

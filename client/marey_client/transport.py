@@ -150,9 +150,9 @@ class Transport:
     ) -> httpx.Response:
         """Send a request, if necessary several times, and return the complete answer.
 
-        If `repeatable` is False, the request is not sent again after its connection broke. The default is False for
-        PUT, PATCH and DELETE with `If-Match`, and True otherwise; a POST then gets an idempotency key. To stream
-        `content`, give a function that returns a new iterable of bytes for each try.
+        If `repeatable` is False, the request is not sent again after its connection broke. By default, it is False for
+        PUT, PATCH and DELETE requests that have the header `If-Match`, and True for all others; then, POST requests get
+        an idempotency key. To stream `content`, give a function that returns a new iterable of bytes for each try.
 
         Raises `RequestFailed` if the server answers with an error, `Unreachable` if there is no answer.
         """

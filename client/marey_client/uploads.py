@@ -47,7 +47,7 @@ class UploadReport:
 
     @property
     def summary(self) -> str:
-        """The numbers of files by their outcomes, and the number of frames."""
+        """A text with the number of files for each outcome, such as created or failed, and the number of frames."""
         return outcomes_text(self.entries)
 
     def __str__(self) -> str:
@@ -77,7 +77,7 @@ def upload(project: ProjectItems, found: FoundFiles, options: ImportOptions, not
 
 
 def outcomes_text(entries: Sequence[ImportEntry]) -> str:
-    """Return the numbers of files by their outcomes, and the number of frames, as text."""
+    """Return a text with the number of files for each outcome, and the number of frames."""
     counts = Counter(map(_outcome, entries))
     changed = sum(entry.skeleton_changed for entry in entries)
     words = {one: f"{counts[one]} {one}" for one in OUTCOMES}

@@ -1,4 +1,4 @@
-"""Documents of a project, requested by the content digests of revisions, which are the same on every server."""
+"""Requests for documents of a project by content digest; equal content has the same digest on every server."""
 
 from __future__ import annotations
 

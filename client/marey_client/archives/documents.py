@@ -43,7 +43,7 @@ class EarlierDocument(NamedTuple):
 
 @dataclass
 class DocumentWriter:
-    """Writer of the documents of an archive, with everything to which they refer."""
+    """Writer of the documents of an archive, and of the revisions, arrays and files to which the documents refer."""
 
     transport: Transport
     project_url: str

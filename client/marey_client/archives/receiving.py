@@ -97,8 +97,8 @@ def require_receivable(commit: str, changed: int) -> None:
     if changed > MOST_RECEIVED_CHANGES:
         raise LargeCommit(
             f"the commit {commit} changes {changed:,} entries, but a commit that is imported, pushed or pulled may "
-            f"change at most {MOST_RECEIVED_CHANGES:,}. It can be archived and extracted. To copy the dataset, commit "
-            "its entries to another dataset in several steps, and copy that dataset"
+            f"change at most {MOST_RECEIVED_CHANGES:,}. The commit can be archived and extracted. To copy the dataset, "
+            "commit its entries to another dataset in several steps, and copy that dataset"
         )
 
 

@@ -63,7 +63,7 @@ class ReturningFolder:
 
     @cached_property
     def clips(self) -> Mapping[str, ExportedClip]:
-        """The clips by the names under which their files are imported."""
+        """The exported clips that have a file, by the name under which the file is imported."""
         return {self.name_of(file): clip for file, clip in self._by_file.items()}
 
     def name_of(self, file: str) -> str:

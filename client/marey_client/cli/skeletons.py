@@ -111,10 +111,11 @@ def merge(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be merged, and change nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Merge skeletons of one rig, such as those of takes that an earlier version gave a skeleton each.
+    """Merge skeletons of one rig, for example if an earlier version created a skeleton for each take.
 
-    Skeletons are one rig if they differ only in the offset of the root, in offsets that the motions replace, or by
-    rounding. Clips and models get a new revision with the kept skeleton and the same motion; the others are deleted.
+    Skeletons are of one rig if they differ only in the offset of the root, in offsets that the motions replace, or by
+    rounding. Clips and models get a new revision with the remaining skeleton and the same motion; the other skeletons
+    are deleted.
     """
     from marey_schemas.kinds import Kind
 

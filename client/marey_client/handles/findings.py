@@ -23,7 +23,7 @@ FILES = ("document", "report", "maps", "figures", "fitted", "table")
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of one job; `job.result` holds their counts."""
+    """Findings of one job: its results, with the files that some kinds of jobs also make."""
 
     transport: Transport
     job: Job
@@ -70,7 +70,7 @@ class Findings:
 
 @dataclass(frozen=True)
 class Quality(Findings):
-    """Quality of clips, with totals, beside that of a reference if there is one."""
+    """Quality of clips: numbers for each clip, totals, and the same for reference clips if some were given."""
 
     @property
     def conditions(self) -> QualityConditions:

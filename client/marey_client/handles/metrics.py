@@ -1,4 +1,4 @@
-"""Perceptual metrics, and the distances of clips that they give."""
+"""Perceptual metrics, and distances of clips measured by a perceptual metric."""
 
 from __future__ import annotations
 

@@ -154,5 +154,8 @@ def read_samples(text: str) -> dict[str, float]:
         (f"{name}{{{labels}}}" if labels else name): float(value) for name, labels, value in _SAMPLE.findall(text)
     }
     if not samples:
-        raise MareyError("the server's answer to GET /metrics contains no metrics; is something between it and you?")
+        raise MareyError(
+            "the server's answer to GET /metrics contains no metrics; check whether a proxy answers instead of the "
+            "server"
+        )
     return samples

@@ -1,4 +1,4 @@
-"""Handles of items with poses: what people ask of a clip in a script or a notebook."""
+"""Handles of items with poses: positions, velocities, contacts, tables and pictures of a clip."""
 
 from __future__ import annotations
 

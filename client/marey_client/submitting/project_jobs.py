@@ -1,4 +1,4 @@
-"""Jobs of a project: methods that submit them, and handles of what they made."""
+"""Jobs of a project: methods that submit jobs, and handles of the items that the jobs created."""
 
 from __future__ import annotations
 

@@ -276,7 +276,8 @@ def link_user(
     context: typer.Context,
     name: UserName,
     subject: Annotated[
-        str, typer.Argument(help="Id of the person at the identity provider; the refused sign-in shows it.")
+        str,
+        typer.Argument(help="Id of the person at the identity provider; the message of a refused sign-in shows the id."),
     ],
     issuer: Annotated[
         str | None, typer.Option(help="Address of the identity provider; default: the provider of the server.")

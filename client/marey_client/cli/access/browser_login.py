@@ -86,8 +86,8 @@ class _Handler(BaseHTTPRequestHandler):
 def sign_in_in_browser(marey: Marey, expires_in_s: int, *, paste: bool) -> str:
     """Let a person sign in in a browser, and return the new token.
 
-    With `paste`, the browser may run on another machine: it shows a code, for which this command asks. Otherwise, the
-    browser brings the code to a port of this machine.
+    With `paste`, the browser may run on another machine: the browser shows a code, and this command asks the user for
+    the code. Otherwise, the browser sends the code to a port of this machine.
     """
     from marey_schemas.sign_ins import BrowserSignInCode, BrowserSignInCreate
 

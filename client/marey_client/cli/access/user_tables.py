@@ -184,7 +184,7 @@ def _row(line: int, row: Mapping[str, str]) -> _Row:
 
     administrator = row.get("administrator", "").lower()
     if administrator not in (*YES, *NO):
-        raise WrongUsage(f"administrator: {administrator!r} is neither yes nor no")
+        raise WrongUsage(f"administrator: {administrator!r} must be yes or no")
     project, role = row.get("project") or None, row.get("role") or None
     if (project is None) != (role is None):
         raise WrongUsage("give both a project and a role, or neither")

@@ -17,7 +17,7 @@ MOST_PROJECTS_OF_JOBS = 20
 
 
 class Suggestion(NamedTuple):
-    """Text that replaces what was typed, and a remark that some shells show beside it."""
+    """Text that replaces the typed word, and a remark that some shells show beside the text."""
 
     text: str
     remark: str = ""

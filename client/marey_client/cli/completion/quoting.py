@@ -15,7 +15,7 @@ _EXPANDS = "$`"
 
 
 class Mark(NamedTuple):
-    """Character of a line, and how a POSIX shell reads it."""
+    """Character of a command line, and the meaning that a POSIX shell gives to the character."""
 
     place: int
     typed: str

@@ -10,7 +10,7 @@ from marey_client.cli.completion.found import Suggestion
 from marey_client.cli.completion.quoting import for_bash, for_powershell, marks
 
 VARIABLE = "_MAREY_COMPLETE"
-"""Environment variable by which a shell asks for completion: `complete_` and the name of the shell."""
+"""Environment variable that requests completion; the value is `complete_` followed by the name of the shell."""
 LINE = "_TYPER_COMPLETE_ARGS"
 """Environment variable that contains the command line up to the cursor, as typed."""
 REPLACED = "_MAREY_REPLACED"
@@ -83,7 +83,7 @@ end
 complete --command marey --no-files --keep-order --arguments '(__marey_completion)'
 """
 SCRIPTS = {"bash": _BASH.lstrip(), "zsh": _ZSH.lstrip(), "fish": _FISH.lstrip()}
-"""Script by the name of its shell."""
+"""Completion script of each shell, by the shell's name."""
 
 POWERSHELLS = ("powershell", "pwsh")
 

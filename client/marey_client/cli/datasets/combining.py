@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from marey_schemas.datasets.merges import EntryConflict, MergeAnswer, Resolution, Side
 
 CONFLICT = "PATH:KIND[/PART]"
-"""Form in which the options name a conflict, or one of its parts."""
+"""Form of the values of --ours, --theirs and --base, which name an entry with a conflict, or one part of the entry."""
 
 Into = Annotated[str, typer.Option(help="Branch that gets the changes.")]
 CommitMessage = Annotated[str, typer.Option("--message", "-m", help="Message of the commit.")]

@@ -1,4 +1,4 @@
-"""Command `capacity`, which computes what an amount of work needs."""
+"""Command `capacity`, which computes how busy an amount of work keeps workers, servers and database."""
 
 from __future__ import annotations
 

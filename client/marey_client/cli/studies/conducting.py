@@ -103,7 +103,7 @@ def invite(
     ] = 30,
     as_json: AsJson = False,
 ) -> None:
-    """Create links, each for one participant without an account, and print them; they are never shown again."""
+    """Create links, each for one participant without an account, and print the links, which are never shown again."""
     from marey_schemas.studies.participation import LINK_PATH
 
     with connect(context) as marey:
