@@ -100,7 +100,7 @@ def _attempt(scratch: Scratch, job: str, name: str, draw: random.Random) -> Chao
             HOSTILE_CASES[name](HostileAttempt(scratch, caller, job, draw))
         except MareyError as error:
             return ChaosFinding(name, str(error), "")
-    return ChaosFinding(name, "", "answered as it must be")
+    return ChaosFinding(name, "", "the server answered correctly")
 
 
 def _await_results(

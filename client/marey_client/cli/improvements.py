@@ -168,7 +168,7 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
          f"{redundant['tried']} of {redundant['needed']} used clips were tried", redundant["plan"]),
         (f"{counted(len(document['near_duplicates']['pairs']), 'pair')} of clips with nearly the same motion, within "
          f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
-        (f"{counted(len(document['fillings']), 'clip')} would fill holes", document["fillings"]),
+        (f"{counted(len(document['fillings']), 'clip')} would fill gaps in the coverage", document["fillings"]),
         ("Order in which to add clips", document["additions"]),
     )  # fmt: skip
     _print_sections(sections, unused)
@@ -188,7 +188,7 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
             f"{one['folder']}: {counted(one['clips'], 'clip')} cannot be matched: {one['detail']} ({one['code']})"
         )
     if not any(entries for _, entries in sections):
-        typer.echo("No clip was found that can be removed or that would fill a hole.")
+        typer.echo("No clip was found that can be removed, or that would fill a gap in the coverage.")
 
 
 def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unused: Mapping[str, Any]) -> None:
@@ -247,7 +247,7 @@ def _print_steps(document: Mapping[str, Any]) -> None:
     typer.echo(reasons[document["ended"]])
     if document["total"] is not None:
         change = _change(document["total"]["objective"])
-        typer.echo(f"All steps together change the objective by {change} m, in replicates that had no part in them.")
+        typer.echo(f"All steps together change the objective by {change} m, in replicates not used to choose them.")
 
 
 def _confirmed(effect: Mapping[str, Any] | None) -> str:

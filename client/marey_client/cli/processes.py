@@ -197,8 +197,8 @@ def upgrade_database(
         bool,
         typer.Option(
             "--finish",
-            help="Also remove tables and columns that only earlier versions use; no server of an earlier version may "
-            "run.",
+            help="Also remove the parts of the schema that only earlier versions use; no server of an earlier version "
+            "may run.",
         ),
     ] = False,
     data: DataFolder = None,

@@ -277,7 +277,7 @@ def link_user(
     name: UserName,
     subject: Annotated[
         str,
-        typer.Argument(help="Id of the person at the identity provider; the message of a refused sign-in shows the id."),
+        typer.Argument(help="Id of the person at the identity provider; the message of a refused sign-in shows it."),
     ],
     issuer: Annotated[
         str | None, typer.Option(help="Address of the identity provider; default: the provider of the server.")

@@ -135,7 +135,7 @@ def _unmatched(motion: MotionDifference) -> Iterator[str]:
         if run.change == "removed" and following is not None and following.change == "inserted":
             where = _time(*following.after, motion.frame_rate_hz[1])
             old, new = run.before[1] - run.before[0], following.after[1] - following.after[0]
-            yield f"replaced: {counted(old, 'frame')} by {new:,} that correspond to none, {where}"
+            yield f"replaced: {counted(old, 'frame')} by {new:,} new ones, {where}"
             following = next(runs)
         elif run.change != "matched":
             yield _run(run, motion)
