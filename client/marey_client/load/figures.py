@@ -42,9 +42,9 @@ class Estimate:
 
 
 def percentile(values: Iterable[float], percent: float) -> float:
-    """Return the percentile by the nearest-rank method: the smallest value with `percent` % of all values at or below.
+    """Return a percentile by the nearest-rank method; NaN without values.
 
-    Returns NaN without values.
+    The result is the smallest of the values for which at least `percent` % of the values are not greater.
     """
     ordered = sorted(values)
     return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)] if ordered else math.nan
