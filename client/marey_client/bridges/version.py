@@ -122,7 +122,9 @@ class VersionToExport:
         request = ContentsRequest(revisions=(content,))
         (found,) = request_contents(self.dataset.transport, self.dataset.project_url, request)["revisions"]
         if found is None:
-            raise CannotExport(f"the project has no revision with the content {content} any more; restore the item")
+            raise CannotExport(
+                f"the project no longer has the revision with the content digest {content}; restore its item"
+            )
         parts: Mapping[str, str] = found["parts"]
         return parts
 

@@ -1,4 +1,4 @@
-"""Attempts of the test that break the rules of workers: lost answers, repetitions, stale fences and wrong clocks."""
+"""Attempts that violate the protocol of workers: lost answers, repetitions, stale fences and wrong clocks."""
 
 from __future__ import annotations
 

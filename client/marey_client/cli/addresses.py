@@ -143,7 +143,7 @@ class Thing(Protocol):
         """Return the number of items that `delete` removes."""
 
     def move(self, folder: str, name: str) -> Collection | Item:
-        """Move to a folder and rename; return the moved folder or item."""
+        """Move the folder or item to another folder, under a new name; return the moved folder or item."""
 
     def delete(self) -> None:
         """Delete the item, or the folder with its contents; `restore` restores what was deleted."""

@@ -166,8 +166,8 @@ def _is_folder(project: ProjectHandle, address: Address) -> bool:
     items = project.purge(path=address.path, preview=True)
     if items.purged or items.refused:
         raise WrongUsage(
-            f"{address} is a folder and a removed item; write {address}/ for all items removed from the folder, or the "
-            "id of the item"
+            f"{address} names both a folder and a removed item; write {address}/ for all items removed from the "
+            "folder, or the id of the item"
         )
     return True
 

@@ -69,7 +69,7 @@ class _RecordedClips:
 
 
 def _moved(skeleton: Any, poses: Floats, positions: Floats, headings: Floats) -> NDArray[np.float32]:
-    """Turn poses (T, 3 + 4 joints) about the vertical to headings (T,), and put the pelvis at positions (T, 2)."""
+    """Turn poses (T, 3 + 4·joints) to headings (T,) in radians, and move the pelvis to x and z (T, 2) in metres."""
     kinematics = room("marey_motion.kinematics", FIGURES_EXTRA)
     quaternions = room("marey_motion.quaternions", FIGURES_EXTRA)
     body = room("marey_reports.drawing.stick_figures", FIGURES_EXTRA).body_of(skeleton)

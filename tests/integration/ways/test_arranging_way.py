@@ -261,7 +261,7 @@ def test_of_a_folder_and_a_removed_item_of_one_name_the_address_says_which(run: 
     run("mv", "lab/raw/b", "lab/raw/a/")
     run("rm", f"lab/{item}")
     run("rm", "lab/raw/a/b")
-    assert "lab/raw/a is a folder and a removed item" in run("purge", "lab/raw/a", "--yes", status=2).stderr
+    assert "lab/raw/a names both a folder and a removed item" in run("purge", "lab/raw/a", "--yes", status=2).stderr
     assert "1 item purged" in run("purge", "lab/raw/a/", "--yes").stderr
     assert "1 item purged" in run("purge", f"lab/{item}", "--yes").stderr
     assert "is the id of a folder" in run("purge", f"lab/collection_{item.partition('_')[2]}", status=2).stderr

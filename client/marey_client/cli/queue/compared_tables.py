@@ -18,7 +18,7 @@ FORMULA_SIGNS = tuple("=+-@\t\r")
 
 
 class RunTable(NamedTuple):
-    """Table of exact values, with the columns of numbers, and the cells (row, column) of the best values."""
+    """Table of exact values; `numeric` are the headings of columns of numbers, `best` the best cells (row, column)."""
 
     heads: tuple[str, ...]
     rows: list[list[Value | None]]
@@ -33,7 +33,7 @@ class RunTable(NamedTuple):
         ]
 
     def csv(self) -> str:
-        """Return the table as CSV with exact numbers; texts that would be formulas begin with an apostrophe."""
+        """Return the table as CSV with exact numbers; an apostrophe is put before texts that look like formulas."""
         buffer = io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
         writer.writerow(map(_safe, self.heads))
