@@ -93,7 +93,5 @@ def frames_text(frames: slice | None) -> str | None:
         )
     bounds: tuple[Any, Any] = (frames.start, frames.stop)
     if any(bound is not None and bound < 0 for bound in bounds):
-        raise BadArgument(
-            "frames: negative bounds are not possible; count frames from the start of the clip, from 0"
-        )
+        raise BadArgument("frames: negative bounds are not possible; count frames from the start of the clip, from 0")
     return ":".join("" if bound is None else str(bound) for bound in bounds)
