@@ -42,7 +42,7 @@ Q = TypeVar("Q", bound=QuotasInUse)
 
 
 def change_quotas(transport: Transport, path: str, change: QuotaChange, answer: type[Q]) -> Q:
-    """Change quotas of the project or user at `path`; return all its quotas, and how much of each is used."""
+    """Change quotas of the project or user at `path`; return all quotas at `path`, each with the amount in use."""
     return read_model(answer, transport.send("PATCH", path, content=as_json(change), repeatable=True))
 
 
@@ -88,7 +88,7 @@ class Users:
         return self.transport.post(Identity, f"/users/{name}/identities", identity, repeatable=True)
 
     def unlink(self, name: str, identity_id: str) -> None:
-        """End the link of a person with a user, and all sign-ins of the user."""
+        """Remove the link between a person at an identity provider and a user, and end all sign-ins of the user."""
         self.transport.send("DELETE", f"/users/{name}/identities/{identity_id}", repeatable=False)
 
     def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
@@ -133,7 +133,7 @@ class Tokens:
         return pages(self.transport, Token, "/tokens", params)
 
     def create(self, token: TokenCreate) -> NewToken:
-        """Create a token; only this answer contains its secret."""
+        """Create a token. The result contains the secret of the token, which cannot be read later."""
         return self.transport.post(NewToken, "/tokens", token, repeatable=False)
 
     def rotate(self, rotation_id: str | None = None, *, grace: timedelta = timedelta(hours=1)) -> NewToken:
@@ -182,7 +182,7 @@ class Members:
 
     @property
     def in_folders(self) -> FolderRoles:
-        """The roles that members have in folders instead of their roles in the project."""
+        """The roles of members in folders, which apply there instead of the roles in the project."""
         return FolderRoles(self.transport, self.project)
 
     def remove(self, user: str) -> None:

@@ -1,4 +1,4 @@
-"""Check of what callers of this package pass: an invalid value is an error of this package, which names the value."""
+"""Validation of arguments: an invalid value raises `BadArgument`, which names the argument."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def checked(model: type[Model], values: Mapping[str, Any] | None = None, /, **more: Any) -> Model:
-    """Return a model made of values that a caller gave. Raises `BadArgument`, which names the first invalid value."""
+    """Return a model with the given field values. Raises `BadArgument`, which names the first invalid field."""
     try:
         return model.model_validate({**(values or {}), **more})
     except ValidationError as error:

@@ -95,7 +95,7 @@ class Blobs:
         return target
 
     def fetch_into(self, digest: str, file: BufferedRandom) -> None:
-        """Download a blob into an empty file that is open for reading and writing; its position is then the end."""
+        """Download a blob into an empty file that is open for reading and writing; leave the position at its end."""
 
         def once() -> None:
             start = file.tell()

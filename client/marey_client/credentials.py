@@ -37,14 +37,14 @@ _PLAIN_ADDRESS = re.compile(
     r"https?://(127\.0\.0\.1|(?![0-9.]+[:/]|[0-9.]+$)[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?)(:[1-9][0-9]{0,3})?"
     r"(/[A-Za-z0-9._/-]*)?"
 )
-"""Addresses with the name of a host, or with the usual number of this machine."""
+"""Pattern of addresses that need no further check: with a host name, or with 127.0.0.1."""
 
 
 class TokenFile:
     """File that contains a token; the file is read again whenever it has changed.
 
-    A program therefore continues to work after its token was rotated. If the changed file cannot be read or contains no
-    token, the last token that was read stays in use.
+    A program therefore continues to work after its token was rotated. If the changed file cannot be read, or contains
+    no token, the token that was read last stays in use.
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,7 +79,7 @@ def trusted_authorities() -> ssl.SSLContext:
 
 
 class BearerToken:
-    """Function for httpx that adds the token to requests; the token is not shown elsewhere, for example in logs."""
+    """Function for httpx that adds the token to requests; the `repr` of the function does not show the token."""
 
     def __init__(self, token: str | TokenFile) -> None:
         self._source = token if isinstance(token, TokenFile) else as_token(token)
@@ -199,11 +199,11 @@ def read_secret(path: Path) -> str:
 
 
 def _forbidden_rights(path: Path) -> int:
-    """Return the rights that a token file must not give.
+    """Return the mode bits that a token file must not have: access for group and others.
 
-    systemd gives a service read access to its credentials by an access control list. Its mask appears as the group's
-    right to read, although the group has no access.
-    In a pod, Kubernetes gives it by a group that no other process has; the manifest of the pod sets the variable.
+    Files in the folder `CREDENTIALS_DIRECTORY` may be readable by the group. systemd gives a service read access to its
+    credentials by an access control list, whose mask appears in the mode as read access of the group. In a pod,
+    Kubernetes gives read access to a group that no other process has; the manifest of the pod sets the variable.
     """
     credentials = os.environ.get("CREDENTIALS_DIRECTORY")
     return 0o037 if credentials and path.absolute().parent == Path(credentials) else 0o077

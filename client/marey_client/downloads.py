@@ -56,7 +56,7 @@ def safe_file_name(name: str) -> str:
 
 
 class TakenPaths:
-    """Paths of the files of one download; of two files with the same name, the later one gets a number."""
+    """Paths of the files of one download; if two files have the same name, a number is added to the later name."""
 
     def __init__(self) -> None:
         self._taken: set[str] = set()
@@ -106,7 +106,7 @@ def download(
 
 
 def download_to(transport: Transport, path: str, target: Path, *, params: Params | None = None) -> None:
-    """Download a file to `target`, whatever name the server has for it; an existing file is replaced."""
+    """Download a file to the path `target`, ignoring the file name that the server sends; replace an existing file."""
 
     def once() -> None:
         with transport.stream(path, params=params) as response:

@@ -1,6 +1,6 @@
 """Access to the server, worker and motion packages for the commands that need them, such as `serve` and `worker`.
 
-They are imported only when such a command runs, so that the client can be installed alone.
+These packages are imported only when such a command runs, so that the client can be installed alone.
 """
 
 from __future__ import annotations
@@ -44,13 +44,16 @@ def examine(*, data: Path | None, database_url: str | None) -> list[tuple[str, s
 
 
 def examine_scripts() -> tuple[str, str, str]:
-    """Check how far this machine confines scripts; return the name of the check, its state and a detail."""
+    """Check which limits and isolation this machine can enforce on scripts; return check, state and detail as texts."""
     found: tuple[str, str, str] = room("marey_worker.kinds.script", "worker").examine()
     return found
 
 
 def compute_capacity(**amounts: Any) -> dict[str, Any]:
-    """Return what an amount of work needs, and the measured costs from which this is computed."""
+    """Return the needed and available time of workers, servers and database, and the measured costs of the computation.
+
+    `amounts` are the options of `marey capacity`.
+    """
     answers = room("marey_server.capacity.answers", "server")
     try:
         found: dict[str, Any] = answers.capacity(**amounts)
@@ -64,7 +67,7 @@ def predict_jobs(
 ) -> dict[int, float]:
     """Return the jobs per second that a simulation of the queue predicts for each number of workers.
 
-    `known` is one other number of workers and its measured jobs per second.
+    `known` is a number of workers whose jobs per second were measured, and this measured value.
     """
     answers = room("marey_server.capacity.answers", "server")
     try:

@@ -23,7 +23,7 @@ class Unreachable(MareyError):
 
 
 class UnexpectedAnswer(MareyError):
-    """The answer does not come from a Marey server."""
+    """An answer of the server is not valid, or lacks requested data; the text gives the reason."""
 
 
 # What happened on this machine
@@ -67,7 +67,7 @@ class EarlierVersionsMissing(MareyError):
 
 
 class DifferencesRefused(MareyError):
-    """A server refused revisions whose arrays were sent as differences; perhaps it accepts whole arrays."""
+    """A server refused revisions whose arrays were sent as differences; the server may accept whole arrays."""
 
 
 class LargeCommit(MareyError):

@@ -26,7 +26,7 @@ def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> li
 
 
 def _limit_of(marey: Marey, job: Job) -> RunningJobs | None:
-    """Return how many jobs of the project run, and the limit; None if unknown, or if the job is not queued."""
+    """Return the number and the limit of running jobs in the project; None if unknown or if the job is not queued."""
     if job.state is not JobState.QUEUED:
         return None
     try:

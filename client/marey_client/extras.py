@@ -1,6 +1,6 @@
 """Access to packages that only some functions need: other packages of Marey, and libraries for tables and pictures.
 
-They are imported only when such a function is called, so that the client can be installed alone.
+The packages are imported only when such a function is called, so that the client can be installed alone.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 OTHER_MOTION = (
     ".fbx", ".trc", ".htr", ".mvnx", ".vmd", ".vrma", ".dae", ".glb", ".gltf", ".usd", ".usda", ".usdc",
 )  # fmt: skip
-"""Endings of files that contain motion, but that Marey does not read."""
+"""Endings of files that contain motion in formats that Marey does not read."""
 FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20
 UPLOADS_AT_ONCE = 8
@@ -63,9 +63,9 @@ class FoundFiles:
 
     files: tuple[LocalFile, ...]
     left_out: tuple[Path, ...]
-    """Files that no reader reads, and hidden motion files."""
+    """Files in formats that Marey does not read, hidden motion files, broken links, and skipped folders with motion."""
     exported: Mapping[str, ExportedClip] = field(default_factory=dict)
-    """Clips whose files an export of a dataset wrote, by the names of the files."""
+    """Description of each clip whose file an export of a dataset wrote, by the name of the file."""
     unit: LengthUnit | None = None
     """Unit of length of the files; known if all files come from one export, otherwise None."""
     changed_tables: tuple[Path, ...] = ()
@@ -73,7 +73,7 @@ class FoundFiles:
 
     @property
     def motions_left_out(self) -> tuple[Path, ...]:
-        """Files among those left out that contain motion, by their endings, and folders that contain such files."""
+        """Left-out files whose endings are those of motion files, and left-out folders, which contain such files."""
         return tuple(path for path in self.left_out if _is_motion(path.name) or path.is_dir())
 
 
@@ -121,9 +121,10 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
 
 
 def _files_below(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files in a folder and below, sorted, and what is left out although it seems to contain motion.
+    """Return the files in a folder and its subfolders, sorted, and the paths that are left out, sorted.
 
-    Left out are hidden files, links that lead nowhere, and hidden or linked folders; not the notes of macOS.
+    Left out are hidden motion files, broken links to motion files, and hidden or linked folders that contain motion
+    files. Files of macOS whose names begin with `._` are ignored.
     """
     found: list[Path] = []
     left_out: list[Path] = []
@@ -145,7 +146,7 @@ def _is_motion(name: str) -> bool:
 
 
 def _has_motion(folder: Path) -> bool:
-    """Return whether a folder, or a folder below it, contains a file that seems to be motion."""
+    """Return whether a folder or one of its subfolders contains a file with the ending of a motion file."""
     return any(_is_motion(name) for _, _, names in os.walk(folder) for name in names)
 
 

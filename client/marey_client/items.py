@@ -169,8 +169,8 @@ class ItemHandle:
 
         If several items are exported with the same `beside`, files of the same name get numbers. If the consent for a
         clip has ended, raises `Conflict`, unless `allow_expired_consent` gives a reason to export the clip
-        nevertheless. The server records the reason; the caller must be a maintainer or owner. `fold_positions` gives
-        positions to the root of a BVH file alone, for programs that ignore those of other joints.
+        nevertheless. The server records the reason; the caller must be a maintainer or owner. With `fold_positions`, a
+        BVH file has positions only for its root joint, for programs that ignore positions of other joints.
         """
         if fold_positions:
             options |= {"fold_positions": "true"}
@@ -248,7 +248,7 @@ class Items(Generic[Handle]):
         return Selection(self, folder, query)
 
     def to_dataframe(self) -> Any:
-        """Return the facts that lists show about the items as a pandas table, with one row for each item.
+        """Return a pandas table with one row for each item: path, revision, summary and facets; the index is the id.
 
         Raises `MissingPackage` if pandas is not installed.
         """
@@ -348,5 +348,5 @@ class Selection(Generic[Handle]):
         return self.items.count(collection=self.folder, filters={"query": self.query})
 
     def to_dataframe(self) -> Any:
-        """Return the facts that lists show about the items as a pandas table; see `Items.to_dataframe`."""
+        """Return a pandas table with one row for each item; see `Items.to_dataframe`."""
         return summary_table(self)

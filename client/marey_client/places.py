@@ -24,7 +24,8 @@ Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
 def resolved(items: Items[Handle], places: Places[Handle]) -> list[ExistingInput | Handle]:
     """Look up the texts among `places`: folders and items by their paths, and items by their ids.
 
-    A path of a folder and an item means the folder. Raises `NoSuchPath`, which names the nearest path.
+    If a folder and an item have the same path, the result is the folder. Raises `NoSuchPath`, which names the nearest
+    path, if there is neither.
     """
     return [_looked_up(items, place) if isinstance(place, str) else place for place in _as_list(places)]
 

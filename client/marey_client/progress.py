@@ -1,4 +1,4 @@
-"""Progress of long work: functions that receive it, and a bar that shows it."""
+"""Progress of long work: functions that are called with the progress, and a progress bar."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ OnProgress = Callable[[str, int, int | None], None]
 """Function called with the current activity, the amount done, and the total amount if it is known."""
 
 Advance = Callable[[str, float, float | None], None]
-"""The same, for amounts that need not be whole numbers."""
+"""Function called with the current activity, the amount done, and the total amount if known, all of them floats."""
 
 
 def ignore_progress(_doing: str, _done: float, _of: float | None) -> None:
-    """Ignore a report of progress."""
+    """Do nothing; used in place of a function that shows progress."""
 
 
 def is_shown(shown: bool | None) -> bool:
@@ -28,7 +28,7 @@ def is_shown(shown: bool | None) -> bool:
 
 @contextmanager
 def progress(shown: bool | None = None) -> Iterator[Advance]:
-    """Show a progress bar during the `with` block if `is_shown(shown)`; yield a function that updates it."""
+    """Show a progress bar during the `with` block if `is_shown(shown)`; yield a function that updates the bar."""
     if not is_shown(shown):
         yield ignore_progress
         return

@@ -77,7 +77,7 @@ class ProjectHandle(JobSubmission):
         return self.transport.post(Project, f"{self.url}/restore")
 
     def browser_link(self) -> BrowserLink:
-        """Create a code that signs one browser in, once, to read the project; append it to an address after `#`."""
+        """Create a code that signs one browser in, once, to read the project; append `#` and the code to an address."""
         return self.transport.post(BrowserLink, f"{self.url}/browser-links", repeatable=False)
 
     # -- what it holds -------------------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ class ProjectHandle(JobSubmission):
     def upload(
         self, places: str | Path | Iterable[str | Path], *, shown: bool | None = None, **options: Unpack[ImportKeywords]
     ) -> UploadReport:
-        """Import the motion files in folders and below; return a report on each file. A refused file stops no other.
+        """Import the motion files in folders and subfolders; return a report. Refused files do not affect the others.
 
         `options` are those of `ImportOptions`, for example `collection="raw"`. A progress bar is shown on terminals and
         in notebooks; `shown` overrides this. Uploading the same files again changes nothing. Raises the errors of

@@ -108,11 +108,11 @@ class ProjectItems:
         metric: Metric | None = None,
         **options: Unpack[SimilarKeywords],
     ) -> SimilarAnswer:
-        """Find the moments of the project's clips that resemble a pose, or a window of frames, of a clip.
+        """Find the moments of the project's clips that resemble a pose or a window of frames in a clip.
 
-        `clip` is a handle, a path or an id, `frames` one frame or a half-open range. `metric` is the id or the
-        handle of a stored metric, or the name of a built-in one. `options` are the others of `SimilarOptions`. The
-        project needs an index of motions, which `ProjectHandle.index` builds.
+        `clip` is a handle, a path or an id; `frames` is one frame, or a half-open range of frames. `metric` is the id
+        or the handle of a stored metric, or the name of a built-in metric. `options` are the other fields of
+        `SimilarOptions`. The project needs an index of motions, which `ProjectHandle.index` builds.
         """
         clip = self.clips[clip] if isinstance(clip, str) else clip
         first, end = (frames, frames + 1) if isinstance(frames, int) else frames
@@ -163,8 +163,8 @@ class ProjectItems:
     def purge_dataset(self, name: str, *, preview: bool = False) -> DatasetPurgeAnswer:
         """Delete a deleted dataset for good: versions, branches, tags and proposals. For owners of the project.
 
-        `name` is the name or the id of the dataset. With `preview`, nothing changes, and the answer says what cites the
-        versions. Raises `Conflict` if something cites a version.
+        `name` is the name or the id of the dataset. With `preview`, nothing changes, and the answer lists the objects
+        that refer to the versions. Raises `Conflict` if an object refers to a version.
         """
         request = checked(DatasetPurgeRequest, dataset=name, preview=preview)
         return self.transport.post(DatasetPurgeAnswer, f"/projects/{self.name}/dataset-purges", request)
@@ -172,7 +172,7 @@ class ProjectItems:
     def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
         """Return the skeletons of `clips` whose joint mapping may have been edited: those with several revisions.
 
-        Deleted skeletons are left out: their clips use the mapping of the revision that they name.
+        Deleted skeletons are left out: clips use the mapping of the revision of a deleted skeleton that they refer to.
         """
         edited = []
         for used in sorted({str(clip.summary["skeleton"]) for clip in clips}):

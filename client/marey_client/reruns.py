@@ -14,13 +14,14 @@ from marey_schemas.queue.job_kinds import job_kinds
 from marey_schemas.queue.jobs import ItemInput, Job, JobCreate, JobKind, JobOutput, JobState
 
 RERUNS = "reruns"
-"""Folder that receives repeated results; each job has a subfolder, named by its id."""
+"""Folder that receives the results of repetitions, in one subfolder for each repeated job, named by the job's id."""
 
 Agreement = Literal["identical", "other bytes", "missing", "deleted"]
 """Comparison of an output with its repetition.
 
-`missing`: only one of the jobs has this output; `deleted`: one of the two items was deleted, so that they cannot be
-compared. An output that refers to another output of its job has other bytes, because the ids differ.
+identical: both have the same bytes; other bytes: the bytes differ; missing: only one of the two jobs has this output;
+deleted: one of the two items was deleted, so the outputs cannot be compared. An output that refers to another output of
+its job always has other bytes, because the ids differ.
 """
 
 
@@ -30,7 +31,7 @@ class CannotRerun(ValueError):
 
 @dataclass(frozen=True)
 class ComparedOutput:
-    """Output of a job (`first`) and the same output of its repetition (`second`); None if a job lacks the output."""
+    """Output of a job (`first`), and the output of the same name of its repetition (`second`); None if missing."""
 
     name: str
     agreement: Agreement
@@ -43,8 +44,8 @@ class ComparedOutput:
 def rerun_request(job: Job, kind: JobKind, tasks: Iterable[Job] = (), *, into: str | None = None) -> JobCreate:
     """Return the request that repeats a job with the same revisions, parameters and seed, without cached results.
 
-    `tasks` are the tasks of the job. If an input was distributed over the tasks, only the records of the tasks name the
-    items of this input. The results are stored in the folder `into`, by default `reruns/` and the id of the job. Raises
+    `tasks` are the tasks of the job; if an input was distributed over tasks, the items of the input are read from their
+    records. The results are stored in the folder `into`, by default `reruns/ID` with the id of the job. Raises
     `CannotRerun` for a job that has not succeeded, for a task of another job, and for a job that wrote new revisions of
     its inputs.
     """

@@ -15,10 +15,10 @@ NEVER_ARRIVED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 """Failures after which the server cannot have seen the request."""
 
 TRIES_IN_SILENCE = 3
-"""Number of tries after which waits are reported; the waits before take less than two seconds together."""
+"""Number of failed tries from which on each wait is reported; the earlier waits take less than two seconds in total."""
 
 BUSY_STATUSES = frozenset({429, 502, 503, 504})
-"""HTTP statuses that mean "not now": the server has done nothing."""
+"""HTTP statuses by which a server refuses a request temporarily, without having processed it."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Retries:
     first_s : longest wait before the second try, in seconds; the wait doubles with each further try
     longest_s : limit of the doubled wait, in seconds
     total_s : longest time between the first try and the start of the last one, in seconds
-    notice : called with a text before the waits after the second try
-    sleep, random_unit : replaceable in tests; `random_unit` draws from [0, 1)
+    notice : function that is called with a text before each wait from the third failed try on
+    sleep, random_unit : replaceable in tests; `random_unit` returns a random number in [0, 1)
     """
 
     tries: int = 10
@@ -44,12 +44,12 @@ class Retries:
     random_unit: Callable[[], float] = field(default=random.random, repr=False)
 
     def delay_s(self, tried: int, retry_after_s: float | None) -> float:
-        """Return how many seconds to wait after `tried` tries; at least as long as the server requested."""
+        """Return the wait in seconds after `tried` tries: the backoff, plus the wait that the server requested."""
         backoff = Backoff(self.first_s, self.longest_s, random_unit=self.random_unit)
         return backoff.delay_s(tried) + (retry_after_s or 0.0)
 
     def report_wait(self, url: str, tried: int, elapsed_s: float, *, busy: bool) -> None:
-        """Report, after the first waits, that the server does not answer and how long tries go on."""
+        """Call `notice` with the server's state and the remaining time; do nothing after the first failed tries."""
         if self.notice is not None and tried >= TRIES_IN_SILENCE:
             left_s = max(1, round(self.total_s - elapsed_s))
             self.notice(f"{url} {'is busy' if busy else 'does not answer'}; trying again for {left_s} s")
@@ -59,6 +59,6 @@ ONCE = Retries(tries=1)
 
 
 def retry_after_s(response: httpx.Response) -> float | None:
-    """Return the seconds that the server asks to wait, if it gives them as a number."""
+    """Return the header `Retry-After` in seconds; None if the header is missing or is a date."""
     value = response.headers.get("Retry-After", "")
     return float(value) if value.isdigit() else None

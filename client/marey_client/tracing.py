@@ -1,6 +1,6 @@
-"""Traces of a client: requests pass on the trace of the program, and a command of `marey` may begin one.
+"""Traces of a client: requests carry the trace context of the program; a command of `marey` may begin a trace.
 
-A program that uses OpenTelemetry needs to do nothing: requests belong to its active span.
+In a program that uses OpenTelemetry, requests belong to the active span, without further settings.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from marey_schemas.tracing.declared import CALL, COMMAND
 from marey_schemas.tracing.spans import ProcessScope, SpanScope, current_scope, trace_headers
 
 SERVICE = "marey"
-"""Name under which collectors show commands, unless a variable of OpenTelemetry names another."""
+"""Service name under which collectors show commands, unless an environment variable of OpenTelemetry sets another."""
 PARENT_VARIABLE = "TRACEPARENT"
-"""Variable by which the program that starts a command passes on its trace, in the form of the header."""
+"""Environment variable by which the program that starts a command passes on its trace, as in `traceparent` headers."""
 
 
 @dataclass(slots=True)
 class TracedRequest:
-    """Request, which is perhaps sent several times."""
+    """Request in a trace; the request may be sent several times."""
 
     scope: SpanScope | None
     tries: int = 0
 
     @property
     def headers(self) -> dict[str, str]:
-        """The headers that pass the trace on."""
+        """The headers that send the trace context to the server."""
         return trace_headers(self.scope)
 
     def note_try(self) -> None:
-        """Record that the request is sent, perhaps again."""
+        """Record that the request is sent; from the second time on, also record the number of repetitions."""
         if self.tries:
             self._note("http.request.resend_count", self.tries)
         self.tries += 1
@@ -62,9 +62,10 @@ def calling(method: str) -> Iterator[TracedRequest]:
 
 @contextmanager
 def tracing_command(name: str) -> Iterator[None]:
-    """Let all requests of this process belong to one trace while the `with` block runs.
+    """Assign all requests of this process to one trace while the `with` block runs.
 
-    The trace is that in the variable `TRACEPARENT`. Without it, a new trace begins if a collector is configured.
+    The environment variable `TRACEPARENT` names the trace. Without this variable, a new trace begins if a collector is
+    configured.
     """
     from marey_schemas.tracing.export import closing, open_optional_tracer
 

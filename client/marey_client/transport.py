@@ -41,9 +41,9 @@ log = logging.getLogger(__name__)
 
 
 class _TlsOnFirstUse(httpx.BaseTransport):
-    """Connections with TLS, made ready by the first request that needs them: reading the certificates takes 25 ms.
+    """TLS connections whose certificates are read by the first request that uses TLS, because this takes 25 ms.
 
-    A server without TLS needs them only if it sends the client to object storage.
+    With a server without TLS, only requests that the server redirects to object storage use TLS.
     """
 
     @cached_property
@@ -99,14 +99,14 @@ class Transport:
         return other
 
     def with_present_token(self) -> Transport:
-        """Return a transport with the same connections that always sends the present token.
+        """Return a transport with the same connections that always sends the token that is valid now.
 
         If the token was read from a file, later changes of this file have no effect on the new transport.
         """
         return self if self._auth is None else self.with_token(self._auth.token)
 
     def has_token_of(self, other: Transport) -> bool:
-        """Return whether this transport and `other` now send the same token."""
+        """Return whether this transport and `other` send the same token at present."""
         return (self._auth and self._auth.token) == (other._auth and other._auth.token)
 
     def with_retries(self, retries: Retries) -> Transport:
@@ -150,9 +150,9 @@ class Transport:
     ) -> httpx.Response:
         """Send a request, if necessary several times, and return the complete answer.
 
-        If `repeatable` is False, the request is not sent again after its connection broke. The default is False for
-        PUT, PATCH and DELETE with `If-Match`, and True otherwise; a POST then gets an idempotency key. To stream
-        `content`, give a function that returns a new iterable of bytes for each try.
+        If `repeatable` is False, the request is not sent again after its connection broke. By default, it is False for
+        PUT, PATCH and DELETE requests that have the header `If-Match`, and True for all others; then, POST requests get
+        an idempotency key. To stream `content`, give a function that returns a new iterable of bytes for each try.
 
         Raises `RequestFailed` if the server answers with an error, `Unreachable` if there is no answer.
         """
@@ -203,8 +203,8 @@ class Transport:
     def repeat(self, once: Callable[[], T], *, repeatable: bool, what: str) -> T:
         """Call `once` until it succeeds, at most `retries.tries` times, and return its result.
 
-        An error that a retry cannot solve is raised at once. If `repeatable` is False, a broken connection is such an
-        error, because the request may have arrived. `what` names the request in the log.
+        Errors that a retry cannot solve are raised at once; if `repeatable` is False, also errors of a connection that
+        broke when the server may have received the request. `what` names the request in the log.
         """
         started = time.monotonic()
         for tried in range(1, self.retries.tries + 1):
@@ -249,9 +249,9 @@ class Transport:
     def stream(
         self, path: str, *, params: Params | None = None, headers: Mapping[str, str] | None = None
     ) -> Iterator[httpx.Response]:
-        """Request bytes by GET and yield the answer, to be read while it arrives. Retries are left to the caller.
+        """Request bytes by GET, and yield the answer while its body still arrives. The caller handles retries.
 
-        If the server refers to its object storage, the bytes are read there. Then httpx does not send the token.
+        If the server redirects to its object storage, the bytes are read there, and httpx does not send the token.
         """
         with (
             calling("GET") as call,
@@ -272,7 +272,7 @@ class Transport:
 
 
 def _connected_again(url: str) -> Transport:
-    """Return a transport to a server with the token that the command line would use."""
+    """Return a transport for `url` with the token that the command line would use; called when unpickling."""
     return Transport(url, resolve(url).bearer)
 
 
@@ -286,7 +286,7 @@ class _Connections:
         self._opened = (os.getpid(), self._open())
 
     def client(self) -> httpx.Client:
-        """Return the client of this process."""
+        """Return the HTTP client of this process."""
         process, client = self._opened
         if process != os.getpid():
             client = self._open()
@@ -339,7 +339,7 @@ def read_model(answer: type[Model], response: httpx.Response) -> Model:
         raise UnexpectedAnswer(
             f"{response.request.method} {response.request.url.path}: the server's answer is not a valid "
             f"{answer.__name__} ({error.error_count()} fields are wrong); the client may be older than the "
-            "server: update it"
+            "server: update the client"
         ) from error
 
 
@@ -370,7 +370,7 @@ def raise_for_problem(response: httpx.Response) -> None:
         title=response.reason_phrase,
         status=response.status_code,
         detail=f"{server} answered {response.status_code} "
-        f"{response.reason_phrase}, and not as a Marey server does; is it the right address?",
+        f"{response.reason_phrase}, which is not an answer of a Marey server; check the address of the server",
         instance=response.headers.get("X-Request-Id", "unknown"),
         code=f"http-{response.status_code}",
     )
@@ -378,7 +378,7 @@ def raise_for_problem(response: httpx.Response) -> None:
 
 
 def _present(params: Params | None) -> dict[str, str] | None:
-    """Return the query parameters that are not None, with booleans in the server's spelling."""
+    """Return the query parameters that are not None as texts; booleans become `true` and `false`."""
     if not params:
         return None
     return {

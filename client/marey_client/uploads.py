@@ -36,18 +36,18 @@ class UploadReport:
 
     @property
     def left_out(self) -> tuple[Path, ...]:
-        """Files in the folders that are not motion files."""
+        """Files in the folders that were not imported, because they are not motion files or are hidden."""
         return self.found.left_out
 
     def clips(self) -> Iterator[ClipHandle]:
-        """Yield handles of the clips that the files became, also of those that existed before."""
+        """Yield handles of the imported clips, also of clips that existed before the import."""
         for entry in self.entries:
             if entry.item is not None and entry.frames is not None:
                 yield self.project.clips.get(entry.item)
 
     @property
     def summary(self) -> str:
-        """The numbers of files by their outcomes, and the number of frames."""
+        """A text with the number of files for each outcome, such as created or failed, and the number of frames."""
         return outcomes_text(self.entries)
 
     def __str__(self) -> str:
@@ -63,8 +63,8 @@ class UploadReport:
 def upload(project: ProjectItems, found: FoundFiles, options: ImportOptions, notice: Notice) -> UploadReport:
     """Import files that were found, and restore the take records of clips that an export wrote.
 
-    `options` without a unit get the unit of the export from which all files come, if there is one. Their skeleton is an
-    id or a path. Raises `NoSuchPath` if there is no such skeleton.
+    If all files come from one export and `options` have no unit, the unit is that of the export. The field `skeleton`
+    of `options` is an id or a path. Raises `NoSuchPath` if there is no such skeleton.
     """
     if options.skeleton is not None:
         found_id = project.skeletons[options.skeleton].id
@@ -77,7 +77,7 @@ def upload(project: ProjectItems, found: FoundFiles, options: ImportOptions, not
 
 
 def outcomes_text(entries: Sequence[ImportEntry]) -> str:
-    """Return the numbers of files by their outcomes, and the number of frames, as text."""
+    """Return a text with the number of files for each outcome, and the number of frames."""
     counts = Counter(map(_outcome, entries))
     changed = sum(entry.skeleton_changed for entry in entries)
     words = {one: f"{counts[one]} {one}" for one in OUTCOMES}
@@ -90,5 +90,5 @@ def outcomes_text(entries: Sequence[ImportEntry]) -> str:
 
 
 def _outcome(entry: ImportEntry) -> str:
-    """Return the word for the result of an import: `new revision` if an item of this name existed before."""
+    """Return the outcome of an import as text: the status, or `new revision` if the item existed before."""
     return NEW_REVISION if entry.status == "created" and (entry.revision or 1) > 1 else entry.status

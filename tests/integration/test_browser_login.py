@@ -129,8 +129,8 @@ def test_the_commands_of_the_page_link_a_person_who_then_logs_in(
 @ON_SQLITE
 def test_options_that_do_not_fit_are_refused(run: Run) -> None:
     assert "only one of" in run("login", "--browser", "--with-token", status=2).stderr
-    assert "--paste belongs to" in run("login", "--paste", status=2).stderr
-    assert "says who you are" in run("login", "--browser", "--name", "ada", status=2).stderr
+    assert "--paste needs --browser" in run("login", "--paste", status=2).stderr
+    assert "--name cannot be combined with --browser" in run("login", "--browser", "--name", "ada", status=2).stderr
 
 
 def test_the_port_of_a_login_takes_only_the_code_of_its_sign_in() -> None:

@@ -70,6 +70,6 @@ export async function signOut(where: Page, context: BrowserContext): Promise<voi
   expect(await context.cookies()).toEqual([]);
   expect(await faults(where)).toEqual([]);
   await where.reload();
-  await where.getByText("Nothing to see here without a link").waitFor();
+  await where.getByText("You need a link to open this page").waitFor();
   expect(await where.getByRole("button", { name: "Sign out" }).count()).toBe(0);
 }

@@ -120,7 +120,7 @@ it("says what to do without a session, and for a link that was used", async () =
   expect(await faults(other)).toEqual([]);
   await picture(other, "view-without-link");
   await other.goto(new URL("/s/", page.url()).href);
-  await other.getByText("this address alone begins no study").waitFor();
+  await other.getByText("no study begins at this address alone").waitFor();
   expect(await faults(other)).toEqual([]);
   await stranger.close();
 });

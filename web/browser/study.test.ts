@@ -145,7 +145,7 @@ it("tells its owner that nobody has answered yet, and shows readers nothing of p
   const asked: string[] = [];
   page.on("request", (request) => asked.push(request.url()));
   await page.goto(GIVEN.reader);
-  await page.getByText("What participants answer is shown to owners and maintainers").waitFor();
+  await page.getByText("Only owners and maintainers of the project can see answers").waitFor();
   await page.getByText("I may stop at any time.").waitFor({ state: "attached" });
   expect(asked.filter((url) => /participants|differences|judgements/.test(url))).toEqual([]);
   expect(await faults(page)).toEqual([]);
@@ -220,7 +220,7 @@ it("deletes the answers of a participant who withdraws, and what this browser ke
   await page.keyboard.press("1");
   await page.keyboard.press("2");
   await page.getByRole("button", { name: "Withdraw" }).click();
-  await page.getByRole("button", { name: "Delete them" }).click();
+  await page.getByRole("button", { name: "Delete my answers" }).click();
   await page.getByText("Your answers are deleted").waitFor();
   expect(await page.evaluate(() => localStorage.length)).toBe(0);
   await context.close();
@@ -242,7 +242,7 @@ it("shows no trial on a computer that draws fewer than 30 pictures a second", as
   const { context, page } = await profile();
   await open(page, GIVEN.codes.slow, 29);
   await page.getByRole("button", { name: "I agree, begin" }).click();
-  await page.getByText("It shows 29 pictures a second").waitFor();
+  await page.getByText("It shows 29 pictures per second").waitFor();
   expect(await faults(page)).toEqual([]);
   await pictures(page, "slow");
   await page.keyboard.press("Space");
@@ -285,7 +285,7 @@ it("shows its owner what participants perceived, and both motions of a pair", as
 it("shows its owner the analysis, and ends the session by a button", async () => {
   const { context, page } = owner;
   await analyse();
-  const report = page.getByRole("link", { name: "Report with figures 3 to 5" });
+  const report = page.getByRole("link", { name: "Report with figures" });
   await report.waitFor({ timeout: 120_000 }); // until the page looks again
   await page.getByRole("region", { name: "Fitted metrics, best first" }).waitFor();
   expect(await page.getByRole("row", { name: /^positions, manhattan/ }).count()).toBe(1);

@@ -117,8 +117,8 @@ describe("a skeleton whose root carries the body through space", () => {
 describe("the data of a page without a server", () => {
   it("are refused if they are missing, of another form, or incomplete", async () => {
     await expect(unpackPage("\n")).rejects.toThrow("this page contains no motion");
-    await expect(unpackPage('{"format": 2, "title": "x", "motions": []}')).rejects.toThrow("the form 2, but this page reads the form 1");
+    await expect(unpackPage('{"format": 2, "title": "x", "motions": []}')).rejects.toThrow("the format version 2, but this page reads version 1");
     const motion = jsonOf<PackedMotion>(`${INDEX.clips[0]!}.packed.json`);
-    await expect(unpackMotion({ ...motion, frames: motion.frames + 1 })).rejects.toThrow("do not fit the frames");
+    await expect(unpackMotion({ ...motion, frames: motion.frames + 1 })).rejects.toThrow("does not match the number of frames");
   });
 });

@@ -1,4 +1,4 @@
-"""Documents of a project, requested by the content digests of revisions, which are the same on every server."""
+"""Requests for documents of a project by content digest; equal content has the same digest on every server."""
 
 from __future__ import annotations
 
@@ -43,26 +43,28 @@ def read_facets(transport: Transport, project_url: str, contents: Sequence[str])
 def first_documents(
     transport: Transport, project_url: str, places: Sequence[RequestedDocument], *, keep_blocks: bool = False
 ) -> list[Any]:
-    """Request documents by address; return the first of them, as many as fit into one answer, but at least one.
+    """Request the documents at the addresses `places`; return those that fit into one answer, at least one.
 
-    The result has the order of `places`, but may be shorter.
-
-    Raises `UnexpectedAnswer` if one of the revisions is no longer in the project.
+    The result contains the first documents, in the order of `places`. Raises `UnexpectedAnswer` if one of the revisions
+    is no longer in the project.
     """
     request = ContentsRequest(documents=tuple(places))
     found: list[Any] = request_contents(transport, project_url, request, keep_blocks=keep_blocks)["documents"]
     for place, tree in zip(places, found, strict=False):
         if not isinstance(tree, dict):
-            raise UnexpectedAnswer(f"the project has no revision with the content {place.content} any more")
+            raise UnexpectedAnswer(f"the project no longer has the revision with the content digest {place.content}")
     if not found:
-        raise UnexpectedAnswer("the server's answer has no documents")
+        raise UnexpectedAnswer("the server's answer contains none of the requested documents")
     return found
 
 
 def read_documents(
     transport: Transport, project_url: str, places: Sequence[RequestedDocument]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the documents at the given addresses, in order, with numpy arrays; memory holds one answer at a time."""
+    """Yield the documents at the addresses `places`, in order, with numpy arrays.
+
+    Memory holds the documents of one answer at a time.
+    """
     waiting = list(places)
     while waiting:
         found = first_documents(transport, project_url, waiting[:MOST_CONTENTS])
@@ -72,25 +74,26 @@ def read_documents(
 
 @dataclass(frozen=True)
 class ArrayBases:
-    """Arrays of one document of the receiving project."""
+    """Document of the receiving project, and the tiles of its arrays; these tiles need not be sent to the project."""
 
     content: str
-    """Content digest of the revision that has the document."""
+    """Content digest of the revision that contains the document."""
     tiles: Mapping[str, Sequence[str]]
-    """Digests of the tiles of each array, by JSON Pointer."""
+    """Digests of the tiles of each array of the document, by the JSON Pointer of the array."""
 
     def without_shared(self, pointer: str, array: EncodedArray) -> EncodedArray | dict[str, Any]:
-        """Return the array without tiles that the array at the same pointer has; the whole array if it has none."""
+        """Return `array` without the tiles that it shares with the array of this document at the same pointer.
+
+        Returns the whole array if the two arrays share no tile.
+        """
         return partial_array(array, self.content, pointer, self.tiles.get(pointer, ())) or array
 
 
 def bases_of_arrays(transport: Transport, project_url: str, places: Mapping[K, PartOfContent]) -> dict[K, ArrayBases]:
-    """Ask a project for the tiles of documents; documents that the project does not have are left out.
+    """Request the tiles of the arrays of documents; documents that the project does not have are left out.
 
-    `places` are the addresses of the documents. An answer has as many documents as fit into it, at least one; the next
-    request asks for the others.
-
-    Raises `UnexpectedAnswer` if an answer has no documents.
+    `places` are the addresses of the documents. An answer covers as many documents as fit into it, at least one; the
+    remaining documents are requested again. Raises `UnexpectedAnswer` if an answer covers no document.
     """
     found: dict[K, ArrayBases] = {}
     waiting = list(places.items())
@@ -102,6 +105,6 @@ def bases_of_arrays(transport: Transport, project_url: str, places: Mapping[K, P
             if of_document:
                 found[key] = ArrayBases(place.content, of_document)
         if not tiles:
-            raise UnexpectedAnswer("the server's answer has no tiles")
+            raise UnexpectedAnswer("the server's answer contains none of the requested tiles")
         waiting = waiting[len(tiles) :]
     return found

@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from marey_client.transport import Transport
 
 OF_UNKNOWN_FIELDS = "invalid-body"
-"""Code of the error with which servers of earlier versions refuse a request that names bases."""
+"""Code of the error by which servers of earlier versions refuse requests for differences between arrays."""
 CheckContents = Callable[[Sequence[str]], object]
 """Function called with content digests of revisions before their documents are read."""
 
 
 class EarlierDocument(NamedTuple):
-    """Document that another one has replaced: its digest, and its address on the server."""
+    """Document of an entry before a commit replaced it: the document's digest, and its address on the server."""
 
     digest: str
     place: PartOfContent
@@ -43,13 +43,13 @@ class EarlierDocument(NamedTuple):
 
 @dataclass
 class DocumentWriter:
-    """Writer of the documents of an archive, with everything to which they refer."""
+    """Writer of the documents of an archive, and of the revisions, arrays and files to which the documents refer."""
 
     transport: Transport
     project_url: str
     writer: ArchiveWriter
     folder: Path
-    """Folder in whose file system files are kept, without a name, until they are in the archive."""
+    """Folder for unnamed temporary files, which hold downloaded files until these are in the archive."""
     on_progress: OnProgress
     check: CheckContents
     differences: bool
@@ -59,7 +59,7 @@ class DocumentWriter:
     documents: dict[str, PartOfContent] = field(default_factory=dict)
     """Address on the server of each document of an entry, by the digest of the document."""
     earlier: dict[str, EarlierDocument] = field(default_factory=dict)
-    """The earlier document, by the digest of the document that replaced it."""
+    """The replaced document, by the digest of the document that replaced it."""
 
     def run(self) -> None:
         """Add all documents, and the facets of all revisions."""
@@ -106,7 +106,7 @@ class DocumentWriter:
             self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
 
     def _files(self, digest: str, body: Any) -> set[str]:
-        """Return the digests of the files that a document names, without the files that its earlier version named."""
+        """Return the digests of the files that a document names, without the files that the replaced document named."""
         named = _files_in(body)
         if named and digest in self.earlier:
             place = self.earlier[digest].place
@@ -115,7 +115,7 @@ class DocumentWriter:
         return named
 
     def _add_revisions(self, contents: Iterable[str]) -> None:
-        """Add revisions, given by content digest, and their documents; other documents refer to these revisions."""
+        """Add the revisions to which documents refer, given by content digest, and the documents of these revisions."""
         waiting = sorted(contents)
         self.known.update(waiting)
         self.check(waiting)
@@ -123,7 +123,9 @@ class DocumentWriter:
             found = self._ask(ContentsRequest(revisions=tuple(some)))["revisions"]
             for content, one in zip(some, found, strict=True):
                 if one is None:
-                    raise UnexpectedAnswer(f"a document refers to the content {content}, which the project lacks")
+                    raise UnexpectedAnswer(
+                        f"a document refers to the revision with the content digest {content}, which the project lacks"
+                    )
                 self._add_documents(
                     {digest: PartOfContent(content=content, part=part) for part, digest in one["parts"].items()}
                 )
@@ -132,7 +134,8 @@ class DocumentWriter:
     def _add_facets(self) -> None:
         """Add the facets of all revisions, which jobs may have published after the revisions were committed.
 
-        Each member has those of a few revisions, because readers refuse members of more than `MOST_BYTES`.
+        Each member of the archive contains the facets of a few revisions, because readers refuse members of more than
+        `MOST_BYTES`.
         """
         for some in batched(sorted(self.known), MOST_CONTENTS):
             if facets := read_facets(self.transport, self.project_url, some):
@@ -149,9 +152,10 @@ class DocumentWriter:
             self.writer.add_stream(member, file, size_bytes)
 
     def _requested(self, digest: str, place: PartOfContent) -> RequestedDocument:
-        """Return the request for a document, with the revision whose arrays the reader of the archive has.
+        """Return the request for a document, if possible as differences from a document that the reader already has.
 
-        The reader has a revision that an entry had before the commits of the archive.
+        The reader has the entries from before the commits in the archive, so a replaced document of such an entry can
+        be the base of the differences.
         """
         one: EarlierDocument | None = EarlierDocument(digest, place)
         passed: set[str] = set()

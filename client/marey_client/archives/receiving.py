@@ -40,7 +40,7 @@ MOST_BYTES_RESTORED = 64 * MIB
 The server keeps the whole arrays in memory.
 """
 LEAST_BYTES_SHARED = 16 * KIB
-"""Size of a document in bytes above which the server is asked for tiles of its arrays; for less, that would not pay."""
+"""Size of a document in bytes above which only new tiles of its arrays are sent; smaller documents are sent whole."""
 
 
 class ReceivingDataset(Protocol):
@@ -97,8 +97,8 @@ def require_receivable(commit: str, changed: int) -> None:
     if changed > MOST_RECEIVED_CHANGES:
         raise LargeCommit(
             f"the commit {commit} changes {changed:,} entries, but a commit that is imported, pushed or pulled may "
-            f"change at most {MOST_RECEIVED_CHANGES:,}. It can be archived and extracted. To copy the dataset, commit "
-            "its entries to another dataset in several steps, and copy that one"
+            f"change at most {MOST_RECEIVED_CHANGES:,}. The commit can be archived and extracted. To copy the dataset, "
+            "commit its entries to another dataset in several steps, and copy that dataset"
         )
 
 
@@ -118,7 +118,7 @@ class _Import:
     archive: Archive
     on_progress: OnProgress
     has: Callable[[str], bool]
-    """Function that returns whether the dataset has the commit with a digest."""
+    """Function that returns whether the dataset has the commit with the given digest."""
     revisions: dict[str, _Revision] = field(default_factory=dict)
     """Revisions of entries, by content digest."""
     held: set[str] = field(default_factory=set)
@@ -128,11 +128,11 @@ class _Import:
     facets: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Facets of the revisions in the archive, by content digest."""
     homes: dict[str, str] = field(default_factory=dict)
-    """Content digest of a revision that contains the document, by the digest of the document."""
+    """For each document, by digest: the content digest of a revision that contains the document."""
     earlier: dict[str, str] = field(default_factory=dict)
-    """For each revision of an entry: the revision that the entry had before, if it is known."""
+    """For each revision of an entry, by content digest: the entry's previous revision, if it is known."""
     _newest: dict[str, str] = field(default_factory=dict)
-    """For the key of each entry: the revision in the last commit that was noted."""
+    """For each entry, by key: the content digest of its revision in the newest commit that was read so far."""
 
     def run(self, begins: str | None) -> Commit:
         require_base(self.archive, self.has)
@@ -168,7 +168,7 @@ class _Import:
         return known
 
     def _put(self, changes: Mapping[str, EntryChange]) -> list[str]:
-        """Note the revision of each entry that was added or changed; return the content digests of these revisions."""
+        """Record the revision of each added or changed entry; return the content digests of these revisions."""
         found = []
         for key, (value, unchanged) in changes.items():
             if value is not None:
@@ -202,7 +202,7 @@ class _Import:
         return {one for digest in documents for one in contents_in(self._document(digest))}
 
     def _missing(self, contents: list[str]) -> list[str]:
-        """Ask the server which of the revisions the project lacks, and return them; record the rest in `held`."""
+        """Request which revisions the project lacks, and return these; record all others in `held`."""
         missing = []
         for some in batched(contents, MOST_CONTENTS):
             request = ContentsRequest(revisions=tuple(some))
@@ -290,14 +290,14 @@ class _Import:
         self.sent.update(contents)
 
     def _add_facets(self) -> None:
-        """Add facets to the revisions that the project already had; all their documents are references."""
+        """Add facets to the revisions that the project already had; the requests refer to stored documents."""
         for some in batched(sorted(self.facets.keys() & self.held - self.sent), MOST_CONTENTS):
             self._send(some)
 
     def _bases(self, contents: list[str]) -> dict[tuple[str, str], ArrayBases]:
-        """Ask the server for the tiles of the arrays that the new arrays of revisions replace.
+        """Request the tiles of the arrays that the new arrays of revisions replace.
 
-        Returns them by content digest and part of the new revision. Small arrays are not asked for.
+        Returns the tiles by content digest and part of the new revision. Small documents are left out.
         """
         places = {
             (content, part): PartOfContent(content=self.earlier[content], part=part)

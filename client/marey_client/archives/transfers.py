@@ -33,10 +33,10 @@ class MissingCommits(NamedTuple):
 
 
 def find_missing(source: DatasetReader, head: Commit, has: Callable[[str], bool]) -> MissingCommits:
-    """Return which commits, among `head` and its ancestors, another dataset lacks.
+    """Return the commits that another dataset lacks, among `head` and its ancestors.
 
-    `has` returns whether the other dataset has the commit with a digest. A dataset that has a commit also has the
-    ancestors of the commit, so `has` is not called for these.
+    `has` returns whether the other dataset has the commit with the given digest. A dataset that has a commit also has
+    the commit's ancestors, so `has` is not called for these ancestors.
     """
     if has(head.digest):
         return MissingCommits((), (head.digest,))
@@ -66,8 +66,8 @@ def copy_missing(
 ) -> T:
     """Write an archive of missing commits, and return the result of `receive`, which sends it to the other dataset.
 
-    Arrays are sent as differences from those of the commits that the other dataset has. If its server refuses this,
-    which servers of earlier versions do, the archive is written and sent again with whole arrays.
+    Arrays are sent as differences from the arrays in the commits that the other dataset has. Servers of earlier
+    versions refuse differences; then the archive is written and sent again with whole arrays.
 
     Consents are not checked here: take records are copied with their clips, so that the other server checks the
     consents. Raises `LargeCommit` if the other server would refuse one of the commits.
@@ -85,8 +85,8 @@ def _fetched(
 ) -> Iterator[Archive]:
     """Write an archive of missing commits, and yield the opened archive.
 
-    The archive's file is deleted after the `with` block, but kept if the block ends with an error of another kind than
-    `DifferencesRefused`. If the program is interrupted while it writes the file, the next call continues writing.
+    The archive's file is deleted if the `with` block succeeds or raises `DifferencesRefused`; after any other error,
+    the file remains for the next call. If writing the file is interrupted, the next call continues writing.
     """
     name = short_name(missing.commits[0].digest, missing.bases)
     path = transfers_folder() / (f"{name}.differences.tar" if differences else f"{name}.tar")
@@ -104,8 +104,8 @@ def _fetched(
 def transfers_folder() -> Path:
     """Return the folder for archives of datasets that are being copied, below `XDG_CACHE_HOME` or `~/.cache`.
 
-    Old content of the folder is deleted: a copy command that is killed leaves its archive. In earlier versions, it also
-    left the folder of its downloaded files.
+    Files and folders in it that are older than `MOST_DAYS_KEPT` are deleted: archives, and in earlier versions folders
+    of downloaded files, remain there if a copy command is killed.
     """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "transfers"
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)

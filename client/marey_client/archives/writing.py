@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from marey_schemas.datasets.differences import DatasetDifference
 
 MOST_LISTED = 10_000
-"""Number of differences that are requested at once; versions that differ in more entries are listed whole."""
+"""Greatest number of differing entries in one request; if two versions differ in more, all their entries are listed."""
 
 
 class DatasetReader(Protocol):
@@ -103,10 +103,10 @@ def write_archive(
 def write_transfer(
     dataset: DatasetReader, commits: Sequence[Commit], path: Path, on_progress: OnProgress, *, differences: bool
 ) -> None:
-    """Write and check an archive of commits for a server that has all other ancestors of the first of these commits.
+    """Write and check an archive of `commits`, newest first, for a server that has all their other ancestors.
 
-    With `differences`, arrays may be replaced by their differences from arrays of these ancestors, so that only this
-    server can read them. Continues after an interruption as `write_archive` does. Raises `LargeCommit`, before
+    With `differences`, arrays may be replaced by their differences from arrays of these ancestors; then only this
+    server can read the archive. Continues after an interruption as `write_archive` does. Raises `LargeCommit`, before
     documents are read, if a commit has more changes than servers accept. Consents are not checked.
     """
 
@@ -167,7 +167,8 @@ def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequenc
 def short_name(head: str, bases: Iterable[str]) -> str:
     """Return a text of 32 characters, for file names, that identifies the content of an archive.
 
-    `head` is the digest of the archive's newest commit, and `bases` are those of the commits that it leaves out.
+    `head` is the digest of the archive's newest commit, and `bases` are the digests of the commits that the archive
+    leaves out.
     """
     return digest_of("\n".join([head, *sorted(set(bases))]).encode()).removeprefix("sha256:")[:32]
 
@@ -188,7 +189,7 @@ def _opened(part: Path) -> Iterator[BinaryIO]:
 
 
 def _is_at(path: Path, file: BinaryIO) -> bool:
-    """Return whether the path leads to this opened file, and not to another file or to none."""
+    """Return whether the file at `path` is the opened `file`; False if there is no file at `path`."""
     try:
         return os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except FileNotFoundError:
@@ -221,7 +222,7 @@ class _Making:
     """Whether the archive must be importable; then a commit with more changes than servers accept is an error."""
 
     def run(self, head: Commit, commits: Sequence[Commit]) -> None:
-        """Write the given commits, of which `head` is the newest; the parents that are left out are the base."""
+        """Write the commits, of which `head` is the newest; parents that are not among them become the base."""
         base = {parent for one in commits for parent in one.parents} - {one.digest for one in commits}
         for done, commit in enumerate(commits):
             self.documents.on_progress("reading versions", done, len(commits))
@@ -230,7 +231,7 @@ class _Making:
         self.documents.writer.finish(self.dataset.name, head.digest, sorted(base))
 
     def _add_commit(self, commit: Commit, *, unchanged: bool) -> None:
-        """Add a commit and its changes to the archive, and note the revisions of the changed entries.
+        """Add a commit and its changes to the archive, and record the revisions of the changed entries.
 
         If `unchanged` is true, documents that an entry already had in the first parent of the commit are not added; the
         list of changes names them as unchanged.
@@ -287,7 +288,7 @@ class _Making:
         return {place: one for place, one in both.items() if _line(place, one.before) != _line(place, one.after)}
 
     def _difference(self, before: str, after: str) -> DatasetDifference | None:
-        """Return the entries that differ in two versions; None if they are too many for one answer of the server."""
+        """Return the entries that differ between two versions; None if one answer cannot contain all of them."""
         try:
             found = self.dataset.difference(before, after, limit=MOST_LISTED)
         except BadRequest as error:
@@ -298,7 +299,7 @@ class _Making:
 
 
 class _EntryPair(NamedTuple):
-    """State of an entry after and before a commit; None where the entry does not exist."""
+    """State of an entry after a commit and before it; None if the entry does not exist then."""
 
     after: Entry | None
     before: Entry | None

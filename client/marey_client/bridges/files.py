@@ -46,7 +46,7 @@ class ExportedVersion(NamedTuple):
     folder: Path
     clips: int
     renamed: Mapping[str, str]
-    """Names of the files of clips whose paths are not valid as file names on all systems, by the path of the entry."""
+    """File names that differ from the paths of their clips, because not every system accepts these paths; by path."""
     left_out: Mapping[str, int]
     """Number of entries that are not clips, by kind."""
 
@@ -120,8 +120,8 @@ def prepare_files(
 ) -> MotionFiles:
     """Check whether a version can be exported to files, and read its entries below `path`.
 
-    Raises `CannotExport` if a file in the format lacks the motion or the skeleton: such a file cannot be imported again
-    alone. Also raises the errors of `require_free` and `version_to_export`.
+    Raises `CannotExport` if files in this format do not contain both motion and skeleton, because a file without one of
+    them cannot be imported again on its own. Also raises the errors of `require_free` and `version_to_export`.
     """
     if format not in WHOLE_FORMATS:
         raise CannotExport(
@@ -146,7 +146,8 @@ def write_files(motions: MotionFiles, target: Path, on_progress: OnProgress) -> 
 def exported(version: VersionToExport, target: Path, names: Sequence[str], ending: str) -> ExportedVersion:
     """Return the result of an export to files.
 
-    `names` are the paths of the clips' files, in order, without folders that only the layout adds.
+    `names` are the paths of the clips' files in the order of `version.clips`, without the folders that the layout puts
+    above them, such as `data`.
     """
     pairs = zip((one.path for one in version.clips), names, strict=True)
     renamed = {path: name for path, name in pairs if name != path + ending}

@@ -1,4 +1,4 @@
-"""Folders that are written as a whole, and names of the files in them."""
+"""Folders that appear only when all their files are written, and names of the files in these folders."""
 
 from __future__ import annotations
 

@@ -48,8 +48,7 @@ class _Summary:
 
     licences: Counter[str | None] = field(default_factory=Counter)
     jobs: Counter[tuple[str, tuple[str, ...]] | None] = field(default_factory=Counter)
-    """Number of clips, by kind and input commits of the job that made them; key None: clips that no job made.
-    """
+    """Number of clips, by kind and input commits of the job that made them; key None: clips that no job made."""
 
     def add(self, clip: ExportedClip) -> None:
         self.licences[clip.record.licence] += 1
@@ -57,7 +56,7 @@ class _Summary:
 
 
 def write_huggingface(motions: MotionFiles, target: Path, on_progress: OnProgress) -> ExportedVersion:
-    """Write a version to a new folder that can be uploaded to the Hub as it is."""
+    """Write a version to a new folder that can be uploaded to the Hub without further changes."""
     version = motions.version
     plain = file_names([one.path for one in version.clips], motions.ending)
     names = [f"data/{place // MOST_FILES_PER_FOLDER:05d}/{name}" for place, name in enumerate(plain)]

@@ -82,7 +82,7 @@ class CommonRig(NamedTuple):
         return whole if math.isclose(self.rate_hz, whole, rel_tol=RATE_TOLERANCE) else self.rate_hz
 
     def difference_to(self, other: CommonRig) -> str | None:
-        """Return a text that says how another rig differs, or None if it does not differ."""
+        """Return a text that says how the rig `other` differs from this rig; None if they agree."""
         if (self.hierarchy, self.joints) != (other.hierarchy, other.joints):
             return "another skeleton"
         if self.translated != other.translated:

@@ -63,7 +63,7 @@ class ReturningFolder:
 
     @cached_property
     def clips(self) -> Mapping[str, ExportedClip]:
-        """The clips by the names under which their files are imported."""
+        """The exported clips that have a file, by the name under which the file is imported."""
         return {self.name_of(file): clip for file, clip in self._by_file.items()}
 
     def name_of(self, file: str) -> str:
@@ -84,7 +84,7 @@ class ReturningFolder:
 
     @property
     def table_changed(self) -> bool:
-        """Whether the table exists and does not contain the take records of the sidecar."""
+        """Whether the table exists and differs from the take records in the sidecar."""
         if not self.table.is_file():
             return False
         written = io.StringIO(newline="")
@@ -93,7 +93,7 @@ class ReturningFolder:
 
 
 def restore_clip(transport: Transport, project: str, item: str, exported: ExportedClip) -> bool:
-    """Add the exported values of the take record and tags that a clip lacks; return whether the clip was changed."""
+    """Add the exported tags and fields of the take record that a clip lacks; return whether the clip was changed."""
     clip = Items(transport, project, Kind.CLIP, ClipHandle).get(item)
     try:
         info = clip.info()

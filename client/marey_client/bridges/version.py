@@ -122,7 +122,9 @@ class VersionToExport:
         request = ContentsRequest(revisions=(content,))
         (found,) = request_contents(self.dataset.transport, self.dataset.project_url, request)["revisions"]
         if found is None:
-            raise CannotExport(f"the project has no revision with the content {content} any more; restore the item")
+            raise CannotExport(
+                f"the project no longer has the revision with the content digest {content}; restore its item"
+            )
         parts: Mapping[str, str] = found["parts"]
         return parts
 
@@ -188,7 +190,7 @@ def version_to_export(
 def _located(entry: Entry) -> _Located:
     if entry.item is None or entry.revision is None:
         raise CannotExport(
-            f"{entry.path}: the project has no revision with the content of this clip any more; restore the clip, or "
+            f"{entry.path}: the project no longer has the revision of this clip; restore the clip, or "
             "export a version without it"
         )
     return _Located(entry, entry.item, entry.revision)

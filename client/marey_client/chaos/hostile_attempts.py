@@ -1,4 +1,4 @@
-"""Attempts of the test that break the rules of workers: lost answers, repetitions, stale fences and wrong clocks."""
+"""Attempts that violate the protocol of workers: lost answers, repetitions, stale fences and wrong clocks."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from marey_client.load.scratch import KIND, Scratch
 RESULT = "result"
 SKEW_S = 3600
 OVER = frozenset({401, 404, 409})
-"""Statuses of the refusal of an attempt that no longer holds its job."""
+"""HTTP statuses by which the server refuses requests of an attempt that no longer holds its job."""
 
 
 class HostileAttempt:
-    """One job that an attempt of the test completes, with the faults of one case.
+    """Attempt of the test, which completes one job and sends faulty requests meanwhile.
 
-    Each method raises `MareyError` if the server gives an answer that it must not give.
+    Each method raises `MareyError` if the server answers wrongly.
     """
 
     def __init__(self, scratch: Scratch, caller: LoadConnection, job: str, draw: random.Random) -> None:
@@ -36,7 +36,7 @@ class HostileAttempt:
         }  # fmt: skip
         leases = self._require(self._caller.post("/leases", wanted, headers=self._skewed())).document["leases"]
         if len(leases) != 1:
-            raise MareyError(f"a claim of the queued job {self._job} got {len(leases)} leases")
+            raise MareyError(f"a claim of the queued job {self._job} got {len(leases)} leases instead of one")
         return dict(leases[0])
 
     def post(self, lease: dict[str, Any], what: str, document: dict[str, Any]) -> LoadAnswer:
@@ -50,7 +50,7 @@ class HostileAttempt:
             other.send_only(f"/jobs/{lease['job']}/attempts/{lease['fence']}/{what}", document)
 
     def stage(self, lease: dict[str, Any]) -> None:
-        """Stage the result: a skeleton whose offset is drawn, so that each attempt has another result."""
+        """Stage a skeleton with a random joint offset, so that each attempt has a different result."""
         offset = [round(self._draw.random(), 6), 0.0, 0.0]
         hierarchy = {"schema": "marey/skeleton@1", "joints": [{"name": "Hips", "parent": -1, "offset": offset}]}
         output = {"name": RESULT, "kind": "skeleton", "item_name": RESULT, "parts": {"hierarchy": hierarchy}}
@@ -61,9 +61,9 @@ class HostileAttempt:
         return self._require(self.post(lease, "complete", {"write_id": write_id}))
 
     def refused(self, answer: LoadAnswer, what: str) -> None:
-        """Require that the server has refused a request."""
+        """Raise `MareyError` unless `answer` refuses the request that `what` describes."""
         if answer.status not in OVER:
-            raise MareyError(f"the server answered {answer.status} to {what} of the job {self._job}")
+            raise MareyError(f"the server must refuse {what} of the job {self._job}, but answered {answer.status}")
 
     def _require(self, answer: LoadAnswer) -> LoadAnswer:
         if answer.code:
@@ -77,7 +77,7 @@ class HostileAttempt:
 
 
 def lost_answers(attempt: HostileAttempt) -> None:
-    """Repeat a claim and a completion whose answers are lost; both repetitions get the same answer."""
+    """Repeat a claim and a completion whose answers are lost; each repetition must get the answer that was lost."""
     claim_id = secrets.token_hex(16)
     first = attempt.claim(claim_id)
     lease = attempt.claim(claim_id)
@@ -92,7 +92,7 @@ def lost_answers(attempt: HostileAttempt) -> None:
 
 
 def double_completion(attempt: HostileAttempt) -> None:
-    """Complete a job twice, the second time as another write, which the server must refuse."""
+    """Complete a job, then complete it again with another `write_id`, which the server must refuse."""
     lease = attempt.claim()
     attempt.stage(lease)
     attempt.complete(lease, secrets.token_hex(16))
@@ -101,7 +101,7 @@ def double_completion(attempt: HostileAttempt) -> None:
 
 
 def stale_fence(attempt: HostileAttempt) -> None:
-    """Give a job back, claim it again, and let the first attempt write; the server must refuse its writes."""
+    """Release a job, claim it again, and write as the first attempt; the server must refuse these writes."""
     stale = attempt.claim()
     attempt.stage(stale)
     gone = {"write_id": secrets.token_hex(16), "code": "interrupted", "interrupted": True}

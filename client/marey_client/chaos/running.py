@@ -28,7 +28,7 @@ END_S = 900.0
 LATE_S = 5.0
 """Time in which workers that were paused may try to publish the results of lost attempts."""
 MAX_ATTEMPTS = 20
-"""Greatest number of attempts of a job: several faults can meet the same job."""
+"""Greatest number of attempts of a job; more than one, because several faults can affect the same job."""
 
 OnStep = Callable[[str, float, float | None], None]
 """Function called with the present activity, the amount done, and the total amount if it is known."""
@@ -36,7 +36,7 @@ OnStep = Callable[[str, float, float | None], None]
 
 @dataclass(frozen=True)
 class ChaosFinding:
-    """Result for one fault or one job; `fault` is empty if everything was as it must be."""
+    """Result for one injected fault or one job; `fault` is empty if the server behaved correctly."""
 
     check: str
     fault: str
@@ -44,12 +44,12 @@ class ChaosFinding:
 
 
 def run_chaos(marey: Marey, seed: int, faults: int, on_step: OnStep) -> Iterator[ChaosFinding]:
-    """Run each fault at least once in a scratch project, and yield a finding for each fault and for the results.
+    """Inject each kind of fault at least once in a scratch project; yield a finding for each fault and for each job.
 
-    `faults` is the total number of faults, but each happens at least once; half of those beyond one of each are drawn
-    from each group. Equal seeds draw the same faults in the
-    same order; the moments at which requests meet still differ. The scratch project and all processes of the test are
-    removed at the end, also after an error or Ctrl-C.
+    `faults` is the total number of faults; it is exceeded if there are more kinds. Faults in addition to one of each
+    kind are random: half of them faulty requests, half of them killed or paused workers. Equal seeds give the same
+    faults in the same order, but not the same timing of requests. The scratch project and all processes of the test
+    are removed at the end, also after an error or Ctrl-C.
     """
     draw = random.Random(seed)  # noqa: S311 - faults of a test, not secrets
     further = max(0, faults - len(HOSTILE_CASES) - len(WORKER_FAULTS))
@@ -79,7 +79,7 @@ def run_chaos(marey: Marey, seed: int, faults: int, on_step: OnStep) -> Iterator
 
 
 def _drawn(cases: Sequence[T], further: int, draw: random.Random) -> list[T]:
-    """Return all cases and `further` drawn ones, shuffled."""
+    """Return each of the cases once, and `further` random ones of them in addition, in random order."""
     chosen = [*cases, *(draw.choice(cases) for _ in range(further))]
     draw.shuffle(chosen)
     return chosen
@@ -100,7 +100,7 @@ def _attempt(scratch: Scratch, job: str, name: str, draw: random.Random) -> Chao
             HOSTILE_CASES[name](HostileAttempt(scratch, caller, job, draw))
         except MareyError as error:
             return ChaosFinding(name, str(error), "")
-    return ChaosFinding(name, "", "answered as it must be")
+    return ChaosFinding(name, "", "the server answered correctly")
 
 
 def _await_results(

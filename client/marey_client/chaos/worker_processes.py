@@ -22,7 +22,7 @@ STATE_EVERY_S = 0.1
 
 
 class WorkerFault(NamedTuple):
-    """Point at which a worker acts on itself, and the action: `kill` or `stop`."""
+    """Point of a job at which a worker process kills or stops itself, and the action: `kill` or `stop`."""
 
     point: str
     action: str
@@ -97,7 +97,7 @@ class WorkerProcesses:
         self._started: list[WorkerProcess] = []
 
     def start(self, fault: WorkerFault | None = None) -> WorkerProcess:
-        """Start a worker, which acts on itself by the given fault."""
+        """Start a worker process, which kills or stops itself as `fault` says; without `fault`, it does neither."""
         made = WorkerProcess(self._scratch, self._folder, fault)
         self._started.append(made)
         return made
@@ -110,7 +110,7 @@ class WorkerProcesses:
 
 @contextmanager
 def worker_processes(scratch: Scratch) -> Iterator[WorkerProcesses]:
-    """Yield a place for worker processes; all of them are killed at the end of the `with` block."""
+    """Yield an object that starts worker processes; all of them are killed at the end of the `with` block."""
     if importlib.util.find_spec("marey_worker") is None:
         raise MissingPackage("the test starts workers, which are not installed; run: pip install 'marey[worker]'")
     with tempfile.TemporaryDirectory(prefix="marey-chaos-") as folder:

@@ -143,7 +143,7 @@ class Thing(Protocol):
         """Return the number of items that `delete` removes."""
 
     def move(self, folder: str, name: str) -> Collection | Item:
-        """Move to a folder and rename; return the moved folder or item."""
+        """Move the folder or item to another folder, under a new name; return the moved folder or item."""
 
     def delete(self) -> None:
         """Delete the item, or the folder with its contents; `restore` restores what was deleted."""
@@ -248,7 +248,8 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
         if not deleted:
             raise _missing(marey, address, "no item or folder")
         raise WrongUsage(
-            f"there is no deleted item or folder at {address}; `marey ls --deleted {address.project}` lists them"
+            f"there is no deleted item or folder at {address}; `marey ls --deleted {address.project}` lists all that "
+            "are deleted"
         )
     return found[0]
 
@@ -256,7 +257,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
 def items_selected(
     marey: Marey, places: Sequence[str], query: str, kind: str | None, *, deleted: bool = False
 ) -> list[SingleItem]:
-    """Return the items of one kind that a query selects in projects or folders and below; the default kind is clips.
+    """Return the items of one kind, by default clips, that a query selects in projects, folders and their subfolders.
 
     The items of each place are sorted by path; an item in several places is returned once. With `deleted`, only deleted
     items are selected, including those in deleted folders. If several deleted items have the same path, the one that
@@ -285,7 +286,7 @@ def items_selected(
 
 
 def _is_folder(project: ProjectHandle, path: str, *, deleted: bool) -> bool:
-    """Return whether there is a folder at a path; with `deleted`, whether there is a deleted one."""
+    """Return whether there is a folder at a path; with `deleted`, whether there is a deleted folder."""
     folders = project.collections
     return folders.at(path) is not None or (deleted and folders.at(path, deleted=True) is not None)
 

@@ -70,14 +70,14 @@ OTHER_NAMES = {
     "version": "--version",
     "whoami": "user show",
 }
-"""What to type instead of names of commands of other programs."""
+"""Command of `marey` to suggest for a command name of another program, by this name."""
 
 
 class CommandGroup(TyperGroup):
-    """Group of commands that names the right command for some names of other programs."""
+    """Command group that suggests the command of `marey` if the user types a command name of another program."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Return name, command and further arguments; end with a usage error if there is no such command."""
+        """Return the name of the command, the command, and its arguments; fail if there is no such command."""
         if args[0] not in self.commands and args[0] in OTHER_NAMES:
             ctx.fail(f"No such command {args[0]!r}. Type: marey {OTHER_NAMES[args[0]]}")
         return super().resolve_command(ctx, args)
@@ -96,7 +96,7 @@ app = typer.Typer(
 
 
 UNTRACED = ("serve", "worker")
-"""Commands that run for long; the server and the worker record their requests and jobs themselves."""
+"""Long-running commands that are not traced as a whole; they record each of their requests and jobs themselves."""
 
 
 def _print_version(wanted: bool) -> None:
@@ -146,13 +146,16 @@ def marey(
             "--install-completion",
             callback=_install_completion,
             is_eager=True,
-            help="Let the current shell complete commands, projects, paths, jobs and versions, and exit.",
+            help="Install completion of commands, projects, paths, jobs and versions for the current shell, and exit.",
         ),
     ] = False,
     show_completion: Annotated[  # noqa: ARG001 - its callback does it
         Literal["bash", "zsh", "fish"] | None,
         typer.Option(
-            "--show-completion", callback=_show_completion, is_eager=True, help="Show the script of a shell, and exit."
+            "--show-completion",
+            callback=_show_completion,
+            is_eager=True,
+            help="Print the completion script for this shell, and exit.",
         ),
     ] = None,
 ) -> None:

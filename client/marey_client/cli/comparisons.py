@@ -88,7 +88,7 @@ def _print_several(document: Mapping[str, Any]) -> None:
     for name in names:
         columns += [name, ""]
     print_table(columns, rows, right=[columns[1], *names])
-    typer.echo(f"Each verdict is that of the change from {document['names']['before']}; --out writes a report.")
+    typer.echo(f"Each verdict is about the change from {document['names']['before']}; --out writes a report.")
 
 
 def _print_comparison(document: Mapping[str, Any]) -> None:

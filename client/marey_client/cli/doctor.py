@@ -55,12 +55,12 @@ def doctor(
 
     Prints one line for each check: ok, warning or fault, and what to do. The exit status is 1 if there are faults. On a
     machine without a server's data folder, use --no-local; while the server is stopped, use --no-remote. Only the token
-    of an administrator shows workers and the reason why a server is not ready. Where MAREY_SCRIPT_REPOSITORIES is set,
-    the command also checks how far this machine confines scripts.
+    of an administrator shows workers and the reason why a server is not ready. If MAREY_SCRIPT_REPOSITORIES is set, the
+    command also checks which limits and isolation this machine can enforce on scripts.
 
     With --chaos, the command creates a project, of which you are the owner, starts workers for this project only, kills
-    and pauses them, loses answers, and repeats requests with wrong times. Then it checks that each job has exactly one
-    visible result, and removes the project. On a server with the usual leases of a minute, it takes a few minutes.
+    and pauses them, ignores answers, and repeats requests with wrong times. Then the command checks that each job has
+    exactly one visible result, and removes the project. With the usual leases of a minute, this takes a few minutes.
     """
     findings: list[Finding] = []
     if chaos:
@@ -85,7 +85,7 @@ def doctor(
 
 
 def _check_scripts() -> list[Finding]:
-    """Return how far this machine confines scripts, if its workers run any."""
+    """Return the finding about the isolation of scripts; no finding unless workers of this machine run scripts."""
     from marey_client import embedded
     from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from marey_schemas.items import Staleness
 
 FEW = 50
-"""Number of items up to which each is asked for, because their folder may contain many others."""
+"""Greatest number of items that are examined by one request each; for more, whole folders are examined."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -36,7 +36,7 @@ def df(
     projects: Annotated[list[str] | None, typer.Argument(help="Projects; default: all that you may read.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show how many items and bytes projects hold, and how much they may hold, the largest project first.
+    """Show how many items and bytes projects contain, and their limits, the largest project first.
 
     Deleted items do not count; `marey purge` frees what they occupy.
     """
@@ -59,7 +59,7 @@ def df(
 
 
 def size_text(size_bytes: int) -> str:
-    """Return a size for people: with three digits, in MiB or GiB."""
+    """Return a size for people: rounded to three digits, in MiB or GiB."""
     unit, name = (GIB, "GiB") if size_bytes >= GIB else (MIB, "MiB")
     size = size_bytes / unit
     return f"{size:,.{max(0, 2 - len(str(int(size))) + 1)}f} {name}"
@@ -96,10 +96,10 @@ def stale(
 
 
 def outdated(project: ProjectHandle, items: Sequence[ItemHandle]) -> list[tuple[ItemHandle, Staleness]]:
-    """Return those of the items of which an input has a newer revision, each with these inputs.
+    """Return the items that are outdated, because an input has a newer revision, each with these inputs.
 
-    Few items are asked for one by one. Otherwise, the server is asked once for each page of a kind, for the folder that
-    contains all the items, and examines all items of the kind there.
+    Up to `FEW` items are examined one by one. For more items, the server examines all items of the same kinds in the
+    deepest folder that contains all given items; the result contains only the given items.
     """
     with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
         if len(items) <= FEW:
@@ -113,7 +113,7 @@ def outdated(project: ProjectHandle, items: Sequence[ItemHandle]) -> list[tuple[
 
 
 def _common_folder(folders: Sequence[str]) -> str:
-    """Return the path of the deepest folder that is equal to or above each of the folders; empty: the root."""
+    """Return the path of the deepest folder that contains all the folders or is one of them; empty: the root."""
     parts = [folder.split("/") for folder in folders]
     shared: Iterator[str] = (step[0] for step in takewhile(lambda step: len(set(step)) == 1, zip(*parts, strict=False)))
     return "/".join(shared)

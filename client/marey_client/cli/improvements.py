@@ -125,9 +125,9 @@ def sweep(
 def submit_and_follow(
     marey: Marey, handle: EvaluationHandle, request: JobCreate, job: Chosen, wait: bool, as_json: bool
 ) -> Findings | None:
-    """Submit a job and follow it.
+    """Submit a job, wait for its end, and return its findings.
 
-    Returns its findings, or None if the command does not wait, since the job itself was then printed.
+    Without `wait`, the submitted job is printed instead, and the result is None.
     """
     from marey_client.handles.findings import Findings
 
@@ -147,7 +147,7 @@ def _places(marey: Marey, handle: EvaluationHandle, candidates: Sequence[str] | 
 def print_findings(
     found: Findings, document: Mapping[str, Any], as_json: bool, show: Callable[[Mapping[str, Any]], None]
 ) -> None:
-    """Print the findings of a job: summary and document as JSON, or the document as text, by `show`."""
+    """Print the findings of a job: summary and document as JSON, or the document as text by calling `show`."""
     if as_json:
         print_json({"summary": found.summary, **_plain(document)})
     else:
@@ -168,7 +168,7 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
          f"{redundant['tried']} of {redundant['needed']} used clips were tried", redundant["plan"]),
         (f"{counted(len(document['near_duplicates']['pairs']), 'pair')} of clips with nearly the same motion, within "
          f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
-        (f"{counted(len(document['fillings']), 'clip')} would fill holes", document["fillings"]),
+        (f"{counted(len(document['fillings']), 'clip')} would fill gaps in the coverage", document["fillings"]),
         ("Order in which to add clips", document["additions"]),
     )  # fmt: skip
     _print_sections(sections, unused)
@@ -188,11 +188,11 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
             f"{one['folder']}: {counted(one['clips'], 'clip')} cannot be matched: {one['detail']} ({one['code']})"
         )
     if not any(entries for _, entries in sections):
-        typer.echo("No clip was found that can be removed or that would fill a hole.")
+        typer.echo("No clip was found that can be removed, or that would fill a gap in the coverage.")
 
 
 def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unused: Mapping[str, Any]) -> None:
-    """Print the reasons of suggestions, list by list; the effect of all unused data together follows its list."""
+    """Print lists of suggestions with reasons; after a list of unused data, print the effect of removing all of it."""
     for heading, entries in sections:
         if not entries:
             continue
@@ -208,7 +208,7 @@ def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
 
 
 def _print_similarity(similarity: Mapping[str, Any]) -> None:
-    """Print how many poses can be blended, by metres or by the metric that was chosen."""
+    """Print the share of poses that can be blended; the limit of the distance is in metres, or that of the metric."""
     if similarity["share"] is None:
         return
     limit = f"{similarity['threshold_m']:.2f} m" if "threshold_m" in similarity else f"{similarity['threshold']:.2f}"
@@ -247,7 +247,7 @@ def _print_steps(document: Mapping[str, Any]) -> None:
     typer.echo(reasons[document["ended"]])
     if document["total"] is not None:
         change = _change(document["total"]["objective"])
-        typer.echo(f"All steps together change the objective by {change} m, in replicates that had no part in them.")
+        typer.echo(f"All steps together change the objective by {change} m, in replicates not used to choose them.")
 
 
 def _confirmed(effect: Mapping[str, Any] | None) -> str:
@@ -255,13 +255,13 @@ def _confirmed(effect: Mapping[str, Any] | None) -> str:
 
 
 def _chance_in_words(refused: Mapping[str, Any]) -> str:
-    """Say why an effect was refused: its probability is corrected for the candidates of its step."""
+    """Return a sentence with the probability of an effect by chance, corrected for the number of candidates."""
     p = refused["effect"]["objective"]["p"]
     return "" if p is None else f" Among several candidates, chance alone changes it so much with probability {p:.2f}."
 
 
 def _change(change: Mapping[str, Any]) -> str:
-    """Write a change with its interval, if it has one."""
+    """Return a change as text, followed by its interval if there is one."""
     interval = "" if change["low"] is None else f" ({change['low']:+.4f} to {change['high']:+.4f})"
     return f"{change['change']:+.4f}{interval}"
 

@@ -59,12 +59,12 @@ def _draw(graph: LineageGraph, picture: Path) -> None:
 
 
 def described(graph: LineageGraph) -> Iterator[str]:
-    """Yield the lines of a text that describes a graph, starting from its first revision."""
+    """Yield the lines of an indented text that describes a graph, from the revision where the graph starts."""
     return _LineageTree(graph).lines()
 
 
 _Branch: TypeAlias = "Iterator[str | _Branch]"
-"""Iterator over the lines of a tree, and over branches with further lines."""
+"""Iterator over the lines of a tree; an element is a line, or a branch: an iterator over further lines."""
 
 
 class _LineageTree:

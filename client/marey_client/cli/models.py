@@ -82,7 +82,7 @@ def sample(
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Draw motions from a model, and write them to files or make clips of them."""
+    """Draw motions from a model, and write the motions to files or create clips from them."""
     if format not in SAMPLE_FORMATS:
         raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(SAMPLE_FORMATS)}")
     if into is not None and out is not None:

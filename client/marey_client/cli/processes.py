@@ -26,7 +26,8 @@ DatabaseUrl = Annotated[
     str | None,
     typer.Option(
         help="URL of a Postgres database, postgresql://...; default: the SQLite file marey.db in the data folder. "
-        "Other users can see it: if it contains a password, give it in the variable MAREY_DATABASE_URL instead."
+        "Other users of this machine can see the options of a command: if the URL contains a password, set the "
+        "environment variable MAREY_DATABASE_URL instead."
     ),
 ]
 
@@ -188,19 +189,22 @@ def upgrade_database(
     while_serving: Annotated[
         bool,
         typer.Option(
-            "--while-serving", help="Refuse an upgrade after which servers of the earlier version could not go on."
+            "--while-serving",
+            help="Refuse the upgrade if running servers of the earlier version could not use the upgraded database.",
         ),
     ] = False,
     finish: Annotated[
         bool,
         typer.Option(
-            "--finish", help="Also remove what only earlier versions use; no server of an earlier version may run."
+            "--finish",
+            help="Also remove the parts of the schema that only earlier versions use; no server of an earlier version "
+            "may run.",
         ),
     ] = False,
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
-    """Bring the database's schema up to date, and print whether servers of the earlier version can go on."""
+    """Upgrade the schema of the database, and print whether servers of the earlier version can still use it."""
     _database("upgrade", data, database_url, while_serving=while_serving, finish=finish)
 
 

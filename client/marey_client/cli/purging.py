@@ -104,7 +104,10 @@ def purge(
 
 
 def _purge_dataset(project: ProjectHandle, name: str, *, preview: bool, yes: bool, as_json: bool) -> None:
-    """Purge a deleted dataset, or print what the purge would do. Raises `Refused` if something cites a version."""
+    """Purge a deleted dataset, or print what the purge would do.
+
+    Raises `Refused` if an object refers to a version of the dataset.
+    """
     answer = project.purge_dataset(name, preview=True)
     if not answer.holders and not preview:
         if not yes:
@@ -163,8 +166,8 @@ def _is_folder(project: ProjectHandle, address: Address) -> bool:
     items = project.purge(path=address.path, preview=True)
     if items.purged or items.refused:
         raise WrongUsage(
-            f"{address} is a folder and a removed item; write {address}/ for all items removed from the folder, or the "
-            "id of the item"
+            f"{address} names both a folder and a removed item; write {address}/ for all items removed from the "
+            "folder, or the id of the item"
         )
     return True
 

@@ -248,7 +248,9 @@ def _index_of(marey: Marey, project: str, index: str) -> str:
 
     address = Address.parse(index if "/" in index else f"{project}/{index}")
     if address.project != project:
-        raise WrongUsage(f"the index {index} is in the project {address.project}; the clip is in {project}")
+        raise WrongUsage(
+            f"the index {index} is in the project {address.project}; give an index in {project}, where the clip is"
+        )
     return str(require_item(marey, address, [Kind.INDEX]).id)
 
 

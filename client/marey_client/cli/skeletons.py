@@ -111,10 +111,11 @@ def merge(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be merged, and change nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Merge skeletons of one rig, such as those of takes that an earlier version gave a skeleton each.
+    """Merge skeletons of one rig, for example if an earlier version created a skeleton for each take.
 
-    Skeletons are one rig if they differ only in the offset of the root, in offsets that the motions replace, or by
-    rounding. Clips and models get a new revision with the kept skeleton and the same motion; the others are deleted.
+    Skeletons are of one rig if they differ only in the offset of the root, in offsets that the motions replace, or by
+    rounding. Clips and models get a new revision with the remaining skeleton and the same motion; the other skeletons
+    are deleted.
     """
     from marey_schemas.kinds import Kind
 
@@ -144,7 +145,10 @@ def merge(
 
 
 def _assigned(assignments: list[str], known: set[str], mapped: Mapping[str, str]) -> dict[str, str]:
-    """Return the joint of each standard joint in the texts; names in `mapped` can be cleared whatever they are."""
+    """Parse texts such as `hips=Pelvis`; return the joint by standard joint, empty to clear the mapping.
+
+    A name in `mapped` can be cleared even if it is not a standard joint.
+    """
     from marey_schemas.documents.standard_joints import STANDARD_JOINTS
 
     given: dict[str, str] = {}
@@ -161,7 +165,7 @@ def _assigned(assignments: list[str], known: set[str], mapped: Mapping[str, str]
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:
-    """Return the end of a sentence about a wrong name, with the most similar names, or with some of them."""
+    """Return the end of an error text about a wrong name: the most similar valid names, otherwise the first few."""
     similar = get_close_matches(name, names, n=3)
     if similar:
         return f"; did you mean {' or '.join(similar)}?"

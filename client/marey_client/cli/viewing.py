@@ -58,7 +58,11 @@ def view(
     revision: RevisionNumber = None,
     beside_revision: Annotated[
         int | None,
-        typer.Option(min=1, help="Revision of the clip after --beside; without --beside, of the same clip."),
+        typer.Option(
+            min=1,
+            help="Revision of the clip that --beside names; without --beside, show this revision of the same clip "
+            "beside the clip.",
+        ),
     ] = None,
     browser: InBrowser = False,
     out: Annotated[
@@ -117,7 +121,10 @@ def page_address(marey: Marey, project: str, path: str, query: Mapping[str, str]
 
 
 def show_page(url: str, *, browser: bool) -> None:
-    """Open the address of a page in a browser of this machine, or print it. Raises `WrongUsage` without a browser."""
+    """Print the address of a page; with `browser`, open the page in a browser of this machine instead.
+
+    Raises `WrongUsage` if no browser is found.
+    """
     if browser:
         return _open(url)
     return typer.echo(url)
@@ -128,7 +135,10 @@ def _named(item: str, revision: int | None) -> str:
 
 
 def _source_of(marey: Marey, clip: ItemHandle, revision: int | None) -> tuple[ItemHandle, int]:
-    """Return the clip from which a clip was made, and its revision. Raises `WrongUsage` if it is not just one."""
+    """Return the source of a clip, and the revision of the source.
+
+    Raises `WrongUsage` unless the clip was made from exactly one clip that still exists.
+    """
     graph = clip.lineage_graph(revision, direction="inputs", depth=1)
     sources = [one for one in graph.revisions if one.kind is Kind.CLIP and one.distance == -1 and not one.deleted]
     if len(sources) != 1:
@@ -143,7 +153,7 @@ def _source_of(marey: Marey, clip: ItemHandle, revision: int | None) -> tuple[It
 
 @dataclass(frozen=True)
 class Drawing:
-    """File with poses, and what it shows: poses in a row, and rows of a model or an evaluation."""
+    """Picture or page to write: file `out`, poses per row, and number of samples or trials, drawn with `seed`."""
 
     out: Path
     moments: int
@@ -162,7 +172,7 @@ class Drawing:
         return self._write(draw_worst_trials(found, revision, self.rows, self.moments, form))
 
     def of_clips(self, pair: Sequence[tuple[Any, int | None]], frames: str | None) -> Path:
-        """Draw a clip, and the second one of the pair below it; return the path of the file."""
+        """Draw one or two clips, each at a revision, the second one below the first; return the path of the file."""
         from marey_client.poses.strips import ClipOfStrip, draw_clips
 
         chosen = None if frames is None else read_frames(frames)
@@ -214,7 +224,7 @@ def read_frames(text: str) -> slice:
 
 
 def _open(url: str) -> None:
-    """Open an address in the browser by a file, because other users could read the arguments of a program."""
+    """Open an address in the browser by way of a file, because other users could see it as a program's argument."""
     with tempfile.NamedTemporaryFile("w", prefix="marey-view-", suffix=".html", delete=False) as file:
         file.write(_REDIRECT.format(url=html.escape(url)))
     if webbrowser.open(Path(file.name).as_uri()):

@@ -112,7 +112,7 @@ def read_range(dataset: VersionReader, good: str, bad: str, *, first_parent: boo
         if waiting and earlier is None:  # the versions before `good` matter only if there are merges
             earlier = set(_with_ancestors(dataset, first.digest))
     if not met:
-        advice = "; without following only first parents, it may be" if first_parent else ""
+        advice = "; without the restriction to first parents, it may be found" if first_parent else ""
         raise CannotBisect(f"the good version, {good}, is not among the versions before the bad one, {bad}{advice}")
     commits = {digest: _plain(one) for digest, one in found.items() if not earlier or digest not in earlier}
     parents = {digest: one.parents[:1] if first_parent else one.parents for digest, one in commits.items()}

@@ -72,10 +72,10 @@ class ClipHandle(PosesHandle):
         return preview_edit(self.transport, self.url, commands, bounds, **given)
 
     def import_annotation(self, document: Mapping[str, Any] | str | Path, **options: Any) -> AnnotationHandle:
-        """Create an annotation in the clip's folder from a document of Marey's predecessor, or from the file of one.
+        """Create an annotation in the clip's folder from a document of Marey's predecessor, a dict or a file.
 
-        Only a file is given back byte for byte by an export. `options` are those of `AnnotationImport`, such as
-        `layer="phases"` or `end_index="exclusive"`.
+        Only an annotation from a file can be exported again byte for byte. `options` are those of `AnnotationImport`,
+        such as `layer="phases"` or `end_index="exclusive"`.
         """
         if isinstance(document, Mapping):
             source: dict[str, Any] = {"document": document}

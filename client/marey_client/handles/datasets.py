@@ -29,7 +29,7 @@ class ImportedVersion(NamedTuple):
     branch: str
     """The branch that was to move to the version."""
     moved: bool
-    """Whether the branch is at the version now; if not, the branch has other versions, and a merge can add this one."""
+    """Whether the branch is at the imported version now; if not, the branch has other versions, and can be merged."""
     tag: str | None = None
     """The tag that was copied with the version, or None."""
 
@@ -170,7 +170,7 @@ def _receive(
 def _forward(dataset: DatasetHandle, branch: str, commit: Commit) -> ImportedVersion:
     """Move a branch to the given commit if this commit is a descendant of the branch's newest commit.
 
-    A branch that does not exist is created. The result says whether the branch is at the commit now.
+    A branch that does not exist is created. The field `moved` of the result is true if the branch is at the commit now.
     """
     ref = dataset.find_ref(branch)
     if ref is None:

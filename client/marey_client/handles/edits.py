@@ -60,7 +60,7 @@ class Edits(Items[EditHandle]):
 
 
 def as_edit(commands: EditDocument | Command | Sequence[Command], *, title: str = "") -> EditDocument:
-    """Return commands as the document of an edit. Raises `ValidationError`, which names the faulty command."""
+    """Return commands as the document of an edit. Raises `BadArgument`, which names the faulty command."""
     if isinstance(commands, EditDocument):
         return commands if not title else commands.model_copy(update={"title": title})
     return checked(EditDocument, {"title": title, "commands": several(commands)})

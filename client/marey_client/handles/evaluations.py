@@ -27,7 +27,7 @@ from marey_schemas.queue.job_params import CompareParams, OptimiseParams, Sugges
 from marey_schemas.queue.jobs import JobCreate
 
 TRIAL_VERDICT = ("followed", "worst_rank", "beyond_limits")
-"""Verdict on a trial: whether it was followed, its place in the order of the worst (0: the worst), exceeded limits."""
+"""Fields of a trial's verdict: whether it was followed, its rank among the worst trials (0: worst), exceeded limits."""
 
 
 class EvaluationHandle(ReportedHandle):
@@ -165,7 +165,7 @@ class EvaluationHandle(ReportedHandle):
 
 
 def name_of_trial(trial: Mapping[str, Any]) -> str:
-    """Return the name of a trial of an evaluation's document, which its records have, too."""
+    """Return the name of a trial in an evaluation's document; the records of the trial have the same name."""
     return trial_name(trial["family"], trial["speed_m_s"], trial["turn_rate_rad_s"])
 
 

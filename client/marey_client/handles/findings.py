@@ -23,7 +23,7 @@ FILES = ("document", "report", "maps", "figures", "fitted", "table")
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of one job; `job.result` holds their counts."""
+    """Findings of one job: its results, with the files that some kinds of jobs also make."""
 
     transport: Transport
     job: Job
@@ -70,7 +70,7 @@ class Findings:
 
 @dataclass(frozen=True)
 class Quality(Findings):
-    """Quality of clips, with totals, beside that of a reference if there is one."""
+    """Quality of clips: numbers for each clip, totals, and the same for reference clips if some were given."""
 
     @property
     def conditions(self) -> QualityConditions:
@@ -82,10 +82,10 @@ class Quality(Findings):
         return QualityDocument.model_validate(self.document())
 
     def changes_since(self, earlier: Quality) -> Mapping[str, tuple[float, float]]:
-        """Return the totals of an earlier result and of this one, by measure, without measures that one of both lacks.
+        """Return the totals of an earlier result and of this result, by the name of the measure.
 
-        Raises `NotComparable` if they were measured under different conditions; the error has the command that measures
-        under the conditions of the earlier result.
+        Measures that only one of the two results has are left out. Raises `NotComparable` if the results were measured
+        under different conditions; the text contains the command that measures under the earlier conditions.
         """
         if different := differing_conditions(earlier.conditions, self.conditions):
             told = ", ".join(f"{name} is {before} and {now}" for name, (before, now) in different.items())

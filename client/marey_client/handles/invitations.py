@@ -1,4 +1,4 @@
-"""Invitations of users to a project, and of people who have no account to a server."""
+"""Invitations of users to a project, and invitations to a server for people who have no account."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Perceptual metrics, and the distances of clips that they give."""
+"""Perceptual metrics, and distances of clips measured by a perceptual metric."""
 
 from __future__ import annotations
 
@@ -33,16 +33,17 @@ class PerceptualMetrics(Items[MetricHandle]):
     """The perceptual metrics of a project."""
 
     def store(self, metric: MetricDocument | str, name: str, *, collection: str = "") -> MetricHandle:
-        """Store a metric, or the built-in one with this name, as an item, so that versions of datasets can contain it.
+        """Store a metric as an item, so that versions of datasets can contain the metric.
 
-        Raises `KeyError` if no built-in metric has the name, and `Conflict` if an item has it.
+        `metric` is a document or the name of a built-in metric; `name` is the name of the item. Raises `KeyError` if
+        there is no such built-in metric, and `Conflict` if an item has the name.
         """
         document = built_in_metric(metric) if isinstance(metric, str) else metric
         return self.create(name, {"metric": document.stored()}, collection=collection)
 
 
 def metric_choice(metric: Metric | None) -> tuple[dict[str, ItemInput], dict[str, Any]]:
-    """Return the input and the parameter of a job that name a metric; without a metric, both are empty."""
+    """Return the inputs and the parameters of a job that select a metric; both are empty without a metric."""
     if metric is None:
         return {}, {}
     if isinstance(metric, str):
@@ -59,11 +60,12 @@ class Distances(Findings):
         return np.asarray(self.document()["distances"])
 
     def maps(self) -> dict[str, NDArray[Any]]:
-        """Return motion maps and registration curves of the drawn pairs: the only pair, or nearest and farthest.
+        """Return arrays of motion maps and registration curves, for the only pair or the nearest and farthest pair.
 
-        The names begin with `pair0_` or `pair1_`. They end with the measurement or `combined` for maps, with frames of
-        the first clip as rows; with `map_rate_hz` for the frame rate of rows and columns; and with `curve_first_s` and
-        `curve_second_s` for the times at which both clips show the same moment.
+        The names begin with `pair0_` or `pair1_`. The name of a map ends with the measurement or with `combined`; rows
+        are frames of the first clip, columns frames of the second clip. The name of the frame rate of both ends with
+        `map_rate_hz`. The times in seconds at which the two clips show the same moment have names that end with
+        `curve_first_s` and `curve_second_s`.
         """
         with np.load(io.BytesIO(Blobs(self.transport).fetch(self._blob("maps")))) as arrays:
             return dict(arrays)

@@ -25,10 +25,10 @@ def purge_items(transport: Transport, project: str, request: PurgeRequest) -> Pu
 
 
 def without_contained(previews: Sequence[PurgeAnswer]) -> list[int]:
-    """Return the indices of the previews that together contain all items, in ascending order.
+    """Return the indices, in ascending order, of previews that together contain all items.
 
-    Left out are previews whose items all occur in larger ones: the same bytes would count twice, and the purge of these
-    items would be requested twice.
+    Previews whose items all occur in larger previews are left out; otherwise the same bytes would be counted twice, and
+    the purge of the same items would be requested twice.
     """
     items = [{one.item for one in each.purged} | {one.item for one in each.refused} for each in previews]
     kept: list[int] = []
@@ -43,8 +43,8 @@ def without_contained(previews: Sequence[PurgeAnswer]) -> list[int]:
 def combined(answers: Sequence[PurgeAnswer]) -> PurgeAnswer:
     """Combine the answers of a purge into one answer.
 
-    An item that occurs in several answers is listed once, but its bytes count in each. Bytes that items of different
-    answers have in common are not counted in previews, so the purge may free more bytes than the previews state.
+    An item that occurs in several answers is listed once, but its bytes are counted once per answer. Previews do not
+    count bytes that items of different answers share, so the purge may free more bytes than the previews state.
     """
     return PurgeAnswer(
         preview=answers[0].preview,

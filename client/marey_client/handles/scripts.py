@@ -81,7 +81,10 @@ class ScriptHandle:
         return self.transport.post(Job, f"{self.url}/runs", request)
 
     def runs(self, *, sort: str = "-created_at", limit: int = 50) -> tuple[ScriptRun, ...]:
-        """Return the first runs in an order: `created_at`, `fields.<name>` or `values.<name>`; `-` reverses it."""
+        """Return the first `limit` runs, sorted by `created_at`, `fields.<name>` or `values.<name>`.
+
+        A minus sign before the key reverses the order, as in `-created_at`.
+        """
         found = pages(self.transport, ScriptRun, f"{self.url}/runs", {"sort": sort, "limit": limit})
         return tuple(found)
 
@@ -94,11 +97,11 @@ class ScriptHandle:
         goals: Mapping[str, Goal] | None = None,
         curves: bool = False,
     ) -> RunComparison:
-        """Compare the succeeded runs, the first `limit` in an order: their settings, logged fields and curves.
+        """Compare settings, logged fields and curves of the first `limit` succeeded runs in the order `sort`.
 
-        Without `limit`, as many as possible are compared. `fields` are the logged fields to compare, by default
-        all, and `goals` say which value of a field is the best. The result contains `curves` of at most 6 fields if
-        they are requested. Raises `BadRequest` for a field that no run has logged.
+        Without `limit`, as many runs as possible are compared. `fields` are the logged fields to compare, by default
+        all. `goals` state for a field whether its highest or its lowest value is the best. With `curves`, the result
+        contains the curves of at most 6 fields. Raises `BadRequest` for a field that no run has logged.
         """
         named: dict[str, str] = {
             goal: ",".join(name for name, own in (goals or {}).items() if own == goal) for goal in GOALS

@@ -73,7 +73,10 @@ class StudyHandle(ItemHandle):
         return pages(self.transport, JudgingParticipant, f"{self.url}/judgements", query)
 
     def analyse(self, *, on_progress: OnProgress | None = None, **options: Unpack[AnalyseStudyKeywords]) -> Findings:
-        """Compute differences, order and groups of the motions, and fit metrics; `options`: `AnalyseStudyParams`."""
+        """Compute differences, order and groups of the motions, and fit metrics.
+
+        `options` are those of `AnalyseStudyParams`.
+        """
         request = self.analyse_request(**options)
         return Findings(self.transport, Jobs(self.transport).run(self.project, request, on_progress=on_progress))
 

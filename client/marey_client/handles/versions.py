@@ -216,8 +216,8 @@ class DatasetHandle:
     ) -> CheckoutAnswer:
         """Change the folder of the dataset to the content of a version.
 
-        With `query` or `paths`, only the entries are checked out that the query selects and that are at one of the
-        paths or below it. The folder remembers this selection: later commits of the folder keep all other entries.
+        With `query`, only entries that the query selects are checked out; with `paths`, only entries at one of the
+        paths or below it. The server stores this selection: later commits of the folder keep all other entries.
 
         Raises `Conflict` if the folder has changes that no commit has recorded, unless `discard` is true.
         """

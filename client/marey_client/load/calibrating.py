@@ -15,10 +15,10 @@ from marey_client.load.scratch import Scratch, scratch_project
 from marey_client.marey import Marey
 
 ALONE, SOME, CROWDED = 1, 4, 16
-"""Numbers of workers of the calibration: one that never waits for others, some, and enough to saturate the server."""
+"""Numbers of workers of the calibration: a single worker, some workers, and enough workers to saturate the server."""
 LONGEST_DRAIN_S = 300.0
 JOBS_OF_A_WORKER = 10
-"""Number of jobs in the backlog per worker; at least `FEWEST_JOBS`."""
+"""Number of jobs in the backlog for each worker; a backlog has at least `FEWEST_JOBS` jobs."""
 FEWEST_JOBS = 60
 
 OnDrain = Callable[[str], None]
@@ -38,10 +38,11 @@ class Drain:
 class Calibration:
     """Costs of a job on one server, and the jobs per second of the checked numbers of workers.
 
-    `claim_s` and `complete_s` are the mean durations of the requests of a worker that is alone; `variation` is their
-    standard deviation over their mean. `busy_s` is the time per job when `CROWDED` workers compete, and `some_per_s`
-    the jobs per second of `SOME` workers. `work_s` is the time of a worker alone outside its requests; it is
-    longer than planned on a busy machine. All rounds count together: the times of their jobs are added up.
+    `claim_s` and `complete_s` are the mean durations of the two requests of a single worker, in seconds; `variation` is
+    the standard deviation of these durations divided by the mean. `busy_s` is the time per job when `CROWDED` workers
+    compete. `some_per_s` is the number of jobs per second of `SOME` workers. `work_s` is the time per job that a single
+    worker spends outside its requests; it is longer than planned on a busy machine. All values are computed from
+    all rounds.
     """
 
     claim_s: float
@@ -66,16 +67,19 @@ def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
     with load.workers(workers, work_s):
         load.await_end(LONGEST_DRAIN_S, begun, lambda _: None)
     if load.errors or len(load.completed) < len(load.planned):
-        raise MareyError(f"the backlog was not drained without errors: {dict(load.errors) or 'too slow'}")
+        raise MareyError(
+            f"the simulated workers did not complete all jobs of the measurement: {dict(load.errors) or 'too slow'}"
+        )
     ends = sorted(load.completed.values())
     claims = sorted(load.durations_s["claim"])[: len(ends)]  # the longest are those that waited in vain at the end
     return Drain((len(ends) - 1) / (ends[-1] - ends[0]), tuple(claims), tuple(load.durations_s["complete"]))
 
 
 def calibrate(marey: Marey, checked: Sequence[int], *, rounds: int, work_s: float, on_drain: OnDrain) -> Calibration:
-    """Measure the costs of a job, and the drains of other numbers of workers, in several rounds.
+    """Measure the costs of a job, and the jobs per second of the numbers of workers in `checked`.
 
-    Measuring in turn lets a change of the machine's speed affect all numbers of workers.
+    Each of the `rounds` measures every number of workers once, so that a change of the machine's speed affects all
+    numbers alike.
     """
     counts = (ALONE, SOME, CROWDED, *checked)
     found: dict[int, list[Drain]] = {count: [] for count in counts}
@@ -107,7 +111,7 @@ def calibrate(marey: Marey, checked: Sequence[int], *, rounds: int, work_s: floa
 
 
 def _together(drains: Sequence[Drain]) -> float:
-    """Return the jobs per second of several drains of equally many jobs, whose times are added up."""
+    """Return the mean jobs per second of several drains with the same number of jobs: all jobs over the total time."""
     return statistics.harmonic_mean([one.per_s for one in drains])
 
 

@@ -15,7 +15,7 @@ from marey_client.credentials import trusted_authorities
 from marey_schemas.address import API
 
 NO_ANSWER = "no-answer"
-"""Code of a request that got no answer, because the connection broke or the time was over."""
+"""Code of a request that got no answer, because the connection broke or the time limit was exceeded."""
 TIMEOUT_S = 60.0
 
 
@@ -56,7 +56,7 @@ class LoadConnection:
         token: str | None = None,
         headers: Mapping[str, str] = MappingProxyType({}),
     ) -> LoadAnswer:
-        """Send a JSON document by POST; a `token` replaces that of the connection for this request."""
+        """Send a JSON document by POST; a `token` replaces the connection's token for this request."""
         sent = {**self._headers, **headers}
         if token is not None:
             sent["Authorization"] = f"Bearer {token}"
@@ -85,7 +85,10 @@ def connection(url: str, token: str) -> Iterator[LoadConnection]:
 
 
 def _read(status: int, body: bytes) -> tuple[str, dict[str, Any]]:
-    """Return the code and the document of an answer's body; an answer that is not JSON has a code of its status."""
+    """Return error code and document of an answer; the code is empty without an error.
+
+    An answer whose body is not a JSON object has the code `http-` followed by the status.
+    """
     try:
         document = orjson.loads(body) if body else {}
     except orjson.JSONDecodeError:

@@ -42,7 +42,10 @@ class Estimate:
 
 
 def percentile(values: Iterable[float], percent: float) -> float:
-    """Return the smallest of the values that at least `percent` % of the values do not exceed; NaN if there is none."""
+    """Return a percentile by the nearest-rank method; NaN without values.
+
+    The result is the smallest of the values for which at least `percent` % of the values are not greater.
+    """
     ordered = sorted(values)
     return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)] if ordered else math.nan
 
@@ -51,8 +54,8 @@ def percentile(values: Iterable[float], percent: float) -> float:
 class Replicate:
     """Measurements of one run at one rate.
 
-    `starts_s` contains, for each job that was started, the seconds from the time at which it was to be submitted to its
-    start. `errors` counts error answers by request and code.
+    `starts_s` contains, for each started job, the seconds from its planned submission to its start. `errors` contains
+    the number of failed requests by kind of request and error code.
     """
 
     seconds: float
@@ -63,7 +66,7 @@ class Replicate:
 
     @property
     def cycles_per_s(self) -> float:
-        """Number of jobs per second that were submitted, claimed and completed."""
+        """The number of completed jobs per second."""
         return self.completed / self.seconds
 
 
@@ -108,7 +111,8 @@ _SAMPLE = re.compile(r"^(\w+)(?:\{([^}]*)\})? (\S+)", re.MULTILINE)
 class ServerUse:
     """Use of processor time and of the database by a server during a test, from its metrics.
 
-    The metrics are those of one server process; behind a proxy that distributes requests to several, they mean little.
+    The metrics are those of one server process. Behind a proxy that distributes requests to several processes, the
+    results mean little.
     """
 
     def __init__(self, transport: Transport) -> None:
@@ -124,7 +128,7 @@ class ServerUse:
         self._waiting = max(self._waiting, sum(lanes))
 
     def figures(self, jobs: int) -> dict[str, float]:
-        """Return processor time and database bytes per job, and the greatest numbers since the start.
+        """Return processor time and database bytes per job, and the greatest numbers of connections and waiting calls.
 
         The metric of the database's size may be a minute old, so its growth is exact only for longer tests.
         """
@@ -150,5 +154,8 @@ def read_samples(text: str) -> dict[str, float]:
         (f"{name}{{{labels}}}" if labels else name): float(value) for name, labels, value in _SAMPLE.findall(text)
     }
     if not samples:
-        raise MareyError("the server's answer to GET /metrics contains no metrics; is something between it and you?")
+        raise MareyError(
+            "the server's answer to GET /metrics contains no metrics; check whether a proxy answers instead of the "
+            "server"
+        )
     return samples

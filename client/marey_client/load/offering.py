@@ -33,7 +33,7 @@ Tick = Callable[[float], None]
 
 
 class OfferedLoad:
-    """One run: the planned and the actual times of its jobs, and its errors. Times are those of the monotonic clock."""
+    """Run of a load test: planned and actual times of its jobs, by the monotonic clock, and numbers of errors."""
 
     def __init__(self, scratch: Scratch, *, own_workers: bool) -> None:
         self._scratch = scratch
@@ -94,7 +94,7 @@ class OfferedLoad:
                 thread.join()
 
     def _thread(self, function: Callable[..., None], *arguments: object) -> threading.Thread:
-        """Run a function in a thread; `_follow` raises what it raises."""
+        """Run a function in a thread; an exception of the function is raised again by `_follow`."""
 
         def work() -> None:
             try:
@@ -152,7 +152,7 @@ class OfferedLoad:
         return reply
 
     def _accepted(self, what: str, reply: LoadAnswer) -> bool:
-        """Return whether a request succeeded; count its error otherwise."""
+        """Return whether a request succeeded; if it failed, count the error."""
         if not reply.code:
             return True
         with self._lock:
@@ -160,9 +160,9 @@ class OfferedLoad:
         return False
 
     def ends_on_server(self) -> dict[str, tuple[float, float | None]]:
-        """Return, for each started job, the delay of its start and its end in seconds since its submission.
+        """Return start and end of each started job, by id, in seconds after its submission; the end may be None.
 
-        Both are measured by the server's clock, because other workers run the jobs.
+        Both times are by the server's clock, because workers of other processes run the jobs.
         """
         found = {}
         for job in self._scratch.project.jobs():
@@ -173,7 +173,7 @@ class OfferedLoad:
 
 
 def arrival_times(rate: float, seconds: float, seed: int) -> list[float]:
-    """Return the times, in seconds, of a Poisson process with the given rate per second. Equal seeds, equal times."""
+    """Return the times, up to `seconds`, of a Poisson process with `rate` events per second; the seed fixes them."""
     draw = random.Random(seed)  # noqa: S311 - times of a test, not secrets
     gaps = (draw.expovariate(rate) for _ in itertools.count())
     return list(itertools.takewhile(lambda time_s: time_s < seconds, itertools.accumulate(gaps)))
@@ -182,7 +182,7 @@ def arrival_times(rate: float, seconds: float, seed: int) -> list[float]:
 def run_with_own_workers(
     scratch: Scratch, times_s: Sequence[float], seconds: float, *, workers: int, work_s: float, tick: Tick
 ) -> Replicate:
-    """Submit jobs at the given times, run them with simulated workers, and return what was measured."""
+    """Submit jobs at the given times, run the jobs with simulated workers, and return the measurements."""
     run = OfferedLoad(scratch, own_workers=True)
     begun = time.monotonic()
     with run.workers(workers, work_s):

@@ -68,4 +68,4 @@ def _address(process: subprocess.Popen[bytes], log: Path) -> str:
             return url
         time.sleep(LOOK_EVERY_S)
     text = log.read_text(encoding="utf-8", errors="replace")
-    raise MareyError(f"the server of the test did not start: {text[-SHOWN_LOG:].strip() or 'it wrote nothing'}")
+    raise MareyError(f"the server of the test did not start: {text[-SHOWN_LOG:].strip() or 'its log is empty'}")

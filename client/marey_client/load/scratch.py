@@ -18,9 +18,9 @@ from marey_schemas.queue.jobs import JobState
 
 PREFIX = "bench-"
 LABEL = "bench"
-"""Label that jobs of a scratch project require, so that only the workers of the test claim them."""
+"""Name of the label that jobs of a scratch project require, so that only workers of the test claim the jobs."""
 TOKEN_LIFETIME_S = 6 * 3600
-"""Lifetime of the test's token, in case the test is killed before it can revoke the token."""
+"""Lifetime of the test's token in seconds, in case the test is killed before it can revoke the token."""
 CANCELS_AT_ONCE = 4
 KIND = "import"
 """Kind of the jobs of a test: an import of one tiny clip, for which workers need little time."""

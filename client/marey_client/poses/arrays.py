@@ -41,8 +41,9 @@ Joints = str | Sequence[str] | None
 class PosedItem(ItemHandle):
     """Handle of an item with the part `motion`.
 
-    `frames` are slices such as `slice(0, 120)`; they are counted from 0, and None means all frames. `joints` are names,
-    and the results have the joints in the given order. Except for `motion`, methods read the revision of the handle.
+    The argument `frames` is a slice such as `slice(0, 120)`; frames are counted from 0, and None means all frames. The
+    argument `joints` contains names; the results have the joints in this order. Methods read the revision of the
+    handle, except `motion`, which by default reads the newest revision.
     """
 
     @property
@@ -77,9 +78,9 @@ class PosedItem(ItemHandle):
 
 
 def frames_text(frames: slice | None) -> str | None:
-    """Return a slice as the query parameter `first:end`; return None for None, which means all frames.
+    """Return a slice of frames as the query parameter `first:end`; None, which means all frames, stays None.
 
-    Raises `ValueError` for anything else than a slice, for a step other than 1, and for negative bounds.
+    Raises `BadArgument` for any other type than a slice, for a step other than 1, and for negative bounds.
     """
     if frames is None:
         return None
@@ -92,7 +93,5 @@ def frames_text(frames: slice | None) -> str | None:
         )
     bounds: tuple[Any, Any] = (frames.start, frames.stop)
     if any(bound is not None and bound < 0 for bound in bounds):
-        raise BadArgument(
-            "frames: negative bounds are not possible, because frames are counted from the start of the clip"
-        )
+        raise BadArgument("frames: negative bounds are not possible; count frames from the start of the clip, from 0")
     return ":".join("" if bound is None else str(bound) for bound in bounds)

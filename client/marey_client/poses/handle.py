@@ -1,4 +1,4 @@
-"""Handles of items with poses: what people ask of a clip in a script or a notebook."""
+"""Handles of items with poses: positions, velocities, contacts, tables and pictures of a clip."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ class PosesHandle(PosedItem):
     def positions(self, *, joints: Joints = None, frames: slice | None = None) -> NDArray[np.float32]:
         """Return the positions of joints in the world: (frames, joints, 3), metres, Y up.
 
-        Of other joints, only those between the given ones and the root are read. Raises `NoSuchJoint`, which names the
-        nearest joint, and `MissingPackage` without the extra `motion`.
+        Only the given joints and the joints between them and the root are read. Raises `NoSuchJoint`, which names the
+        most similar joint, if the skeleton lacks a joint, and `MissingPackage` without the extra `motion`.
         """
         return read_positions(self, joints, frames)
 
     def velocities(self, *, joints: Joints = None, frames: slice | None = None) -> NDArray[np.float32]:
         """Return the velocities of joints in the world: (frames, joints, 3), metres per second, Y up.
 
-        They are central differences, equal to those of the whole motion. Raises the errors of `positions`.
+        Velocities are central differences. At the ends of the range, they use the frames outside of the range, too.
+        Raises the errors of `positions`.
         """
         return read_velocities(self, joints, frames)
 
@@ -67,14 +68,14 @@ class PosesHandle(PosedItem):
         return to_xarray(self, joints, frames)
 
     def plot(self, *, frames: slice | None = None, moments: int = 8) -> MotionPicture:
-        """Draw poses at some moments, at equal distances; notebooks show the picture. Only these frames are read.
+        """Draw the poses at `moments` frames, evenly spaced over the range; notebooks show the picture.
 
-        Raises `MissingPackage` without the extra `figures`.
+        Only the drawn frames are read. Raises `MissingPackage` without the extra `figures`.
         """
         return draw_poses(self, frames, moments)
 
     def _repr_html_(self) -> str:
-        """Return the facts of the item and a strip of poses, which notebooks show."""
+        """Return path, revision, length and a strip of poses as HTML, which notebooks show."""
         facts = f"{self.frames:,} frames at {self.frame_rate_hz:g} Hz, {self.duration_s:.2f} s"
         text = f"<p><b>{html.escape(self.path)}</b>, revision {self.item.revision}: {facts}</p>"
         try:

@@ -1,7 +1,7 @@
 """Positions, velocities and contacts of the joints of stored motions; computed by `marey_motion` from local rotations.
 
-For the frames and joints that are asked for, only those frames and the joints up to the root are read. Skeletons are
-read once per connection.
+Only the requested frames are read, and only the requested joints and their ancestors. Skeletons are read once per
+connection.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from marey_schemas.wording import nearest
 
 MOTION_EXTRA = "motion"
 DIFFERENCE_FRAMES = 2
-"""Frames before and after a range that its velocities depend on; at the ends of a motion, they are extrapolated."""
+"""Number of frames before and after a range on which the velocities in the range depend."""
 FEET = tuple((f"{side}_toe", f"{side}_ankle") for side in ("left", "right"))
-"""Standard joints of both feet; the second one is used if the first is not mapped."""
+"""Standard joints of the left and the right foot: the toe, or the ankle if the toe is not mapped."""
 
 
 @dataclass(frozen=True)
 class PosedSkeleton:
-    """Skeleton of one revision, as far as positions need it."""
+    """Revision of a skeleton: its handle, and the hierarchy that positions are computed from."""
 
     handle: SkeletonHandle
     hierarchy: SkeletonHierarchy
 
     @cached_property
     def index(self) -> dict[str, int]:
-        """Index of each joint by its name."""
+        """The index of each joint, by the joint's name."""
         return {joint.name: place for place, joint in enumerate(self.hierarchy.joints)}
 
     def chains(self, names: tuple[str, ...]) -> list[int]:
@@ -61,18 +61,18 @@ class PosedSkeleton:
         return sorted(needed)
 
     def part_with(self, places: list[int]) -> SkeletonHierarchy:
-        """Return the hierarchy of some joints, which include the parents of each."""
+        """Return the hierarchy of the joints with the indices `places`, among which are the parents of all of them."""
         new = {old: place for place, old in enumerate(places)} | {-1: -1}
         kept = [self.hierarchy.joints[place] for place in places]
         return SkeletonHierarchy(joints=tuple(Joint(**(dict(joint) | {"parent": new[joint.parent]})) for joint in kept))
 
 
 _RIGS: WeakKeyDictionary[Transport, dict[tuple[str, str, int], PosedSkeleton]] = WeakKeyDictionary()
-"""Skeletons that were read over each connection, by project, and id and revision of the skeleton or of its clip."""
+"""Skeletons read over each connection, by (project, id, revision) of the skeleton and of each clip that uses it."""
 
 
 def rig_of(clip: PosedItem) -> PosedSkeleton:
-    """Return the skeleton that the handle's revision of a motion refers to."""
+    """Return the skeleton to which the motion in the handle's revision refers."""
     known = _RIGS.setdefault(clip.transport, {})
     by_clip = (clip.project, clip.id, clip.item.revision)
     if by_clip not in known:
@@ -86,7 +86,7 @@ def rig_of(clip: PosedItem) -> PosedSkeleton:
 
 
 def read_rig(clip: ItemHandle, reference: RevisionRef) -> PosedSkeleton:
-    """Return the revision of a skeleton to which a motion refers."""
+    """Request the revision of the skeleton to which `reference`, a field of a motion, refers."""
     item = clip.transport.get(Item, f"/projects/{clip.project}/{Kind.SKELETON.plural}/{reference.item}")
     handle = SkeletonHandle(clip.transport, clip.project, item)
     return PosedSkeleton(
@@ -148,7 +148,7 @@ def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
 
 
 def _widened(clip: PosedItem, frames: slice | None, more: int) -> tuple[slice | None, slice]:
-    """Return a range with `more` frames on both sides, and the place of the range in it."""
+    """Return a range extended by `more` frames on both sides, and the slice of the given range in the extended one."""
     frames_text(frames)  # refuses other steps and negative bounds
     if frames is None:
         return None, slice(None)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from marey_schemas.documents.clips import MotionDocument
 
 ANGLE_STEP_RAD = math.pi / 16383
-"""Step of the components of rotation vectors, which are at most pi. The error of a rotation is at most
-sqrt(3) / 2 steps, because the rotation between two rotation vectors is at most as long as their difference."""
+"""Quantisation step of rotation vectors, whose components are at most pi. The error of a rotation is at most
+sqrt(3) / 2 steps, because the angle between two rotations is at most the length of the difference of their vectors."""
 LENGTH_STEP_M = 5e-5
 _ANGLE_BYTES = 2
 _LENGTH_BYTES = 4
@@ -55,7 +55,9 @@ def rotation_vectors(quaternions: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _packed(values: NDArray[np.float64], width: int) -> str:
-    """Return numbers, (frames, channels) in steps, as base64 text: rounded, differenced, in byte planes, deflated.
+    """Pack `values`, (frames, channels) in quantisation steps, into base64 text.
+
+    The numbers are rounded, replaced by differences between frames, split into byte planes, and deflated.
 
     Integers wrap around, so that differences need no more bytes than the numbers themselves.
     """

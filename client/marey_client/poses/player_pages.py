@@ -42,7 +42,7 @@ class ShownMotion:
 
 
 def read_template(transport: Transport) -> bytes:
-    """Return the page without motion that the server offers. Raises `MareyError` if it has none."""
+    """Request the server's template of a page, without motion. Raises `MareyError` if the server has no template."""
     try:
         return transport.send("GET", PLAYER_PATH, headers={"Accept": "text/html"}).content
     except NotFound as error:
@@ -53,19 +53,22 @@ def read_template(transport: Transport) -> bytes:
 
 
 def page_with(template: bytes, title: str, motions: Sequence[ShownMotion]) -> bytes:
-    """Return a page that plays motions. Raises `MareyError` if the template has no place for them.
+    """Return a page that plays motions. Raises `MareyError` if the template has no element for their data.
 
-    Names cannot end the element that contains the data, because each `<` in it is escaped.
+    Each `<` in the data is escaped, so that no name can end this element.
     """
     if template.count(_PLACE) != 1:
-        raise MareyError("the server's page has no place for motion; upgrade the older one of client and server")
+        raise MareyError(
+            "the server's page has no element for motion, because client and server have different versions; upgrade "
+            "the older one"
+        )
     content = {"format": FORMAT, "title": title, "motions": [one.packed() for one in motions]}
     data = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return template.replace(_PLACE, _PLACE.replace(b"></", b">" + data.encode() + b"</"))
 
 
 def save_page(transport: Transport, target: Path, motions: Sequence[ShownMotion]) -> None:
-    """Write a page that plays motions beside each other to a file, which is complete or not there."""
+    """Write a page that plays motions beside each other to a file; if writing fails, no file is left."""
     if not 1 <= len(motions) <= MOST_MOTIONS:
         raise BadArgument(f"a page plays 1 to {MOST_MOTIONS} motions, not {len(motions)}")
     title = " beside ".join(one.name for one in motions[:2]) + (" …" if len(motions) > 2 else "")
@@ -75,9 +78,10 @@ def save_page(transport: Transport, target: Path, motions: Sequence[ShownMotion]
 
 
 def motions_of_clips(clips: Sequence[tuple[ClipHandle, int | None]], frames: slice | None) -> list[ShownMotion]:
-    """Read clips, each at a revision (None: the one of its handle), and the frames at the times of those of the first.
+    """Read clips, each at a revision (None: the handle's revision), as motions of a page.
 
-    Revisions are part of the names if two clips have the same path.
+    `frames` counts in frames of the first clip; of every other clip, the frames at the same times are read. If two
+    clips have the same path, the names contain the revisions.
     """
     leader = clips[0][0]
     paths = [clip.path for clip, _ in clips]
@@ -110,7 +114,7 @@ def motions_of_samples(model: ModelHandle, revision: int | None, n: int, seed: i
 
 
 def shown_motion(item: ItemHandle, name: str, motion: MotionDocument) -> ShownMotion:
-    """Return a motion with its skeleton, which is read in the project of an item."""
+    """Return a motion with its skeleton; the skeleton is read from the project of `item`."""
     reference = motion.skeleton
     assert isinstance(reference, RevisionRef)
     rig = read_rig(item, reference)

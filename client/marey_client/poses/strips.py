@@ -38,7 +38,7 @@ class ClipOfStrip:
         return self.revision or self.clip.item.revision
 
     def chosen(self, moments: int) -> list[int]:
-        """Return the numbers of the frames at some moments, at equal distances."""
+        """Return the numbers of `moments` frames, evenly spaced over the range."""
         return _spread(range(*(self.frames or slice(None)).indices(self._count)), moments, self.clip.path)
 
     def poses(self, frames: Sequence[int]) -> list[Any]:
@@ -55,11 +55,13 @@ class ClipOfStrip:
         return [_posed(one, rig) for one in found]
 
     def at_times_of(self, other: ClipOfStrip, frames: Sequence[int]) -> list[int]:
-        """Return the frames of this clip at the times of frames of another clip, as far as this clip reaches."""
+        """Return the frames of this clip at the times of `frames` of another clip; times after the end are left out."""
         ratio = self.clip.frame_rate_hz / other.clip.frame_rate_hz
         found = [frame for frame in (round(one * ratio) for one in frames) if frame < self._count]
         if not found:
-            raise BadArgument(f"frames: {self.clip.path!r} ends before the first of these frames")
+            raise BadArgument(
+                f"frames: {self.clip.path!r} ends before the time of the first frame; choose earlier frames"
+            )
         return found
 
     def whole(self) -> Any:
@@ -79,8 +81,8 @@ class ClipOfStrip:
 def draw_clips(first: ClipOfStrip, second: ClipOfStrip | None, moments: int, file_type: str) -> bytes:
     """Draw a clip, and another clip or revision below it, at the same times, as PNG or SVG.
 
-    Another revision of the same clip is drawn before grey poses of the first one. Clips with different joints are drawn
-    side by side, which is possible as PNG only. Raises `BadArgument` if the clips have no time in common.
+    Another revision of the same clip is drawn on top of the poses of the first revision in grey. Clips with different
+    joints are drawn side by side, as PNG only. Raises `BadArgument` if the second clip ends before the range begins.
     """
     frames = first.chosen(moments)
     poses = first.poses(frames)
@@ -117,7 +119,7 @@ def _side_by_side(first: ClipOfStrip, second: ClipOfStrip, moments: int, file_ty
 
 
 def draw_samples(model: ModelHandle, revision: int | None, n: int, seed: int, moments: int, file_type: str) -> bytes:
-    """Draw samples of a model, one in each row, at equal shares of their durations, as PNG or SVG."""
+    """Draw samples of a model, one per row, at equally spaced fractions of their durations, as PNG or SVG."""
     _require_rows(n)
     drawn = model.sample(n, seed, revision=revision)
     strips = room("marey_reports.drawing.strips", FIGURES_EXTRA)
@@ -142,7 +144,7 @@ def draw_worst_trials(
     """Draw the worst trials of an evaluation, the worst first, as PNG or SVG.
 
     A cell shows the recorded frame that the character displayed at a moment, turned into the heading of the character;
-    the smoothing after switches between clips is left out. Raises `BadArgument` without ranks and records of trials.
+    the smoothing after switches between clips is left out. Raises `BadArgument` if the evaluation does not rank trials.
     """
     _require_rows(count)
     document = evaluation.document(revision=revision)
@@ -174,7 +176,7 @@ def ranked_trials(evaluation: EvaluationHandle, document: dict[str, Any]) -> lis
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """A frame of a revision of a clip, and whether a mirrored copy of it was displayed."""
+    """Frame of a revision of a clip, and whether its mirrored copy was displayed instead of the frame itself."""
 
     clip: ClipHandle
     revision: int
@@ -193,13 +195,13 @@ class DisplayedFrames:
         self._handles: dict[str, ClipHandle] = {}
 
     def pose(self, row: int) -> Any:
-        """Return the recorded pose of a row, as a clip of one frame; mirrored if the row is of a mirrored copy."""
+        """Return the recorded pose of a row as a clip of one frame, mirrored if the row is part of a mirrored copy."""
         found = self.place(row)
         (pose,) = ClipOfStrip(found.clip, found.revision).poses([found.frame])
         return mirrored(pose) if found.mirrored else pose
 
     def place(self, row: int) -> RecordedFrame:
-        """Return the frame of a recorded clip in which a row was recorded."""
+        """Return the frame of the recorded clip that corresponds to a row of the database."""
         found = self._clips[int(np.searchsorted(self._starts, row, side="right")) - 1]
         item, _, revision = found["uid"].partition("~")[0].partition("@")  # of a mirrored copy, more follows
         clip = self._clip(item)
@@ -223,7 +225,7 @@ def mirrored(clip: Any) -> Any:
 
 
 def _spread(frames: range, moments: int, name: str) -> list[int]:
-    """Return up to `moments` of the frames, at equal distances. Raises `BadArgument` if there are none."""
+    """Return up to `moments` evenly spaced frames of a range. Raises `BadArgument` if the range is empty."""
     if not 1 <= moments <= MOST_MOMENTS:
         raise BadArgument(f"moments: a picture shows 1 to {MOST_MOMENTS} moments, not {moments}")
     if not frames:

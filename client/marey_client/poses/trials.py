@@ -1,4 +1,4 @@
-"""Motions that the character displayed in the trials of an evaluation, put together from recorded clips."""
+"""Motions that the character displayed in the trials of an evaluation, assembled from frames of recorded clips."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Floats = NDArray[np.float64]
 
 
 def motions_of_worst_trials(evaluation: EvaluationHandle, revision: int | None, count: int) -> list[ShownMotion]:
-    """Put the motions of the worst trials together, the worst first.
+    """Assemble the motions of the worst trials from recorded frames, the worst trial first.
 
-    A frame is the recorded one that the character displayed at a tick, with the pelvis at the place of the character
-    and in its heading. The smoothing after switches between clips is left out, so poses jump there. Raises
-    `BadArgument` without ranks of trials, and for clips in which other joints than the root are translated.
+    Each frame is the recorded frame that the character displayed at a tick, moved to the position and the heading of
+    the character. The smoothing after switches between clips is left out, so poses jump there. Raises `BadArgument` if
+    the evaluation does not rank trials, and for clips in which joints below the root are translated.
     """
     document = evaluation.document(revision=revision)
     ranked = ranked_trials(evaluation, document)
@@ -36,14 +36,14 @@ def motions_of_worst_trials(evaluation: EvaluationHandle, revision: int | None, 
 
 
 class _RecordedClips:
-    """Whole clips that trials displayed, each read once."""
+    """Cache of the recorded clips that trials displayed; each clip is read once, as a whole."""
 
     def __init__(self, shown: DisplayedFrames) -> None:
         self._shown = shown
         self._clips: dict[tuple[str, int, bool], Any] = {}
 
     def motion(self, name: str, record: dict[str, NDArray[Any]]) -> ShownMotion:
-        """Return the motion of a trial from its record."""
+        """Return the motion of the trial `name`, assembled from the trial's record of ticks."""
         places = [self._shown.place(int(row)) for row in record["rows"]]
         clips = [self._whole(one.clip, one.revision, is_mirrored=one.mirrored) for one in places]
         poses = np.stack([clip.poses[one.frame] for clip, one in zip(clips, places, strict=True)]).astype(np.float64)
@@ -69,7 +69,7 @@ class _RecordedClips:
 
 
 def _moved(skeleton: Any, poses: Floats, positions: Floats, headings: Floats) -> NDArray[np.float32]:
-    """Turn poses (T, 3 + 4 joints) about the vertical to headings (T,), and put the pelvis at positions (T, 2)."""
+    """Turn poses (T, 3 + 4·joints) to headings (T,) in radians, and move the pelvis to x and z (T, 2) in metres."""
     kinematics = room("marey_motion.kinematics", FIGURES_EXTRA)
     quaternions = room("marey_motion.quaternions", FIGURES_EXTRA)
     body = room("marey_reports.drawing.stick_figures", FIGURES_EXTRA).body_of(skeleton)

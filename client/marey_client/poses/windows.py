@@ -23,22 +23,23 @@ class MotionWindow(NamedTuple):
 
 
 class MotionWindows:
-    """Windows of equal length in clips, each at the revision that was listed; a window is read when it is asked for.
+    """Dataset of windows of equal length in clips, at the revisions of the handles; indexing reads one window.
 
-    Clips that are shorter than a window have none. The dataset can be sent to other processes, such as those of a
-    DataLoader: a forked process opens connections of its own, and a process that gets a pickled dataset finds the token
-    as the command line does, because tokens are not pickled.
+    Clips that are shorter than a window contribute no window. The dataset can be sent to other processes, such as those
+    of a DataLoader. A forked process opens connections of its own. Tokens are not pickled: a process that gets a
+    pickled dataset looks up the token as the command line does.
 
     Parameters
     ----------
     clips : handles of clips of one frame rate, such as `lab.clips` or `lab.clips.where("raw", query="subject = 02")`;
         without `joints`, all with the same number of joints
     frames : number of frames of a window
-    stride : number of frames between the beginnings of windows; default: `frames`, so that windows do not overlap
+    stride : number of frames from the start of one window to the start of the next; default: `frames`, so that windows
+        do not overlap
     content : what a window contains. poses: root translation and local rotations, (frames, 3 + 4 * joints); rotations:
         local rotations, (frames, joints, 4); positions and velocities: in the world, (frames, joints, 3)
     joints : names of the joints, in their order; default: all joints of each clip
-    seed : seed of the order of the windows; default: in the order of the clips and of time
+    seed : seed of a random order of the windows; default: None, in the order of the clips, then of time
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class MotionWindows:
         if frames < 1 or stride < 1:
             raise BadArgument(f"frames and stride must be at least 1, not {frames} and {stride}")
         if content not in get_args(Content):
-            raise BadArgument(f"content: {content!r} is none of {', '.join(get_args(Content))}")
+            raise BadArgument(f"content: {content!r} is not valid; give one of {', '.join(get_args(Content))}")
         self.frames, self.content, self.joints, self.seed = frames, content, joints, seed
         clips = tuple(clips)
         _require_one("frame rate", {clip.path: clip.frame_rate_hz for clip in clips}, "choose clips of one frame rate")
@@ -87,11 +88,11 @@ class MotionWindows:
         return {"motion": motion, "clip": clip.path, "id": clip.id, "first": first}
 
     def split(self, shares: Mapping[str, float], *, by: SplitBy = "subject", seed: int = 0) -> dict[str, MotionWindows]:
-        """Divide the windows into parts, such as `{"train": 0.8, "test": 0.2}`, without a subject or take in two parts.
+        """Divide the windows into parts, such as `{"train": 0.8, "test": 0.2}`; no subject, take or clip is split.
 
-        Groups go one after another, in an order drawn with `seed`, to the part that lacks most of its share of the
-        windows. `by="clip"` keeps only the windows of a clip together. Raises `ValueError` if a clip has no subject or
-        take, or if there are fewer groups than parts.
+        The windows of one subject form a group; with `by="take"` or `by="clip"`, those of one take or clip. The groups
+        are assigned in a random order with the seed `seed`, each to the part that lacks the most windows of its share.
+        Raises `BadArgument` if a clip has no subject or take, or if there are fewer groups than parts.
         """
         if not shares or not all(0 < share < float("inf") for share in shares.values()):
             raise BadArgument(f"shares: every part needs a share above 0, not {dict(shares)}")
@@ -99,7 +100,10 @@ class MotionWindows:
         for window in self.windows:
             groups.setdefault(_group_of(window.clip, by), []).append(window)
         if len(groups) < len(shares):
-            raise BadArgument(f"there are {len(groups)} groups by {by}, fewer than the {len(shares)} parts")
+            raise BadArgument(
+                f"by: the clips have {len(groups)} different values of {by}, fewer than the {len(shares)} parts; split "
+                "into fewer parts, or by another field"
+            )
         order = np.random.default_rng(seed).permutation(sorted(groups))
         wanted = {name: share / sum(shares.values()) * len(self.windows) for name, share in shares.items()}
         parts: dict[str, list[str]] = {name: [] for name in shares}
@@ -121,7 +125,7 @@ class MotionWindows:
 
 
 def _require_one(what: str, values: Mapping[str, float], remedy: str) -> None:
-    """Raise `ValueError` if clips, named by their paths, have different values, so that windows do not fit together."""
+    """Raise `BadArgument` if the values, by path of the clip, are not all equal; `what` names the values."""
     examples = {value: path for path, value in reversed(list(values.items()))}
     if len(examples) > 1:
         told = ", ".join(f"{value:g} in {path!r}" for value, path in sorted(examples.items())[:4])

@@ -1,4 +1,4 @@
-"""Jobs of a project: methods that submit them, and handles of what they made."""
+"""Jobs of a project: methods that submit jobs, and handles of the items that the jobs created."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class JobSubmission(ProjectItems):
         return JobHandle.of(Jobs(self.transport).submit(self.name, job), self)
 
     def _submit(self, request: JobCreate, *, into: str, priority: int, cache: CacheMode, commit: CommitTo) -> JobHandle:
-        """Submit a job with a folder for its results and with what all jobs have."""
+        """Submit a job with the options that all jobs have: folder of the results, priority, cache and commit."""
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
         return self.submit(request.model_copy(update=chosen))
 
@@ -174,10 +174,10 @@ class JobSubmission(ProjectItems):
     def index(
         self, clips: Clips = "", *, priority: int = 0, cache: CacheMode = "use", **options: Unpack[IndexKeywords]
     ) -> JobHandle:
-        """Submit a job that indexes clips or folders (default: all clips), so that `similar` finds moments of them.
+        """Submit a job that indexes clips or folders (default: all clips), so that `similar` finds moments in them.
 
-        `options` are those of `IndexParams`. If the top folder has an index with this name, it is updated: clips at
-        revisions that it has are not read again, and it loses the clips that are not given.
+        `options` are those of `IndexParams`. An index with the same name in the top folder is updated: clips whose
+        revisions are in the index already are not read again, and clips that are not given are removed from the index.
         """
         request = index_request(self, clips, checked(IndexParams, options))
         return self.submit(request.model_copy(update={"priority": priority, "cache": cache}))
@@ -197,8 +197,8 @@ class JobSubmission(ProjectItems):
         """Submit a job that aligns clips of one skeleton, all of which show the same action.
 
         `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. If `options` name a layer or
-        labels, the default for `annotations` is the annotations of the clips. With a `metric`, perceptual distances are
-        the costs of poses.
+        labels, the default for `annotations` is the annotations of the clips. With a `metric`, the cost of a pair of
+        poses is their perceptual distance.
         """
         request = align_request(self, clips, annotations, checked(AlignParams, options), metric)
         return self._submit(request, into=into, priority=priority, cache=cache, commit=commit)

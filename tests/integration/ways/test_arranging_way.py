@@ -261,7 +261,7 @@ def test_of_a_folder_and_a_removed_item_of_one_name_the_address_says_which(run: 
     run("mv", "lab/raw/b", "lab/raw/a/")
     run("rm", f"lab/{item}")
     run("rm", "lab/raw/a/b")
-    assert "lab/raw/a is a folder and a removed item" in run("purge", "lab/raw/a", "--yes", status=2).stderr
+    assert "lab/raw/a names both a folder and a removed item" in run("purge", "lab/raw/a", "--yes", status=2).stderr
     assert "1 item purged" in run("purge", "lab/raw/a/", "--yes").stderr
     assert "1 item purged" in run("purge", f"lab/{item}", "--yes").stderr
     assert "is the id of a folder" in run("purge", f"lab/collection_{item.partition('_')[2]}", status=2).stderr
@@ -318,7 +318,8 @@ def test_take_records_come_from_a_table_and_are_found_by_queries(
     table = tmp_path / "takes.csv"
     table.write_text("File,Performer,Action,select\na.bvh,02,Walk slowly,best\nb.bvh,02,run,\n")
     refused = run("record", "lab/raw", "--table", str(table), status=2).stderr
-    assert "the column 'Performer' is not a field; name one with --column 'Performer=FIELD'" in refused
+    assert "the column 'Performer' is not a field; give the field that the column" in refused
+    assert "--column 'Performer=FIELD'" in refused
     arguments = ("record", "lab/raw", "--table", str(table), "--column", "Performer=subject")
     assert run(*arguments).stderr == "2 records changed, 0 unchanged\n"
     assert run(*arguments).stderr == "0 records changed, 2 unchanged\n"

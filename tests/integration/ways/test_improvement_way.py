@@ -109,7 +109,7 @@ def test_clips_of_another_folder_fill_the_holes_of_a_set(lab: ProjectHandle, mar
         "--confirmation-replicates",
         0,
     ).stdout
-    assert f"{len(found['fillings'])} clips would fill holes." in told
+    assert f"{len(found['fillings'])} clips would fill gaps in the coverage." in told
     assert "can be blended with the set" in told
 
     run("optimise", "lab/straight", "--from", "lab/walks", "--max-steps", 2, "--consider", 3, *FEW)

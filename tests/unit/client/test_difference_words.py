@@ -62,7 +62,7 @@ def test_frames_removed_and_inserted_at_one_place_are_replaced() -> None:
         {"change": "removed", "before": (60, 90), "after": (60, 60)},
         {"change": "inserted", "before": (90, 90), "after": (60, 120)},
     ]
-    line = "replaced: 30 frames by 60 that correspond to none, between 1.00 s and 2.00 s"
+    line = "replaced: 30 frames by 60 new ones, between 1.00 s and 2.00 s"
     assert lines_of_motion(runs=runs) == [line]
 
 

@@ -95,7 +95,7 @@ def test_a_page_is_written_whole_or_not_at_all(script: ScriptedServer, tmp_path:
         save_page(marey.transport, target, [a_shown("a"), a_shown("b")])
         written = target.read_bytes()
         assert json.loads(data_of(written))["title"] == "a beside b – Marey"
-        with pytest.raises(MareyError, match="no place for motion; upgrade the older one of client and server"):
+        with pytest.raises(MareyError, match="no element for motion, because client and server"):
             save_page(marey.transport, target, [a_shown("c")])
     assert target.read_bytes() == written
     assert list(tmp_path.iterdir()) == [target]

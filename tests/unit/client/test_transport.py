@@ -157,7 +157,7 @@ def test_an_error_of_another_server_names_the_address_and_asks_about_it(
     script: ScriptedServer, media_type: str
 ) -> None:
     script.answers = [httpx.Response(404, content=b'{"title": "?"}', headers={"Content-Type": media_type})]
-    with pytest.raises(errors.NotFound, match=r"http://server\.test/ answered 404 .*is it the right address"):
+    with pytest.raises(errors.NotFound, match=r"http://server\.test/ answered 404 .*check the address of the server"):
         script.marey().project("lab").read()
 
 

@@ -86,7 +86,7 @@ def test_the_role_of_a_member_changes_only_on_request(team: Team, tmp_path: Path
         ("name,colour\nada,red\n", "unknown column 'colour'"),
         ("name\n", "has no rows"),
         ("name\nada\nBen B\n", "row 3: name: the text must have at most 64 lower-case letters"),
-        ("name,administrator\nada,perhaps\n", "row 2: administrator: 'perhaps' is neither yes nor no"),
+        ("name,administrator\nada,perhaps\n", "row 2: administrator: 'perhaps' must be yes or no"),
         ("name,project\nada,lab\n", "row 2: give both a project and a role"),
         ("name,project,role\nada,lab,emperor\n", "role: 'emperor' must be reader, contributor, maintainer or owner"),
         (
@@ -100,7 +100,7 @@ def test_the_role_of_a_member_changes_only_on_request(team: Team, tmp_path: Path
         ),
         ("name\nada,lab\n", "more cells than the table has columns"),
         ("name\n\n\nada\nBen B\n", "row 5: name: "),
-        ("name,name\nada,eve\n", "has several columns 'name'"),
+        ("name,name\nada,eve\n", "has several columns named 'name'"),
     ],
 )
 def test_a_wrong_table_is_refused_with_its_row(tmp_path: Path, text: str, told: str) -> None:

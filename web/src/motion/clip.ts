@@ -20,9 +20,9 @@ export class Clip {
   ) {
     this.width = 3 + 4 * joints.length;
     this.frames = poses.length / this.width;
-    if (!Number.isInteger(this.frames) || this.frames < 1) throw new RangeError("the poses do not fit the joints");
+    if (!Number.isInteger(this.frames) || this.frames < 1) throw new RangeError("the number of columns of the poses does not match the number of joints");
     if (translations.length !== 3 * this.frames * translatedJoints.length) {
-      throw new RangeError("the translations do not fit the frames");
+      throw new RangeError("the number of translations does not match the number of frames");
     }
     const missing = skeleton.names.find((joint) => !joints.includes(joint));
     if (missing !== undefined) throw new RangeError(`the motion has no rotation of the joint ${missing}`);

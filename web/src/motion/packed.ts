@@ -32,7 +32,7 @@ const FORMAT = 1;
 export async function unpackPage(text: string): Promise<{ title: string; clips: Clip[] }> {
   if (text.trim() === "") throw new RangeError("this page contains no motion; `marey view CLIP --out FILE.html` writes pages that do");
   const page = JSON.parse(text) as PackedPage;
-  if (page.format !== FORMAT) throw new RangeError(`the motion has the form ${page.format}, but this page reads the form ${FORMAT}`);
+  if (page.format !== FORMAT) throw new RangeError(`the motion has the format version ${page.format}, but this page reads version ${FORMAT}`);
   return { title: page.title, clips: await Promise.all(page.motions.map(unpackMotion)) };
 }
 
@@ -73,7 +73,7 @@ function writeRotation(poses: Float32Array, at: number, x: number, y: number, z:
 function restore(planes: Uint8Array, integers: Int16Array | Int32Array, frames: number): void {
   const count = integers.length;
   const bytes = integers.BYTES_PER_ELEMENT;
-  if (planes.length !== count * bytes) throw new RangeError("the packed poses do not fit the frames");
+  if (planes.length !== count * bytes) throw new RangeError("the size of the packed poses does not match the number of frames");
   for (let index = 0; index < count; index++) {
     let folded = 0;
     for (let plane = 0; plane < bytes; plane++) folded |= planes[plane * count + index]! << (8 * plane);

@@ -1,4 +1,4 @@
-/** Keys of the viewer: one table for what they do and for the help that lists them. */
+/** Keys of the viewer: a table of their actions, from which the help is made, too. */
 
 export type Action =
   | "play" | "back" | "forward" | "back10" | "forward10" | "start" | "end" | "slower" | "faster"
@@ -22,11 +22,11 @@ export const KEYS: Key[] = [
   { action: "end", key: "End", shown: "End", text: "Go to the end" },
   { action: "slower", key: "-", shown: "−", text: "Play slower" },
   { action: "faster", key: "=", shown: "=", text: "Play faster" },
-  { action: "look", key: "v", shown: "V", text: "Skeleton or mannequin" },
-  { action: "layout", key: "b", shown: "B", text: "Both side by side, overlaid, or one of them" },
+  { action: "look", key: "v", shown: "V", text: "Switch between skeleton and mannequin" },
+  { action: "layout", key: "b", shown: "B", text: "Show the clips side by side or overlaid, or show one of two clips" },
   { action: "camera", key: "c", shown: "C", text: "Camera from the front, the side or the top" },
   { action: "frame", key: "f", shown: "F", text: "Bring the figure back into view" },
-  { action: "follow", key: "f", shift: true, shown: "Shift F", text: "Let the camera follow the figure, or stop it" },
+  { action: "follow", key: "f", shift: true, shown: "Shift F", text: "Start or stop following the figure with the camera" },
   { action: "help", key: "?", shown: "?", text: "Show this help" },
 ];
 

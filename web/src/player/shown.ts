@@ -1,4 +1,4 @@
-/** What of clips is shown, and how: kept in the address of a page, or in its data. */
+/** State of a viewer: frame, camera, look and layout. A page stores it in its address or in its data. */
 import { type Actor, arrange, type Cell, type Look } from "../scene/actor";
 
 const LAYOUTS = ["beside", "overlaid", "left", "right"] as const;
@@ -13,12 +13,12 @@ export interface Shown {
   layout: Layout;
 }
 
-/** Return the layouts among which a number of clips offers a choice. */
+/** Return the layouts that are possible for a number of clips. */
 export function layoutsOf(count: number): readonly Layout[] {
   return count === 2 ? LAYOUTS : LAYOUTS.slice(0, 2);
 }
 
-/** Return the layout with a name; that side by side for other names. */
+/** Return the layout with the given name; `beside` for unknown names. */
 export function layoutOf(name: string | null): Layout {
   return LAYOUTS.find((one) => one === name) ?? "beside";
 }

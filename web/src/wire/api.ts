@@ -75,7 +75,7 @@ export interface ItemAddress {
 /** Read the address of an item. Throws a RangeError for other texts. */
 export function parseAddress(text: string): ItemAddress {
   const match = /^([^/@]+)\/([^/@]+)(?:@([1-9]\d{0,8}))?$/.exec(text);
-  if (match === null) throw new RangeError(`“${text}” is no address; write project/item or project/item@revision`);
+  if (match === null) throw new RangeError(`“${text}” is not the address of an item; write project/item or project/item@revision`);
   return { project: match[1]!, item: match[2]!, revision: match[3] === undefined ? null : Number(match[3]) };
 }
 

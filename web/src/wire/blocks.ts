@@ -93,7 +93,7 @@ function unpack(packed: Uint8Array, size: Tile): Float32Array {
     case QUATERNIONS:
       return restoreQuaternions(body, size);
     default:
-      throw new RangeError(`a tile has the unknown form ${content[0]}`);
+      throw new RangeError(`a tile has the unknown encoding ${content[0]}`);
   }
 }
 
@@ -173,9 +173,9 @@ function transposed(channels: Int32Array, size: Tile, places: number[]): Float32
 function restoreQuaternions(body: Sections, size: Tile): Float32Array {
   const lead = body.take(1)[0]!;
   const quaternions = Math.floor((size.columns - lead) / 4);
-  if (quaternions < 1) throw new RangeError("a tile has no room for a quaternion");
+  if (quaternions < 1) throw new RangeError("a tile of quaternions has fewer columns than one quaternion needs");
   const choices = body.take(quaternions);
-  if (choices.some((choice) => choice > 7)) throw new RangeError("a tile has an unknown choice");
+  if (choices.some((choice) => choice > 7)) throw new RangeError("a tile of quaternions has an unknown code for the omitted component");
   const predicted = new Set(Array.from(choices, (choice, index) => lead + 4 * index + (choice & 3)));
   const others = Array.from({ length: size.columns }, (_, column) => column).filter((column) => !predicted.has(column));
   const values = transposed(readChannels(body, others.length, size.frames), size, others);

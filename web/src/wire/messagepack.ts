@@ -8,7 +8,7 @@ const MOST_DEPTH = 64;
 export function decodeMessagePack(bytes: Uint8Array): Tree {
   const reader = new Reader(bytes);
   const value = reader.value(0);
-  if (reader.position !== bytes.length) throw new RangeError("the document is longer than its content");
+  if (reader.position !== bytes.length) throw new RangeError("the document has bytes after its end");
   return value;
 }
 

@@ -53,7 +53,8 @@ def login(
         bool,
         typer.Option(
             "--paste",
-            help="With --browser: the browser runs on another machine; the command asks for the code that it shows.",
+            help="With --browser, for a browser on another machine: the command asks for the code that the browser "
+            "shows.",
         ),
     ] = False,
     days: Annotated[
@@ -73,7 +74,10 @@ def login(
     if with_token + invitation + browser > 1:
         raise WrongUsage("give only one of --with-token, --invitation and --browser")
     if (paste and not browser) or (browser and name is not None):
-        raise WrongUsage("--paste belongs to --browser, and --name does not: the identity provider says who you are")
+        raise WrongUsage(
+            "--paste needs --browser, and --name cannot be combined with --browser, because the identity provider "
+            "determines the user"
+        )
     if with_token:
         refuse_ignored(context, "with --with-token", "name", "days")
     with connect(context, anonymous=True) as marey:
@@ -272,7 +276,8 @@ def link_user(
     context: typer.Context,
     name: UserName,
     subject: Annotated[
-        str, typer.Argument(help="Id of the person at the identity provider; the refused sign-in shows it.")
+        str,
+        typer.Argument(help="Id of the person at the identity provider; the message of a refused sign-in shows it."),
     ],
     issuer: Annotated[
         str | None, typer.Option(help="Address of the identity provider; default: the provider of the server.")
@@ -314,7 +319,10 @@ def unlink_user(
     name: UserName,
     link: Annotated[str, typer.Argument(help="Id of the link; `marey user links` lists the ids.")],
 ) -> None:
-    """End the link of a person with a user, and all logins of the user (for administrators)."""
+    """Remove the link between a person at an identity provider and a user, and end all logins of the user.
+
+    Only administrators may do this.
+    """
     with connect(context) as marey:
         marey.users.unlink(name, link)
     print_message(f"the link {link} and all logins of {name} have ended")
@@ -329,7 +337,7 @@ def user_quota(
     defaults: DefaultLimits = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show a user's quotas: the items and bytes that count, and the limits. Administrators can change the limits."""
+    """Show a user's quotas: the number of items and bytes in use, and the limits. Administrators can change limits."""
     from marey_schemas.access import QuotaChange
 
     wanted = changed_limits(defaults, items=items, stored_bytes=stored_bytes)

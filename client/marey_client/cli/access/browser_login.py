@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 LOOPBACK_ADDRESS = "127.0.0.1"
 REQUEST_S = 5.0
-"""Longest time in seconds of one request to the port of this command."""
+"""Longest time in seconds that the browser may take to send its request to this command."""
 _DONE = b"<!doctype html><title>Marey</title><p>You are signed in. Return to the terminal; you can close this page.</p>"
 
 
 class CodeListener(HTTPServer):
-    """Server at a free port of this machine that waits for the browser with the code of one sign-in."""
+    """Local HTTP server at a free port, to which the browser sends the code of one sign-in."""
 
     def __init__(self) -> None:
         super().__init__((LOOPBACK_ADDRESS, 0), _Handler)
@@ -44,7 +44,7 @@ class CodeListener(HTTPServer):
         return int(self.server_address[1])
 
     def wait(self, sign_in: str, seconds: float) -> str:
-        """Return the code of a sign-in. Raises `WrongUsage` if no browser brings it within `seconds`."""
+        """Wait for the code of a sign-in, and return the code. Raises `WrongUsage` if none arrives within `seconds`."""
         self.sign_in = sign_in
         deadline = time.monotonic() + seconds
         while self.code is None and (left := deadline - time.monotonic()) > 0:
@@ -62,7 +62,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = REQUEST_S
 
     def do_GET(self) -> None:
-        """Take the code from the address, if it belongs to the sign-in for which this command waits."""
+        """Read the code from the requested address if the address names the sign-in for which this command waits."""
         query = parse_qs(urlsplit(self.path).query)
         sign_in, code = (query.get(name, [""])[0] for name in ("sign_in", "code"))
         expected = self.server.sign_in.encode()
@@ -86,8 +86,8 @@ class _Handler(BaseHTTPRequestHandler):
 def sign_in_in_browser(marey: Marey, expires_in_s: int, *, paste: bool) -> str:
     """Let a person sign in in a browser, and return the new token.
 
-    With `paste`, the browser may run on another machine: it shows a code, for which this command asks. Otherwise, the
-    browser brings the code to a port of this machine.
+    With `paste`, the browser may run on another machine: the browser shows a code, and this command asks the user for
+    the code. Otherwise, the browser sends the code to a port of this machine.
     """
     from marey_schemas.sign_ins import BrowserSignInCode, BrowserSignInCreate
 
@@ -97,7 +97,10 @@ def sign_in_in_browser(marey: Marey, expires_in_s: int, *, paste: bool) -> str:
         port = None if paste else listener.port
         begun = marey.begin_sign_in(BrowserSignInCreate(challenge=challenge, port=port, expires_in_s=expires_in_s))
         if urlsplit(begun.url).scheme not in ("http", "https"):
-            raise WrongUsage(f"the server names {begun.url!r} as its address, which no browser opens")
+            raise WrongUsage(
+                f"the server sent {begun.url!r} as the address of the sign-in, which does not begin with http:// or "
+                "https://; ask an administrator to correct the address of the server"
+            )
         print_message(f"sign in at this address, in a browser{'' if paste else ' on this machine'}:\n{begun.url}")
         if paste:
             code = ask_secret("Code that the browser shows")

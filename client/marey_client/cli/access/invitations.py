@@ -152,7 +152,9 @@ def _named(text: str) -> str:
     from marey_schemas.invitations import CODE_PREFIX
 
     if text.startswith(CODE_PREFIX):
-        raise WrongUsage("this is the code of an invitation, not its name; give the prefix or the id from the list")
+        raise WrongUsage(
+            "this is the secret code of an invitation; give the prefix or the id that the list of invitations shows"
+        )
     return text
 
 

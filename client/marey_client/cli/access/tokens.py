@@ -145,7 +145,7 @@ def _labels_of(token: Token) -> str:
 
 
 def _end_of(token: Token) -> str:
-    """Return the date on which a token expires as text, with the days left if these are fewer than `SOON_DAYS`."""
+    """Return the expiry date of a token as text, with the number of days left if it is less than `SOON_DAYS`."""
     if token.expires_at is None:
         return "never"
     left = token.expires_at - datetime.now(UTC)
@@ -180,11 +180,11 @@ def rotate_token(
 
 
 def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedelta) -> NewToken:
-    """Replace the token of `marey` by a successor, on the server and in the file that contains the token.
+    """Replace the token of the client `marey` by a successor, on the server and in the file that contains the token.
 
-    The id of the rotation is stored next to the token's file before the request is sent. If the program ends before it
-    has stored the successor, another call therefore gets the same successor. Raises `BadCredentialFile` if no file
-    contains the token.
+    The id of the rotation is stored next to the token's file before the request is sent. So if the program ends before
+    the successor is stored, the next call gets the same successor. Raises `BadCredentialFile` if no file contains the
+    token.
     """
     from marey_client.access import Tokens
     from marey_client.credentials import replace_token
@@ -193,8 +193,8 @@ def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedel
     file = credential.file or credential.logins
     if file is None or credential.token is None:
         raise BadCredentialFile(
-            f"the token comes from {credential.origin or 'no file'}, where no other token can be stored; write it to a "
-            "file that only you can read, and name the file with --token-file"
+            f"the token comes from {credential.origin or 'no file'}, so its successor cannot be stored; write the "
+            "token to a file that only you can read, and name the file with --token-file"
         )
     begun = file.with_name(f"{file.name}.rotation")
     tokens = Tokens(marey.transport.with_token(credential.token))

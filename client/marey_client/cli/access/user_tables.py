@@ -32,7 +32,7 @@ def add_to(_app: typer.Typer) -> None:
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of the table: a user, and the project that the user joins, if any. What its cells leave open is None."""
+    """Row of the table: a user, and the project that the user joins, if any. Empty cells are None."""
 
     line: int
     name: str
@@ -43,7 +43,7 @@ class _Row:
 
     @property
     def statements(self) -> list[tuple[str, object]]:
-        """Statements of the row about the user, by name; None: not stated. Rows of one user must not contradict."""
+        """Names and values that all rows of the user must agree on; the value of an empty cell is None."""
         joined = [(f"role in {self.project}", str(self.role))] if self.project else []
         return [("display_name", self.display_name), ("administrator", self.administrator), *joined]
 
@@ -65,10 +65,11 @@ def import_users(
 ) -> None:
     """Create the users in a CSV file, and add them to projects.
 
-    The users have no password: they sign in with an identity provider, or after `marey user password NAME`. Users that
-    exist are left as they are, but join the projects. If a row is wrong, contradicts another row, or would change the
-    role of a member, nothing is created; `--change-roles` changes such roles. Each row is a request of its own: if the
-    server refuses one, those before it are kept, and the error names the row. Repeating the command continues there.
+    New users have no password: they sign in with an identity provider, or after `marey user password NAME`. Existing
+    users are not changed, but join the projects. If a row is wrong, contradicts another row, or would change the role
+    of a member, nothing is created; with `--change-roles`, such roles are changed. Each user and each membership is
+    stored by a request of its own. If the server refuses a request, everything stored before remains, and repeating
+    the command continues.
     """
     rows = _read(table)
     with connect(context) as marey:
@@ -92,7 +93,7 @@ def import_users(
 
 @contextmanager
 def _in_row(table: Path, row: _Row) -> Iterator[None]:
-    """Name the row of the table in an error of the `with` block."""
+    """Add the number of the row to errors that the server reports in the `with` block."""
     from marey_client.errors import RequestFailed
 
     try:
@@ -103,7 +104,7 @@ def _in_row(table: Path, row: _Row) -> Iterator[None]:
 
 
 def _users(rows: Sequence[_Row]) -> list[UserCreate]:
-    """Return the users of a table, each with what any of its rows says."""
+    """Return the users of a table; the values of a user are collected from all rows of the user."""
     from marey_schemas.access import UserCreate
 
     by_name: dict[str, list[_Row]] = {}
@@ -147,7 +148,7 @@ def _joining(marey: Marey, rows: Sequence[_Row], table: Path, *, change_roles: b
 
 
 def _read(table: Path) -> list[_Row]:
-    """Return the rows of the file. Raises `WrongUsage`, which names all wrong lines."""
+    """Return the rows of the file. Raises `WrongUsage`, which names all wrong rows."""
     rows = rows_of(table)
     names = [name for name in next(iter(rows.values())) if name]
     if "name" not in names or (unknown := [name for name in names if name not in COLUMNS]):
@@ -166,7 +167,7 @@ def _read(table: Path) -> list[_Row]:
 
 
 def _contradictions(rows: Sequence[_Row]) -> Iterator[str]:
-    """Yield what two rows say differently of one user."""
+    """Yield a message for each value on which two rows of the same user disagree."""
     first: dict[tuple[str, str], tuple[int, object]] = {}
     for row in rows:
         for what, value in row.statements:
@@ -183,7 +184,7 @@ def _row(line: int, row: Mapping[str, str]) -> _Row:
 
     administrator = row.get("administrator", "").lower()
     if administrator not in (*YES, *NO):
-        raise WrongUsage(f"administrator: {administrator!r} is neither yes nor no")
+        raise WrongUsage(f"administrator: {administrator!r} must be yes or no")
     project, role = row.get("project") or None, row.get("role") or None
     if (project is None) != (role is None):
         raise WrongUsage("give both a project and a role, or neither")

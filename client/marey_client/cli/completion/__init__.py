@@ -1,5 +1,5 @@
-"""Shell completion: scripts for shells, the table of what completes which parameter, and questions to the server.
+"""Shell completion: scripts for shells, the completion function of each parameter, and requests to the server.
 
-A shell runs `marey` with the environment variable `_MAREY_COMPLETE`. The answer is never an error: whatever fails, such
-as a server that is down, the shell shows no suggestions.
+A shell runs `marey` with the environment variable `_MAREY_COMPLETE`. `marey` prints no errors then: if anything fails,
+for example because the server is down, the shell shows no suggestions.
 """

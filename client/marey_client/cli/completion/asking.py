@@ -1,6 +1,6 @@
-"""Questions to the server for shell completion: with the saved token, few at a time, and for less than a second.
+"""Requests to the server for shell completion: with the saved token, few at a time, and for less than a second.
 
-Uses `http.client` instead of the SDK, because loading the SDK takes longer than all questions together.
+Uses `http.client` instead of the SDK, because loading the SDK takes longer than all requests together.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ if TYPE_CHECKING:
     from marey_client.credentials import Credential
 
 PATIENCE_S = 0.8
-"""Time in seconds for all answers to one press of the Tab key, without the start of the program (about 0.4 s)."""
+"""Longest time in seconds for all requests after one press of Tab, without the program's start (about 0.4 s)."""
 QUESTIONS_AT_ONCE = 4
 MOST_ENTRIES = 200
-"""Greatest number of entries of one page."""
+"""Greatest number of entries that one request asks for."""
 MOST_PAGES = 50
 MOST_ANSWER_BYTES = 1 << 22
 
 
 @dataclass(frozen=True)
 class Question:
-    """Path of a list below the address of the API, and its query parameters."""
+    """Request for a list: the list's path below the API's root, and query parameters."""
 
     path: str
     query: Mapping[str, str | int] = field(default_factory=dict)
     whole: bool = False
-    """Whether further pages are asked for while time is left."""
+    """Whether all pages of the list are requested, as long as time is left."""
 
     @classmethod
     def of(cls, *names: str, **query: str | int | None) -> Question:
-        """Return the question for a path whose names are quoted here; parameters that are None are left out."""
+        """Return the request for the path made of `names`, percent-encoded; parameters of None are left out."""
         path = "/".join(quote(name, safe="") for name in names)
         asked = {"limit": MOST_ENTRIES, **query}
         return cls(f"/{path}", {key: value for key, value in asked.items() if value is not None})
@@ -50,18 +50,18 @@ class Question:
 
 @dataclass(frozen=True)
 class Desk:
-    """Answers questions about what the token may read."""
+    """Connection to the server for the requests of one completion."""
 
     credential: Credential
     until: float
-    """Time of `time.monotonic()` after which nothing is waited for."""
+    """Deadline of all requests, as a value of `time.monotonic()`."""
 
     @classmethod
     def opened(cls, server: str | None, token_file: str | None) -> Desk:
-        """Return the desk of the server and the token that commands would use. Raises errors of credentials.
+        """Return a connection with the server and the token that commands would use. Raises errors of credentials.
 
-        Nobody has confirmed the line yet, so an address on it gets a token only if the token was saved for it, or if
-        commands without this address would use the same one.
+        The user has not confirmed the command line yet. So a token is sent to the address `server` only if the token
+        was saved for this address, or if commands without the option `--server` would use this address, too.
         """
         from pathlib import Path
 
@@ -74,7 +74,7 @@ class Desk:
         return cls(found, time.monotonic() + PATIENCE_S)
 
     def ask(self, questions: Sequence[Question]) -> list[list[dict[str, Any]]]:
-        """Return the entries of the answers, in the order of the questions; none for a question without an answer."""
+        """Return the entries of each requested list, in the order of `questions`; no entries without an answer."""
         answers: list[list[dict[str, Any]]] = [[] for _ in questions]
         left = iter(list(enumerate(questions)))
         lock = threading.Lock()
@@ -96,7 +96,7 @@ class Desk:
         return [list(one) for one in answers]
 
     def entries(self, *names: str, **query: str | int | None) -> list[dict[str, Any]]:
-        """Return the entries of one list with all pages for which there is time, as for `Question.of`."""
+        """Return the entries of one list, page by page until the deadline; arguments are those of `Question.of`."""
         return self.ask([replace(Question.of(*names, **query), whole=True)])[0]
 
     @property
@@ -104,7 +104,7 @@ class Desk:
         return self.until - time.monotonic()
 
     def _pages(self, question: Question) -> Iterator[list[dict[str, Any]]]:
-        """Yield the entries of the pages of a list."""
+        """Yield the entries of each page of a list."""
         query = dict(question.query)
         for _ in range(MOST_PAGES if question.whole else 1):
             answer = self._answer(question.path, query)
@@ -115,7 +115,7 @@ class Desk:
             query["cursor"] = cursor
 
     def _answer(self, path: str, query: Mapping[str, str | int]) -> object:
-        """Return an answer; None if the server refuses the question, is too slow, or is none of ours."""
+        """Return the JSON document at a path; None if the server refuses, is too slow, or does not answer with JSON."""
         parts = urlsplit(self.credential.url)
         target = f"{parts.path}{API}{path}?{urlencode(query)}"
         headers = {"Accept": "application/json"}
@@ -158,7 +158,7 @@ def _entries(answer: object) -> Iterable[dict[str, Any]]:
 
 
 def _usual_address() -> str:
-    """Return the address that commands use if there is none on the line."""
+    """Return the address of the server that commands use without the option `--server`."""
     from marey_client.credentials import DEFAULT_URL, logins_path, read_logins
 
     by_variable = next(filter(None, map(os.environ.get, SERVER_VARIABLES)), None)

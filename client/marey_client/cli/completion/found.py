@@ -17,7 +17,7 @@ MOST_PROJECTS_OF_JOBS = 20
 
 
 class Suggestion(NamedTuple):
-    """Text that replaces what was typed, and a remark that some shells show beside it."""
+    """Text that replaces the typed word, and a remark that some shells show beside the text."""
 
     text: str
     remark: str = ""
@@ -25,7 +25,7 @@ class Suggestion(NamedTuple):
 
 @dataclass(frozen=True)
 class Typed:
-    """Beginning of a word that was typed, the values before it, and the global options."""
+    """Typed beginning of a word, the values of the parameters before this word, and the global options."""
 
     start: str
     values: Mapping[str, Any]
@@ -34,11 +34,11 @@ class Typed:
 
     @cached_property
     def desk(self) -> Desk:
-        """The server that answers questions."""
+        """The connection to the server."""
         return Desk.opened(self.server, self.token_file)
 
     def value(self, *names: str) -> str:
-        """Return the first of these parameters that has a value, or the empty text."""
+        """Return the value of the first of these parameters that has one, or the empty text."""
         for name in names:
             value = self.values.get(name)
             if isinstance(value, (list, tuple)):
@@ -49,7 +49,7 @@ class Typed:
 
 
 How = Callable[[Typed], Iterable[Suggestion]]
-"""Function that returns suggestions; those that do not begin with what was typed are left out later."""
+"""Function that returns suggestions; the caller drops suggestions that do not begin with the typed text."""
 
 
 def one_of(*words: str) -> How:
@@ -88,7 +88,7 @@ def nothing(_: Typed) -> tuple[Suggestion, ...]:
 
 
 def any_of(*hows: How) -> How:
-    """Complete with all that several functions return."""
+    """Complete with the suggestions of several functions."""
     return lambda typed: (one for how in hows for one in how(typed))
 
 
@@ -102,7 +102,7 @@ def projects(typed: Typed) -> Iterator[Suggestion]:
 
 
 def places(*kinds: Kind) -> How:
-    """Complete an address, step by step: project, folder, folder, item of one of the kinds. Folders end with `/`."""
+    """Complete an address, one name at a time: project, folders, item of one of the kinds. Folders end with `/`."""
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         project, slash, path = typed.start.partition("/")
@@ -114,7 +114,7 @@ def places(*kinds: Kind) -> How:
 
 
 def paths(*kinds: Kind) -> How:
-    """Complete a path in the project of the command, step by step; without kinds, the path of a folder."""
+    """Complete a path in the project of the command, one name at a time; without kinds, the path of a folder."""
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         project = _project_of(typed)
@@ -124,7 +124,7 @@ def paths(*kinds: Kind) -> How:
 
 
 def _paths(desk: Desk, project: str, path: str, kinds: Sequence[Kind]) -> Iterator[Suggestion]:
-    """Yield the folders, then the items in the folder of a path whose names begin with the last part of the path."""
+    """Yield folders, then items: those in the parent folder of `path` whose names begin with the path's last name."""
     folder, slash, name = path.rpartition("/")
     among: dict[str, str | None] = {"directly_in": folder, "name": f"{name}*" if name else None}
     below, *items = desk.ask(
@@ -143,7 +143,7 @@ _PLACES = ("place", "places", "sources", "takes", "evaluation", "address", "clip
 
 
 def _project_of(typed: Typed) -> str:
-    """Return the project that the values before name, as such or at the beginning of an address; or the empty text."""
+    """Return the project of the earlier parameters: a project's name, or the beginning of an address; or empty text."""
     return typed.value(*_PROJECTS) or typed.value(*_PLACES).strip("/").partition("/")[0]
 
 
@@ -178,7 +178,7 @@ def branches(typed: Typed) -> Iterator[Suggestion]:
 
 
 def entries(typed: Typed) -> Iterator[Suggestion]:
-    """Complete the path of an entry in the version of the command, step by step; folders end with `/`."""
+    """Complete the path of an entry in the version of the command, one name at a time; folders end with `/`."""
     place, _, version = typed.value("place").partition("@")
     project, _, name = place.strip("/").partition("/")
     folder, slash, _ = typed.start.rpartition("/")
@@ -202,7 +202,7 @@ def proposals(typed: Typed) -> Iterator[Suggestion]:
 
 
 def commit_targets(typed: Typed) -> Iterator[Suggestion]:
-    """Complete a dataset of the project of the command, then `@` and a branch of it."""
+    """Complete a dataset of the project of the command; after `@`, a branch of this dataset."""
     project = _project_of(typed)
     dataset, at, _ = typed.start.partition("@")
     if at:
@@ -237,7 +237,7 @@ def places_or_versions(*kinds: Kind) -> How:
 
 
 def jobs(*states: str) -> How:
-    """Complete the id of a job: of the newest jobs of the projects, in one of the states if any is given."""
+    """Complete the id of a recent job of the project, or of all projects; with `states`, only jobs in these states."""
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         desk = typed.desk

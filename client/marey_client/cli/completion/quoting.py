@@ -1,7 +1,7 @@
-"""Quoting: how shells read the words of a line, and how suggestions are written so that shells read them as text.
+"""Quoting: parsing of command lines as shells parse them, and escaping of suggestions so that shells read plain text.
 
-Names on the server are chosen by other people, so a suggestion must never become anything but text: no second command,
-no substitution, and no repetition of an earlier command by `!`.
+Other people choose the names on the server. So the shell must not read a suggestion as anything but text: not as a
+second command, as a substitution, or as a repetition of an earlier command by `!`.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ _EXPANDS = "$`"
 
 
 class Mark(NamedTuple):
-    """Character of a line, and how a POSIX shell reads it."""
+    """Character of a command line, and the meaning that a POSIX shell gives to the character."""
 
     place: int
     typed: str
     plain: str
-    """What it contributes to the word: nothing if it is a quote, or a backslash before another character."""
+    """The character as part of the word; empty for a quote, and for a backslash that escapes the next character."""
     quote: str
-    """Quote in which the next character stands, or the empty text."""
+    """Kind of quote that is open after this character, or the empty text."""
     is_free: bool
-    """Whether it is neither quoted nor escaped nor a quote."""
+    """Whether the character is outside of quotes, not escaped, and not a quote or an escaping backslash itself."""
     is_escaped: bool
-    """Whether a backslash is before it and escapes it."""
+    """Whether a backslash before the character escapes it."""
 
 
 def marks(text: str) -> Iterator[Mark]:
-    """Yield how a POSIX shell reads each character; a quote that is still open ends with the text."""
+    """Yield a `Mark` for each character of a text; a quote may still be open at the end of the text."""
     quote, escaped = "", False
     for place, one in enumerate(text):
         free, after_backslash = False, escaped
@@ -46,10 +46,10 @@ def marks(text: str) -> Iterator[Mark]:
 
 
 def for_bash(text: str, raw: str, replaced: str) -> str | None:
-    """Return what bash inserts for a suggestion, or None if it is not certain that bash would read it as text.
+    """Return the text that bash inserts for the suggestion `text`; None if bash might not read it as plain text.
 
-    `raw` is the word as typed up to the cursor; `replaced` is its end, which bash replaces. If a quote is open, this is
-    the text after the quote, otherwise the word or its part from a character such as `=` on.
+    `raw` is the word as typed up to the cursor; `replaced` is the end of `raw` that bash replaces. After an open quote,
+    `replaced` is the text after the quote; otherwise, it is the whole word, or the part after a character such as `=`.
     """
     if not raw.endswith(replaced) or any(_is_expanded(mark) for mark in marks(raw)):
         return None
@@ -95,10 +95,10 @@ def _with_backslashes(text: str) -> str:
 
 
 def _in_quote(text: str, quote: str) -> str:
-    """Return text for the inside of a quote that is open; bash closes the quote after a single suggestion.
+    """Return `text` as a suggestion after an open quote; bash closes the quote if there is only one suggestion.
 
-    bash omits a quote from the beginning of a suggestion if one is before it already, and closes no quote after a
-    suggestion that ends with one. So there is a further quote in both cases.
+    bash drops a quote at the beginning of a suggestion, because the open quote is before it, and does not close the
+    quote after a suggestion that ends with a quote. A second quote is added in both cases.
     """
     shown = "".join(_one_in_quote(one, quote) for one in text)
     begin = quote if shown.startswith(quote) else ""

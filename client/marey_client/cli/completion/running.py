@@ -1,4 +1,4 @@
-"""Runs when a shell asks for completion: finds the parameter at the cursor with typer, and prints suggestions."""
+"""Answers to shells that request completion: the parameter at the cursor is found with typer, then completed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 def complete(app: typer.Typer, line: Line) -> list[Suggestion] | None:
-    """Return suggestions for the end of a line; None if file names fit there."""
+    """Return suggestions for the word at the end of a line; None if the shell should complete file names."""
     from typer.completion import completion_init  # pyrefly: ignore[implicit-reexport]  # of a private module
 
     completion_init()
@@ -49,10 +49,10 @@ def complete(app: typer.Typer, line: Line) -> list[Suggestion] | None:
 def answer_shell(
     app: Callable[[str | None], typer.Typer], apart: Callable[[list[str]], tuple[list[str], list[str]]]
 ) -> int:
-    """Print suggestions for the shell that asks by the environment, and return the exit status.
+    """Read a shell's request from environment variables, print suggestions, and return the exit status.
 
-    `app` returns the application with the command of a name, and `apart` separates global options from other words.
-    Whatever fails, there is no output: an error message would appear in the middle of what the user types.
+    `app` returns the application with the command of the given name. `apart` separates the global options from the
+    other words. If anything fails, nothing is printed, because the text would appear in the line that the user types.
     """
     shell = os.environ[VARIABLE].removeprefix("complete_")
     try:
@@ -72,14 +72,14 @@ def answer_shell(
 
 
 class _Asked:
-    """One question of a shell, and its answer if the table of subjects completes the parameter at the cursor."""
+    """Request of a shell, and the suggestions in `found`; None if `SUBJECTS` has no entry for the parameter."""
 
     def __init__(self, line: Line) -> None:
         self.line = line
         self.found: list[Suggestion] | None = None
 
     def prepared(self, app: typer.Typer, names: tuple[str, ...] = ()) -> typer.Typer:
-        """Return a copy of an application whose parameters are completed by the table of subjects."""
+        """Return a copy of an application whose parameters are completed by the functions in `SUBJECTS`."""
         made = copy.copy(app)
         made.registered_commands = [self._command(one, names) for one in app.registered_commands]
         made.registered_groups = [copy.copy(one) for one in app.registered_groups]
@@ -100,9 +100,9 @@ class _Asked:
         return made
 
     def _without_models(self, command: type[SchemaCommand]) -> Callable[..., Any]:
-        """Return the function of a command without its options from models, whose modules take long to load.
+        """Return the function of a command without the options that come from models, because models load slowly.
 
-        Return it with these options if the line contains an option that the function itself lacks.
+        If the line contains an option that the function does not declare itself, these options are included.
         """
         options = [word.partition("=")[0] for word in (*self.line.words, self.line.start) if word.startswith("-")]
         if set(options) <= {"--json", *_own_options(command.function, command.groups)}:
@@ -110,7 +110,7 @@ class _Asked:
         return expanded(command.function, command.groups)
 
     def _completed(self, function: Callable[..., Any], command: tuple[str, ...]) -> Callable[..., Any]:
-        """Return a function that does nothing, with the parameters of `function`, completed by the table."""
+        """Return a function that does nothing; its parameters are those of `function`, completed by `SUBJECTS`."""
 
         def run(**_: Any) -> None: ...
 
@@ -126,7 +126,7 @@ class _Asked:
         return run
 
     def _answering(self, how: How, depth: int) -> Callable[..., list[str]]:
-        """Return what typer calls to complete a parameter of a command whose name has `depth` words."""
+        """Return the function that typer calls to complete a parameter of a command whose name has `depth` words."""
 
         def answer(ctx: typer.Context, incomplete: str) -> list[str]:
             root = ctx.find_root().params
@@ -149,9 +149,10 @@ class _Asked:
         return answer
 
     def _values(self, ctx: typer.Context, depth: int) -> Mapping[str, Any]:
-        """Return the values before the word at the cursor.
+        """Return the values of the parameters before the word at the cursor.
 
-        If this word is the value of the option before it, the context has no arguments: its parser stopped there.
+        If this word is the value of an option, typer has parsed no arguments; then the line is parsed without the
+        option.
         """
         words = list(self.line.words)
         if not words or not words[-1].startswith("-"):
@@ -161,7 +162,7 @@ class _Asked:
 
 
 def _with_completion(parameter: inspect.Parameter, answer: Callable[..., list[str]]) -> inspect.Parameter:
-    """Return a parameter whose declaration has a function that completes it."""
+    """Return a copy of a parameter that typer completes by calling `answer`."""
     if get_origin(parameter.annotation) is not Annotated:
         return parameter
     kind, *declared = get_args(parameter.annotation)

@@ -10,15 +10,15 @@ from marey_client.cli.completion.found import Suggestion
 from marey_client.cli.completion.quoting import for_bash, for_powershell, marks
 
 VARIABLE = "_MAREY_COMPLETE"
-"""Environment variable by which a shell asks for completion: `complete_` and the name of the shell."""
+"""Environment variable that requests completion; the value is `complete_` followed by the name of the shell."""
 LINE = "_TYPER_COMPLETE_ARGS"
 """Environment variable that contains the command line up to the cursor, as typed."""
 REPLACED = "_MAREY_REPLACED"
-"""Environment variable with the end of the line that bash replaces by a suggestion."""
+"""Environment variable with the part at the end of the line that bash replaces by the chosen suggestion."""
 WORD = "_TYPER_COMPLETE_WORD_TO_COMPLETE"
 """Environment variable with the word at the cursor in PowerShell, whose line lacks the space before an empty word."""
 FILES = 3
-"""Exit status that means: complete with files."""
+"""Exit status by which `marey` requests that the shell completes file names."""
 
 _BASH = r"""
 _marey_completion() {
@@ -83,7 +83,7 @@ end
 complete --command marey --no-files --keep-order --arguments '(__marey_completion)'
 """
 SCRIPTS = {"bash": _BASH.lstrip(), "zsh": _ZSH.lstrip(), "fish": _FISH.lstrip()}
-"""Script by the name of its shell."""
+"""Completion script of each shell, by the shell's name."""
 
 POWERSHELLS = ("powershell", "pwsh")
 
@@ -97,16 +97,16 @@ class Line:
     start: str
     """Beginning of the word at the cursor."""
     raw: str
-    """The same as it was typed, with quotes."""
+    """Beginning of the word at the cursor as it was typed, with quotes and backslashes."""
     options: tuple[str, ...] = ()
     """Global options with their values, which typer needs before all other words."""
 
     replaced: str | None = None
-    """End of `raw` that bash replaces by a suggestion; None if the shell did not say."""
+    """End of `raw` that bash replaces by the chosen suggestion; None if the shell did not send it."""
 
     @classmethod
     def parse(cls, text: str, replaced: str | None = None) -> Line:
-        """Parse a line as POSIX shells split it; a quote that is still open ends with the line."""
+        """Split a line into words as POSIX shells do; a quote that is still open extends to the end of the line."""
         words, start, begin = [], "", -1
         for mark in marks(text):
             if mark.is_free and mark.typed.isspace():
@@ -120,7 +120,7 @@ class Line:
 
 
 def read_line(environment: Mapping[str, str]) -> Line:
-    """Return the line that a shell sends, by a script of this module or by an earlier one made by typer."""
+    """Return the line that a shell sends with a script of this module, or with a script that typer generated."""
     if LINE in environment:
         ends_with_space = environment.get(WORD) == ""
         return Line.parse(environment[LINE] + " " * ends_with_space, environment.get(REPLACED))
@@ -131,7 +131,7 @@ def read_line(environment: Mapping[str, str]) -> Line:
 
 
 def answer_text(shell: str, line: Line, found: Iterable[Suggestion]) -> str:
-    """Return the suggestions in the form that the script of a shell reads: one in each line."""
+    """Return the suggestions in the form that the script of a shell reads, one per line."""
     lines = (_shown(shell, line, one.text, _one_line(one.remark)) for one in found if one.text.isprintable())
     return "\n".join(one for one in lines if one is not None)
 
@@ -146,7 +146,7 @@ def _shown(shell: str, line: Line, text: str, remark: str) -> str | None:
 
 
 def typed_by_typer(line: Line) -> dict[str, str]:
-    """Return the environment in which typer answers a line with one suggestion in each line, without remarks."""
+    """Return environment variables by which typer completes `line` and prints one suggestion per line."""
     words = [*line.options, *line.words, line.start]
     return {"COMP_WORDS": shlex.join(["marey", *words]), "COMP_CWORD": str(len(words)), VARIABLE: "complete_bash"}
 

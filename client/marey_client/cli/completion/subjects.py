@@ -1,4 +1,4 @@
-"""Table of what completes which parameter of which command. Choices and files need no entry: their types suffice."""
+"""Table of the completion functions of parameters. Choices and files need no entry: typer completes them by type."""
 
 from __future__ import annotations
 
@@ -169,10 +169,10 @@ SUBJECTS: Mapping[str, How] = {
     "view place": places(Kind.CLIP),
     "webhook webhook_id": in_project("webhooks", field="id", remark="url"),
 }
-"""What completes a parameter, by its name. Names of commands before it restrict an entry; the longest key counts."""
+"""Completion function of a parameter, by `parameter` or `command parameter`; the longest matching key is used."""
 
 
 def how_to_complete(command: Sequence[str], parameter: str) -> How | None:
-    """Return what completes a parameter of a command, such as `job`, `show`; None if nothing does."""
+    """Return the completion function for a parameter of a command, such as `("job", "show")`; None if it has none."""
     keys = [" ".join([*command[:length], parameter]) for length in range(len(command), -1, -1)]
     return next((SUBJECTS[key] for key in keys if key in SUBJECTS), None)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from marey_schemas.datasets.merges import EntryConflict, MergeAnswer, Resolution, Side
 
 CONFLICT = "PATH:KIND[/PART]"
-"""Form in which the options name a conflict, or one of its parts."""
+"""Form of the values of --ours, --theirs and --base, which name an entry with a conflict, or one part of the entry."""
 
 Into = Annotated[str, typer.Option(help="Branch that gets the changes.")]
 CommitMessage = Annotated[str, typer.Option("--message", "-m", help="Message of the commit.")]
@@ -191,7 +191,10 @@ def resolutions_of(
         for place in places or ():
             one = _resolution(place, side)
             if any(_order_matters(one, other) for other in found):
-                raise WrongUsage(f"{place!r} has two different sides; to choose them one by one, use Python or REST")
+                raise WrongUsage(
+                    f"{place!r} is resolved by two of --ours, --theirs and --base; give only one of them for an entry "
+                    "or a part, or resolve the parts with Python or REST"
+                )
             found.append(one)
     return found
 
@@ -208,9 +211,9 @@ def _resolution(place: str, side: Side) -> Resolution:
 
 
 def _order_matters(one: Resolution, other: Resolution) -> bool:
-    """Return whether the order of two decisions would decide which conflict each resolves.
+    """Return whether two decisions resolve the same conflict differently, so that the later one would win.
 
-    Options of different names have no order.
+    The command line does not show which one is later, because options of different names have no order.
     """
     same_part = one.part == other.part or None in (one.part, other.part)
     return (one.path, one.kind) == (other.path, other.kind) and one.take != other.take and same_part

@@ -268,8 +268,8 @@ def checkout(
 ) -> None:
     """Change the folder of a dataset to the content of a version. Items that the command removes can be restored.
 
-    With --query or --path, only a part of the version is checked out. The folder remembers the part: commits of the
-    folder keep all entries that were not checked out. To take all entries again, repeat the command without the option.
+    With --query or --path, only a part of the version is checked out. Marey stores which part: later commits of the
+    folder keep all entries that were not checked out. To check out all entries, repeat the command without the option.
     """
     at = parse(place, version=True)
     with connect(context) as marey:

@@ -54,7 +54,7 @@ class DemoVersion:
 def version_results(
     project: ProjectHandle, results: Mapping[str, ClipHandle], skeleton: SkeletonHandle, folder: Path
 ) -> DemoVersion:
-    """Commit the results, smooth the longest one on a branch, merge the branch, and tag the merged version.
+    """Commit the results, smooth the longest clip on a branch, merge the branch, and tag the merged version.
 
     `results` maps the paths of entries to the clips that they will contain. If the newest tag already
     names a version with these results, no new tag is set. A picture that shows what smoothing changed is written to

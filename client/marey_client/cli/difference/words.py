@@ -23,7 +23,7 @@ from marey_schemas.wording import counted
 
 NO_DIFFERENCE = "no difference"
 MOST_LINES = 20
-"""Greatest number of joints, segments or fields that are listed; the others are only counted."""
+"""Greatest number of joints, segments or fields that are listed; only the number of the others is printed."""
 MOST_SPANS = 3
 """Greatest number of time ranges that are listed for a joint."""
 LEAST_TURN_DEG = 0.05
@@ -43,7 +43,7 @@ def described(difference: Difference) -> Iterator[str]:
 
 
 def changes_in_words(difference: Difference) -> Iterator[str]:
-    """Yield one line of text for each change, or a single line that says that nothing differs."""
+    """Yield one line of text for each change, or the single line `no difference`."""
     lines = list(_changes(difference))
     yield from lines or [NO_DIFFERENCE]
 
@@ -135,7 +135,7 @@ def _unmatched(motion: MotionDifference) -> Iterator[str]:
         if run.change == "removed" and following is not None and following.change == "inserted":
             where = _time(*following.after, motion.frame_rate_hz[1])
             old, new = run.before[1] - run.before[0], following.after[1] - following.after[0]
-            yield f"replaced: {counted(old, 'frame')} by {new:,} that correspond to none, {where}"
+            yield f"replaced: {counted(old, 'frame')} by {new:,} new ones, {where}"
             following = next(runs)
         elif run.change != "matched":
             yield _run(run, motion)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 JSON_PARAMETER = re.compile(r"(?<!\S)[a-z_]+=(?=[\[{])")
-"""Name of a parameter whose value begins like a list or an object in JSON."""
+"""Pattern of the name and the equals sign of a parameter whose value begins with `[` or `{`, as JSON does."""
 
 
 def parse_command(text: str) -> dict[str, Any]:

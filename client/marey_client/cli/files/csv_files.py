@@ -9,13 +9,13 @@ from pathlib import Path
 from marey_client.cli.terminal.failures import WrongUsage
 
 _BEYOND = "\0"
-"""Name under which the reader stores cells beyond the columns."""
+"""Key under which the CSV reader stores cells that have no column name."""
 
 
 def rows_of(table: Path) -> dict[int, dict[str, str | None]]:
-    """Return the rows of a CSV file, by their numbers in a spreadsheet; each has its cells by the names of columns.
+    """Return the rows of a CSV file by line number; a row maps the names of the columns to cells.
 
-    Raises `WrongUsage` if it has no rows, two columns of one name, or a row with more cells than there are columns.
+    Raises `WrongUsage` if the file has no rows, two columns with the same name, or a row with more cells than columns.
     """
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
@@ -29,7 +29,7 @@ def rows_of(table: Path) -> dict[int, dict[str, str | None]]:
     if not rows:
         raise WrongUsage(f"{table} has no rows below its column names")
     if twice := [name for name, count in names.items() if count > 1]:
-        raise WrongUsage(f"{table} has several columns {twice[0]!r}; name each column once")
+        raise WrongUsage(f"{table} has several columns named {twice[0]!r}; give each column its own name")
     for number, row in rows.items():
         if _BEYOND in row:
             raise WrongUsage(f"{table}, row {number}: the row has more cells than the table has columns")

@@ -43,7 +43,9 @@ def download(
             "project/dataset@version[/folder]."
         ),
     ],
-    format: Annotated[str, typer.Option(help=f"{one_of(EXPORT_FORMATS)}.")] = "original",  # noqa: A002
+    format: Annotated[  # noqa: A002
+        str, typer.Option(help=f"Format of the files: {one_of(EXPORT_FORMATS)}.")
+    ] = "original",
     revision: RevisionNumber = None,
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
@@ -65,7 +67,8 @@ def download(
         bool,
         typer.Option(
             "--fold-positions",
-            help="Give positions to the root of BVH files alone, for programs that ignore those of other joints.",
+            help="Write positions only for the root joint of BVH files, for programs that ignore positions of other "
+            "joints.",
         ),
     ] = False,
     restored: Annotated[
@@ -74,11 +77,11 @@ def download(
     allow_expired_consent: AllowExpiredConsent = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write clips to files: one clip, or all clips in a folder and below.
+    """Write clips to files: one clip, or all clips in a folder and its subfolders.
 
-    Aligned clips are written only if the folder contains no other clips. After `@`, name a revision of the clip, or a
-    version of the dataset. Other items, such as edits and evaluations, are written with `--format json`. For models,
-    graphs, skeletons and annotations, there is also `--format predecessor`.
+    Aligned clips in a folder are written only if there are no other clips in it. After `@`, name a revision of the
+    clip, or a version of the dataset. Other items, such as edits and evaluations, are written with `--format json`. For
+    models, graphs, skeletons and annotations, there is also `--format predecessor`.
 
     An existing file is replaced; if several clips would have the same file name, later clips get a number.
     """
@@ -117,7 +120,7 @@ class _Exported(NamedTuple):
 
 
 def _exported_at(marey: Marey, address: Address) -> list[_Exported]:
-    """Return the item at an address, the clips in a folder and below, or the clips of a dataset version."""
+    """Return the item at an address, the clips in a folder and its subfolders, or the clips of a dataset version."""
     from marey_schemas.kinds import Kind
 
     project = marey.project(address.project)

@@ -47,10 +47,10 @@ COLUMNS: dict[str, Callable[[Item], object]] = {
     "id": lambda item: item.id,
     STALE: lambda item: None,  # noqa: ARG005 - what the server answers decides, see `_value`
 }
-"""Columns that follow the name in a list of items; whether an item is stale, the server is asked for separately."""
+"""Columns that follow the name in a list of items; the values of `stale` come from a separate request."""
 DEFAULT_COLUMNS = "kind,revision,joints,frames,Hz,tags"
 FIGURES = ("revision", "joints", "frames", "Hz", "seconds")
-"""Columns with numbers."""
+"""Columns with numbers, which are aligned to the right."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -145,7 +145,7 @@ def ls(
 
 
 def _nothing_at(address: Address, *, chosen: bool) -> str:
-    """Return what to say instead of an empty list; `chosen` states that options left something out."""
+    """Return the message for an empty list; `chosen` states whether options limited the list."""
     if chosen:
         return f"{address} contains nothing that meets the options"
     return f"{address} is empty; `marey upload FOLDER --project {address.project}` stores motion files"
@@ -181,9 +181,9 @@ def _columns(text: str, *, also: Sequence[str] = ()) -> list[str]:
 
 
 def _value(item: Item, column: str, old: Collection[str]) -> object:
-    """Return the value of a column for an item; a facet is rounded to four digits, or None if the item lacks it.
+    """Return the value of a column for an item; None if the item has no value.
 
-    `old` are the ids of stale items.
+    Facets are rounded to four significant digits. `old` are the ids of stale items.
     """
     if column == STALE:
         return STALE if item.id in old else None
@@ -304,7 +304,7 @@ def show(
 
 
 def _rounded(value: object) -> object:
-    """Return a number with six digits for people; `--json` prints all digits."""
+    """Return a number rounded to six significant digits, for people; `--json` prints all digits."""
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 

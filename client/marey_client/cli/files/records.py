@@ -124,7 +124,7 @@ def _checked(given: Mapping[str, str], place: str) -> dict[str, Any]:
 def _from_table(
     table: Path, clips: Sequence[ClipHandle], path: str, columns: Mapping[str, str]
 ) -> Iterator[_RecordChange]:
-    """Yield the changes of a table. Raises `WrongUsage` with all wrong rows if there are any."""
+    """Yield the change that each row of a table makes. Raises `WrongUsage`, which lists all wrong rows."""
     rows = rows_of(table)
     fields = {
         name: columns.get(name, name.strip().lower().replace(" ", "_")) for name in next(iter(rows.values())) if name
@@ -139,8 +139,8 @@ def _from_table(
     for name, field in fields.items():
         if name != key and field not in TakeRecord.model_fields:
             raise WrongUsage(
-                f"{table}: the column {name!r} is not a field; name one with --column '{name}=FIELD', or remove the "
-                f"column; the fields are {', '.join(TakeRecord.model_fields)}"
+                f"{table}: the column {name!r} is not a field; give the field that the column fills with --column "
+                f"'{name}=FIELD', or remove the column; the fields are {', '.join(TakeRecord.model_fields)}"
             )
     known = _keyed(clips, path, fields[key])
     wrong: list[str] = []

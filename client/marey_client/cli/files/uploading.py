@@ -45,7 +45,7 @@ def upload(
     """Import motion files. Refused files are listed with a reason.
 
     Importing the same file again changes nothing; a changed file of the same name becomes a new revision of its clip.
-    If it also has another skeleton, it is refused without --replace.
+    A changed file that also has another skeleton is refused, unless --replace is given.
     Clips from a folder that `marey dataset export` wrote get the paths, take records and tags that they had in the
     export.
     """

@@ -21,7 +21,7 @@ bench = typer.Typer(
 )
 
 Rates = Annotated[str, typer.Option("--rate", help="Jobs submitted per second: one rate, or several with commas.")]
-Seconds = Annotated[float, typer.Option(help="Duration of the submissions of a run.")]
+Seconds = Annotated[float, typer.Option(help="Number of seconds during which a run submits jobs.")]
 Replicates = Annotated[
     int, typer.Option(help="Number of runs at each rate, from which the confidence intervals are computed.")
 ]
@@ -83,7 +83,7 @@ def serve(
     """Start a server on this machine, measure it as `marey bench load` does, and remove it.
 
     Server and simulated workers share this machine, so a separate server can be faster. A Postgres database must be
-    empty, and keeps the tables of the test; drop it afterwards.
+    empty. The tables of the test remain in it; drop the database afterwards.
     """
     plan = _plan(rates, seconds, replicates, workers, work_ms, seed)
     from marey_client.load.own_server import own_server

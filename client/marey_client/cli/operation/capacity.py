@@ -1,4 +1,4 @@
-"""Command `capacity`, which computes what an amount of work needs."""
+"""Command `capacity`, which computes how busy an amount of work keeps workers, servers and database."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marey_client.cli.terminal.invocation import AsJson
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 
 MOST = 10**15
-"""Greatest amount of anything; infinity and numbers near the end of the range of floats have no sensible answer."""
+"""Greatest value of each option, far below the greatest float, so that the computation cannot overflow."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -31,13 +31,15 @@ def capacity(
     database_processors: Annotated[
         int, typer.Option(min=1, max=MOST, help="Number of processors of the database.")
     ] = 8,
-    costs: Annotated[Path | None, typer.Option(help="File of measured costs; default: that of this version.")] = None,
+    costs: Annotated[
+        Path | None, typer.Option(help="File of measured costs; default: the file that is part of this version.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute what an amount of clips needs of workers, servers and database, and which part saturates first.
+    """Compute how busy a number of clips keeps workers, servers and database, and which of them saturates first.
 
-    The numbers are computed from measured costs of a job, a clip and a byte; nothing is measured now. They hold for
-    machines like that of the measurement, and leave out pauses, failures and networks.
+    The numbers are computed from measured costs of a job, a clip and a byte; this command measures nothing. The numbers
+    hold for machines like the one on which the costs were measured. Pauses, failures and networks are not included.
     """
     from marey_client import embedded
 

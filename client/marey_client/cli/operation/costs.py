@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 CHECKED = "2,8"
 MOST_CHECKED = 64
 FURTHER = 32
-"""Number of workers for which jobs per second are predicted and not measured."""
+"""Further number of workers for which jobs per second are predicted, but not measured."""
 
 
 def add_to(_app: typer.Typer) -> None:
@@ -30,8 +30,12 @@ def measure_costs(
     database_url: Annotated[
         str | None, typer.Option(help="URL of an empty Postgres database; default: an SQLite file.")
     ] = None,
-    workers: Annotated[str, typer.Option(help="Numbers of workers to predict and to measure.")] = CHECKED,
-    rounds: Annotated[int, typer.Option(min=1, max=20, help="Number of rounds; in each, all numbers take turns.")] = 5,
+    workers: Annotated[
+        str, typer.Option(help="Numbers of workers for which jobs per second are predicted and measured.")
+    ] = CHECKED,
+    rounds: Annotated[
+        int, typer.Option(min=1, max=20, help="Number of rounds; each round measures every number of workers once.")
+    ] = 5,
     work_ms: WorkMs = 0.0,
     seed: Seed = 0,
     as_json: AsJson = False,
@@ -63,7 +67,7 @@ def measure_costs(
 
 
 def _counts(text: str, used: tuple[int, ...]) -> tuple[int, ...]:
-    """Return numbers of workers. Raises `WrongUsage` if one is not valid, or used to measure the costs."""
+    """Parse numbers of workers. Raises `WrongUsage` if a number is not valid, or is one of `used`."""
     try:
         counts = tuple(int(one) for one in text.split(","))
     except ValueError:
@@ -77,7 +81,7 @@ def _counts(text: str, used: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _job_costs(found: Calibration) -> dict[str, float]:
-    """Return the costs of a job, without those of the database, which a simulation of the queue does not need."""
+    """Return the costs of a job for a simulation of the queue, which does not need the costs of the database."""
     return {
         "claim_s": found.claim_s, "complete_s": found.complete_s, "busy_s": found.busy_s,
         "variation": found.variation, "database_s": 0.0, "database_bytes": 0.0,
@@ -85,7 +89,7 @@ def _job_costs(found: Calibration) -> dict[str, float]:
 
 
 def _differences(found: Calibration, predicted: dict[int, float]) -> dict[int, float]:
-    """Return predicted over measured jobs per second, minus 1, by number of workers."""
+    """Return the relative error of the prediction, predicted / measured - 1, by number of workers."""
     return {count: predicted[count] / measured - 1 for count, measured in found.checked.items()}
 
 

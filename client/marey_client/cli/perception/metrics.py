@@ -189,7 +189,7 @@ add_command(metric, compare, params=DISTANCES, job=FINDINGS_JOB)
 
 
 def _document(context: typer.Context, name: str) -> MetricDocument:
-    """Return the document of a metric; only a stored one needs the server."""
+    """Return the document of a metric, given by name, by file or by address; only an address needs the server."""
     from marey_schemas.documents.metrics import MetricDocument, built_in_metric, is_built_in
 
     if name.endswith(".json"):

@@ -61,7 +61,7 @@ def quality(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Measure defects of clips: foot skate, contacts, penetration of the floor, jitter, excess of joint limits."""
+    """Measure defects of clips: foot skate, contacts, penetration of the floor, jitter, exceeded joint limits."""
     from marey_client.handles.findings import Quality
     from marey_schemas.kinds import Kind
 

@@ -12,13 +12,13 @@ if TYPE_CHECKING:
     from marey_schemas.queue.scripts import Value
 
 BEST = " *"
-"""Mark behind the best value of a column."""
+"""Text that follows the best value of a column."""
 FORMULA_SIGNS = tuple("=+-@\t\r")
-"""Signs with which a text begins that a spreadsheet would read as a formula."""
+"""Characters at the beginning of a text that make a spreadsheet read the text as a formula."""
 
 
 class RunTable(NamedTuple):
-    """Table of exact values, with the columns of numbers, and the cells (row, column) of the best values."""
+    """Table of exact values; `numeric` are the headings of columns of numbers, `best` the best cells (row, column)."""
 
     heads: tuple[str, ...]
     rows: list[list[Value | None]]
@@ -33,7 +33,7 @@ class RunTable(NamedTuple):
         ]
 
     def csv(self) -> str:
-        """Return the table as CSV with exact numbers; texts that would be formulas begin with an apostrophe."""
+        """Return the table as CSV with exact numbers; an apostrophe is put before texts that look like formulas."""
         buffer = io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
         writer.writerow(map(_safe, self.heads))
@@ -42,7 +42,7 @@ class RunTable(NamedTuple):
 
 
 def shown_columns(comparison: RunComparison, *, every: bool) -> tuple[ComparedColumn, ...]:
-    """Return the columns that differ between the runs, or all; a single run has all."""
+    """Return the columns in which the runs differ; all columns with `every`, and for a single run."""
     every = every or len(comparison.runs) < 2
     return tuple(column for column in comparison.columns if every or column.differs)
 
@@ -63,7 +63,7 @@ def table_of_runs(comparison: RunComparison, columns: Sequence[ComparedColumn]) 
 
 
 def table_of_means(comparison: RunComparison, columns: Sequence[ComparedColumn]) -> RunTable:
-    """Return a table with one row for each setting: its number of runs, and each field's mean with its interval."""
+    """Return a table with one row for each setting: its number of runs, and mean and interval of each logged field."""
     fixed = [column for column in columns if column.of != "field"]
     fields = [column for column in columns if column.of == "field" and column.numeric]
     titles = comparison.titles(fields)

@@ -48,7 +48,7 @@ def compare(
         typer.Option(
             metavar="ORDER",
             help="created_at, fields.NAME or values.NAME; a leading - sorts in descending order. The first value of "
-            "a field in this order is the best, unless another option says which.",
+            "a field in this order is the best, unless --highest or --lowest names the field.",
         ),
     ] = "-created_at",
     limit: Annotated[
@@ -71,20 +71,21 @@ def compare(
     plot: Annotated[
         Literal["lines", "scatter", "bars"] | None,
         typer.Option(
-            help="Chart of a .svg or .png, and the only kind of chart of a page: lines over steps, a field over a "
-            "parameter, or bars. Default: a page has all kinds, a picture the first one for which there are values."
+            help="Kind of chart: lines over steps (lines), a field over a parameter (scatter), or bars. Default: in a "
+            ".html page all kinds, in a .svg or .png the first kind for which there are values."
         ),
     ] = None,
     parameter: Annotated[
-        str | None, typer.Option(help="Parameter on the horizontal axis. Default: the first that differs.")
+        str | None,
+        typer.Option(help="Parameter on the horizontal axis. Default: the first one that differs between the runs."),
     ] = None,
     log: Annotated[bool, typer.Option("--log", help="Logarithmic scale for fields with positive values.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Compare the succeeded runs of a script: a table of what differs, or charts.
+    """Compare the succeeded runs of a script: a table of the differences, or charts.
 
-    Runs that differ only by their seeds are replicates of one setting. Charts show their mean with its 95 % confidence
-    interval, if there are at least 3, and their number n.
+    Runs that differ only by their seeds are replicates of one setting. Charts show the number n of replicates, their
+    mean, and for 3 or more replicates the 95 % confidence interval of the mean.
     """
     ending = _ending_of(chart)
     if as_csv and as_json:

@@ -114,7 +114,10 @@ def change(
     description: Annotated[str | None, typer.Option(help="New purpose of the schedule.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change, pause or resume a schedule. After any change but --pause and --description, jobs are submitted as you."""
+    """Change, pause or resume a schedule.
+
+    After any change except by --pause or --description, the schedule submits its jobs as you.
+    """
     from marey_schemas.queue.jobs import JobCreate
     from marey_schemas.queue.schedules import ScheduleChange
 

@@ -48,7 +48,7 @@ def create(
     consent: Annotated[Path, typer.Option(help="Text file to whose content participants consent.")],
     title: Annotated[str | None, typer.Option(help="Title that participants see; default: the name.")] = None,
     trials: Annotated[int, typer.Option(min=1, max=200, help="Number of answered trials of each participant.")] = 63,
-    seconds: Annotated[float, typer.Option(min=1, max=120, help="Time for an answer.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=1, max=120, help="Time for an answer, in seconds.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the trials.")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -98,10 +98,12 @@ def invite(
     context: typer.Context,
     place: StudyPlace,
     count: Annotated[int, typer.Option("--count", "-n", min=1, max=100, help="Number of links.")] = 1,
-    days: Annotated[int, typer.Option(min=1, max=180, help="Number of days within which to begin.")] = 30,
+    days: Annotated[
+        int, typer.Option(min=1, max=180, help="Number of days within which participants must begin.")
+    ] = 30,
     as_json: AsJson = False,
 ) -> None:
-    """Create links, each for one participant without an account, and print them; they are never shown again."""
+    """Create links, each for one participant without an account, and print the links, which are never shown again."""
     from marey_schemas.studies.participation import LINK_PATH
 
     with connect(context) as marey:

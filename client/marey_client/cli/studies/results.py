@@ -81,7 +81,9 @@ def analyse(
     from marey_client.handles.findings import Findings
 
     if (out is not None or metric is not None) and not wait:
-        raise WrongUsage("--out and --metric write results of the job; leave out --no-wait, which does not wait for it")
+        raise WrongUsage(
+            "--out and --metric write results of the job, but --no-wait does not wait for them; leave out --no-wait"
+        )
     with connect(context) as marey:
         handle = study_at(marey, place)
         request = handle.analyse_request(**params).model_copy(update=job)

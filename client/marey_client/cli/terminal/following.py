@@ -142,7 +142,7 @@ def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None
 
 
 def print_commit(ended: Job) -> None:
-    """Print the commit with the results of a job. Raises `Refused` if it could not be put on the requested branch."""
+    """Print the commit of a job's results. Raises `Refused` if the commit could not be added to the given branch."""
     if ended.commit is not None:
         print_message(commit_text(ended))
     if ended.publish_conflict is not None:

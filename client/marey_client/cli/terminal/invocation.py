@@ -61,7 +61,7 @@ def credential_of(context: typer.Context) -> Credential:
 def refuse_ignored(context: typer.Context, when: str, *names: str) -> None:
     """Raise `WrongUsage` if the user has given an option that would have no effect.
 
-    `when` says with or without which other option it has no effect; `names` are the names of parameters.
+    `names` are the names of the options' parameters. `when` is a part of the error text, such as "without --out".
     """
     from marey_client.cli.terminal.failures import WrongUsage
 

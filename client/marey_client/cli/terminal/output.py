@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _OTHER_CONTROLS = re.compile("[\x7f-\x9f]")
 COPIED = ("id", "job")
-"""Columns that people copy into the next command; on a narrow terminal, the other columns are shortened."""
+"""Columns that are never wrapped on a narrow terminal, because people copy their cells into the next command."""
 
 
 def print_json(value: Any) -> None:

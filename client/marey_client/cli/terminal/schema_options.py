@@ -45,7 +45,7 @@ NONE = "none"
 
 @dataclass(frozen=True)
 class OptionsOf:
-    """Options of a command that are derived from the fields of a model.
+    """Options of a command, one for each field of a model.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class OptionsOf:
     short : further spellings of an option, by the name of its field
     without : fields that get no option, because the command sets them
     only : fields that get an option; all fields if empty
-    nulls : a further text that means null, besides `none`, by the name of the field
+    nulls : a text that means null in addition to `none`, by the name of the field
     """
 
     model: str
@@ -202,7 +202,7 @@ class _Option:
 
 
 class SchemaCommand(TyperCommand):
-    """Command with options from models; its subclasses name its function, and the models by parameter."""
+    """Command with options from models; a subclass sets the function, and the models by parameter of the function."""
 
     function: ClassVar[Callable[..., Any]]
     groups: ClassVar[Mapping[str, OptionsOf]]
