@@ -9,7 +9,7 @@ from lint.sources import House, Offence
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Yield one circle of imports for each package that has one."""
+    """Yield one circular chain of imports for each package that contains such a chain."""
     for package in sorted({name.partition(".")[0] for name in house.modules}):
         names = sorted(name for name in house.modules if name.partition(".")[0] == package)
         try:

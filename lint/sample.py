@@ -17,7 +17,7 @@ SIZES = {"docstrings": 60, "error texts": 40, "help texts": 20, "pages": 5}
 
 
 def draw(house: House, seed: int) -> dict[str, list[tuple[str, str]]]:
-    """Return random texts with their places, by kind of text. The same house and seed give the same texts."""
+    """Return random texts with their places, by kind of text. Equal code and an equal seed give equal texts."""
     modules = [house.modules[name] for name in sorted(house.modules)]
     texts = {
         "docstrings": [one for module in modules for one in _docstrings(module)],

@@ -68,7 +68,7 @@ def draw_comparison(
 
 
 def _write_caption(figure: DrawnFigure) -> None:
-    """Write the caption below the chart, which is not on a page that shows it."""
+    """Write the caption below the chart, in a picture that is not part of an HTML page."""
     drawing = figure.sketch.figure
     lines = textwrap.wrap(plain(figure.caption), _CAPTION_SIGNS)
     width, before = drawing.get_size_inches()
@@ -152,7 +152,7 @@ def render_page(subject: ComparedSubject, plot: Plot | None, parameter: str | No
 
 
 def _verdict(subject: ComparedSubject) -> str:
-    """Name the best setting of the first field with a goal, and whether its interval is apart from all others."""
+    """Describe the best setting for the first field with a goal; mention an overlap with other intervals."""
     column = next((one for one in subject.fields if one.goal is not None and one.best_mean is not None), None)
     if column is None:
         return f"{counted(len(subject.comparison.runs), 'run')} are compared."
