@@ -49,9 +49,9 @@ class StripRow:
 
     Parameters
     ----------
-    label, note : texts to the left of the row; the note is below the label, in small letters
+    label, note : texts to the left of the row; `note` is written below `label`, in small letters
     bodies : (m, T, P, 3) points of m motions in T frames, metres, drawn on top of each other
-    ways : (m, N, 3) paths of the root, drawn on the floor; N may be 0
+    ways : (m, N, 3) paths of the root in metres, drawn on the floor; N may be 0
     ghost : (T, P, 3) points of a motion for comparison, drawn in grey behind the bodies
     """
 
@@ -139,7 +139,7 @@ class PoseRow:
     label, note : texts to the left of the row
     poses : one frame of the motion for each moment
     ghost : one frame of another motion for each moment, drawn in grey behind the poses
-    headings_rad : (T,) directions about +Y, 0 for +z, into which the poses are turned; None: as they are
+    headings_rad : (T,) headings to which the poses are turned, about +Y, 0 for +z; None: the poses are not turned
     """
 
     label: str
@@ -152,11 +152,11 @@ class PoseRow:
 def draw_pose_rows(rows: Sequence[PoseRow], names: Sequence[str], labels: Sequence[str], *, ghost: str = "") -> Figure:
     """Draw motions of one skeleton at T moments, one in each row; each body is in the middle of its cell.
 
-    Ghosts keep their distance from the bodies before them.
+    A ghost (a body of another motion, drawn in grey behind) has the same offset from the body in front as in the data.
 
     Parameters
     ----------
-    names, labels : T texts each, below the columns
+    names, labels : two texts for each of the T columns, written below the column
     ghost : name of the ghosts in the legend; empty: there are none
     """
     body = body_of(rows[0].poses[0].skeleton)
@@ -201,7 +201,7 @@ def _camera_direction(points: Floats, facing: tuple[tuple[int, ...], tuple[int, 
 
 @dataclass(frozen=True)
 class _StripCell:
-    """A cell: lower left corner and size in inches, point of the motion at its centre, scale in inches per metre."""
+    """Cell of a strip: lower left corner and size in inches, (x, z) in metres at its centre, and inches per metre."""
 
     corner: tuple[float, float]
     size: tuple[float, float]

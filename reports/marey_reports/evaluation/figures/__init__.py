@@ -46,8 +46,8 @@ class FigureKind(NamedTuple):
     Parameters
     ----------
     number : number of the figure in Abichequer Sangalli et al. (2022), or "" if that paper does not have the figure
-    trials : "one" if it shows one trial, "any" if it shows one or all trials, "none" if it always shows all trials
-    families : families of trials that it can show
+    trials : "one": the figure shows one trial; "any": one trial or all trials; "none": always all trials
+    families : families of trials that the figure can show
     draw : function that draws the figure for one or two subjects
     """
 
@@ -96,7 +96,7 @@ def draw_figure(
 
     Parameters
     ----------
-    name : one of `FIGURES`
+    name : name of the figure, a key of `FIGURES`
     trial : name of the trial to show, such as "switching v=1.5 w=-50". Default: the trial
         that the character follows worst, for figures that show only one trial; otherwise all trials
     other : second result, drawn beside the first for comparison
