@@ -93,8 +93,8 @@ class User(Answer):
     created_at: datetime
     last_seen_at: datetime | None = Field(
         None,
-        description="Latest use of a token or an identity of the user, to the hour; null if there is none, or if the "
-        "caller is no administrator. Uses of tokens that were deleted do not count.",
+        description="Time when a token or an identity of the user was last used, to the hour. Uses of tokens that "
+            "were deleted later do not count. Null: there was no use, or the caller is not an administrator.",
     )
     rev: int
 
@@ -135,7 +135,7 @@ class TokenCreate(Request):
 
 
 class TokenRotation(Request):
-    """Request to replace the token that authenticates the request by a new token with the same rights and expiry."""
+    """Request to replace the token that authenticates this request; the new token has the same rights and expiry."""
 
     rotation_id: str = Field(
         pattern=r"^[A-Za-z0-9_-]{32,64}$",
@@ -218,8 +218,8 @@ class Project(Answer):
     deleted_at: datetime | None = None
     most_running_jobs: int | None = Field(
         None,
-        description="Greatest number of the project's jobs that run at the same time, as an administrator set it; "
-        "null: no limit, or the caller is not a member.",
+        description="Greatest number of the project's jobs that may run at the same time, as set by an "
+            "administrator. Null: there is no limit, or the caller is not a member.",
     )
     rev: int
 
@@ -232,7 +232,7 @@ class QuotaChange(Request):
 
     items: int | None = Field(None, ge=0, le=2**53, description="Largest number of items.")
     stored_bytes: int | None = Field(
-        None, ge=0, le=2**53, description="Largest number of bytes that all revisions of the items take together."
+        None, ge=0, le=2**53, description="Largest total size of all revisions of the items, in bytes."
     )
 
 
@@ -246,8 +246,8 @@ class ProjectQuotaChange(QuotaChange):
         None,
         ge=0,
         le=MOST_RUNNING,
-        description="Greatest number of the project's jobs that workers run at the same time; null: no limit. Jobs "
-        "that run already continue.",
+        description="Greatest number of the project's jobs that workers run at the same time; null: no limit. A "
+            "lower limit does not stop jobs that are running.",
     )
 
 
@@ -277,7 +277,8 @@ class ProjectQuotasInUse(QuotasInUse):
 
     running_jobs: RunningJobs | None = Field(
         None,
-        description="The project's jobs that workers run; parents of tasks do not count. Null: the server is too old.",
+        description="Number of the project's jobs that workers run, and its limit. A job that is divided into tasks "
+            "does not count, but its tasks do. Null: the server is too old.",
     )
 
 

@@ -55,7 +55,8 @@ class CoverageStreamCreate(Request):
         None, description="Skeleton of the poses that will be sent; not needed if only `roots` are sent."
     )
     evaluation: ItemId | None = Field(
-        None, description="Evaluation whose grid and coverage are the initial state of the stream."
+        None, description="Evaluation from which the stream takes its grid and its initial coverage. Absent: the "
+            "coverage is empty at first."
     )
     speeds_m_s: tuple[Speed, ...] | None = Field(
         None,
@@ -192,7 +193,8 @@ class CoverageProgress(CoverageNow):
     """Coverage after the frames of a request, and the changes of the coverage by these frames."""
 
     offset: int = Field(description="Number of frames received so far.")
-    windows: int = Field(description="Number of one-second windows that these frames completed, in any cell.")
+    windows: int = Field(description="Number of one-second windows that these frames completed, regardless of their "
+        "cells.")
     changed: tuple[CoverageCell, ...] = Field(description="Cells whose data increased.")
 
 
@@ -223,7 +225,7 @@ class CoverageStreamState(CoverageStream, CoverageNow):
         description="[speeds, turn rates]: seconds of data that each cell still needs."
     )
     delay_s: float = Field(
-        description="Seconds between a frame and the end of the window of frames in which it is measured."
+        description="Delay of the newest measured window behind the newest frame, in seconds."
     )
 
 
@@ -231,7 +233,7 @@ class CoverageStreamState(CoverageStream, CoverageNow):
 
 
 class MeasuredOptions(Answer):
-    """Those options of an evaluation that determine its coverage."""
+    """Options of an evaluation that determine its coverage; all other options are left out."""
 
     grid: Grid
     coverage_least_s: float = Field(gt=0, le=3600)

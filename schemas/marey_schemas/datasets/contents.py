@@ -40,7 +40,7 @@ class PartOfContent(Request):
 
 
 class RequestedDocument(PartOfContent):
-    """Address of a document, and the revision with an earlier version of it that the reader has."""
+    """Address of a document, and optionally a revision with an earlier version of this document that the client has."""
 
     base: Digest | None = Field(
         None,
@@ -72,7 +72,7 @@ class ExportPermission(Answer):
     """Permission to export revisions."""
 
     ended: tuple[str, ...] = Field(
-        description="Ids of the items whose consent has ended, and whose export the request allows."
+        description="Ids of the items whose consent has ended, but whose export the request allows."
     )
 
 
@@ -103,7 +103,7 @@ class ReceivedRevision(Request):
 
 
 class ReceivedRevisions(Request):
-    """Revisions from an archive or another server. The project must already have all revisions to which these refer."""
+    """Revisions from an archive or another server. The project must already have the revisions that they refer to."""
 
     revisions: tuple[ReceivedRevision, ...] = Field(min_length=1, max_length=MOST_CONTENTS)
 

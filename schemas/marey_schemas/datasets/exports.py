@@ -55,7 +55,8 @@ class ExportedClip(Answer):
     path: str = Field(description="Path of the entry in the version.")
     content: str = Field(description="Content digest of the revision; it is the same on every server.")
     file: str | None = Field(
-        None, description="Path of the clip's file in the folder; null: the clip's frames are in an episode."
+        None, description="Path of the clip's file in the exported folder; null: an episode of the dataset contains "
+            "the clip's frames."
     )
     digest: str | None = Field(None, description="Digest of the bytes of `file`.")
     episode: int | None = Field(None, description="Index of the clip's episode.")

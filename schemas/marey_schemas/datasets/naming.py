@@ -37,7 +37,7 @@ class DatasetCreate(Request):
 
 
 class CheckedOut(Answer):
-    """Version that the folder of a dataset has, apart from later changes, and the selection of a part of it."""
+    """Version that was last committed or checked out in the folder of a dataset, and the selection of its entries."""
 
     commit: str
     query: str | None = Field(description="Query that selected the entries; null: none.")

@@ -27,7 +27,7 @@ class ExampleRef(Request):
 
 
 class AlignedPlacement(Request):
-    """Position and heading of the body in the first frame of the source clip.
+    """Placement of an aligned clip: position and heading of the body in the first frame of the source clip.
 
     A point p of the aligned clip is at R(heading_rad)·p + (x, y, z) in the source, where R turns about +Y.
     """
@@ -36,7 +36,8 @@ class AlignedPlacement(Request):
     x: Metres = 0.0
     y: Metres = Field(0.0, allow_inf_nan=False, description="Height that was subtracted from the clip, in metres.")
     z: Metres = 0.0
-    joint: JointName | None = Field(None, description="The joint whose position is given; default: the root.")
+    joint: JointName | None = Field(None, description="The joint whose position `x`, `y` and `z` state; default: the "
+        "root.")
 
 
 class PredecessorAlignedOrigin(Request):
@@ -68,7 +69,8 @@ class AlignmentInfo(Request):
         None,
         description="The reference example: the time of all other examples is mapped to its time, the canonical time.",
     )
-    set: Digest | None = Field(None, description="Digest of all clips that were aligned together and of the options.")
+    set: Digest | None = Field(None, description="Digest of the options and of all clips that were aligned together; "
+        "it identifies the set of examples.")
     frame_rate_hz: float = Field(
         gt=0, allow_inf_nan=False, description="Rate of the canonical frames and of `source_frames`, in hertz."
     )
@@ -84,10 +86,12 @@ class AlignmentInfo(Request):
         0.0,
         ge=0,
         allow_inf_nan=False,
-        description="Mean cost per frame of the alignment, in square metres; with a perceptual metric, without unit.",
+        description="Mean cost of the alignment per frame, in square metres; without a unit if the cost is a "
+            "perceptual metric.",
     )
     metric: MetricIdentity | None = Field(
-        None, description="Perceptual metric whose distance of poses was the cost; costs of other metrics differ."
+        None, description="Perceptual metric whose distance of poses was the cost of the alignment. Costs under "
+            "different metrics are not comparable."
     )
     options: AlignParams | None = Field(None, description="Options of the alignment; absent if unknown.")
     predecessor: PredecessorAlignedOrigin | None = None

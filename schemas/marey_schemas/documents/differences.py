@@ -48,7 +48,8 @@ class DifferenceRequest(DifferenceOptions):
         alias="from",
         ge=1,
         lt=2**31,
-        description="Revision before the change. Absent: the revision before `to`; with `to_item`, the newest.",
+        description="Revision before the change. Absent: the revision before `to`, or the newest revision if "
+            "`to_item` is given.",
     )
     to: int | None = Field(None, ge=1, lt=2**31, description="Revision after the change. Absent: the newest.")
     to_item: str | None = Field(
@@ -111,8 +112,8 @@ class PathChange(Exceeding):
     )
     moved: PathMove | None = Field(
         None,
-        description="Movement of the whole path that explains at least nine tenths of the change; absent if there is "
-        "none. Changes of the root's rotation do not include the turn of this movement.",
+        description="Movement of the whole path, if a movement explains at least nine tenths of the change; "
+            "otherwise absent. The turn of this movement is not reported among the changes of the root's rotation.",
     )
 
 
@@ -151,8 +152,8 @@ class MotionDifference(Answer):
     runs: tuple[FrameRun, ...] = Field(description="All frames of both revisions, in order.")
     frames_per_frame: float = Field(
         1.0,
-        description="Number of frames in the revision `after` for each matched frame in `before`; 1 unless the motion "
-        "was resampled.",
+        description="Number of frames in the revision `after` that correspond to one matched frame in `before`; 1 "
+            "unless the motion was resampled.",
     )
     duration_ratio: float = Field(
         1.0,
@@ -168,8 +169,8 @@ class MotionDifference(Answer):
     )
     translated_joints: tuple[tuple[str, ...], tuple[str, ...]] = Field(
         ((), ()),
-        description="Joints other than the root whose translations are stored: those in `before`, and those in "
-        "`after`.",
+        description="Joints, other than the root, whose translations are stored: the joints in `before`, and the "
+            "joints in `after`.",
     )
 
 
@@ -233,12 +234,13 @@ class FieldChange(Answer):
 
 
 class DifferencePlot(Answer):
-    """Values to draw: the change of rotations over time, and the paths of the body."""
+    """Values of a difference for a drawing: the change of rotations over time, and the paths of the body."""
 
     joints: tuple[str, ...] = Field(description="Joints in the order of the columns of `rotation_deg`.")
     frame_rate_hz: float = Field(description="Frame rate of the revision `after`.")
     frames: tuple[int, ...] = Field(
-        description="First frame of each row of `rotation_deg`, then the frame after the last frame of the last row."
+        description="First frame of each row of `rotation_deg`; the last element is the frame after the end of the "
+            "last row."
     )
     rotation_deg: MatchedFloats = Field(
         description="[rows, joints]: largest change of rotation within the row's frames, in degrees; -1: no frame is "

@@ -12,14 +12,14 @@ from pydantic import ConfigDict, Field
 from marey_schemas.base import Request
 
 COSTS = ("match_cost", "continuing_cost", "pose_cost")
-"""Costs that the part `records` contains for each tick."""
+"""Names of the costs that the part `records` contains for each tick of a trial."""
 
 CONFIDENCE = 0.95
 """Confidence level of intervals: of changes between two evaluations, and of means of replicates."""
 
 
 MOST_EVALUATIONS_COMPARED = 8
-"""Greatest number of evaluations in one comparison: more do not fit beside each other in a table."""
+"""Greatest number of evaluations in one comparison; more evaluations do not fit side by side in a table."""
 
 
 def trial_name(family: str, speed_m_s: float, turn_rate_rad_s: float) -> str:

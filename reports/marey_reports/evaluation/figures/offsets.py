@@ -73,7 +73,7 @@ def _field(subject: Subject, family: str) -> _Field:
 
 
 def _largest(field: _Field) -> float:
-    """Compute the largest absolute offset, or change of an offset, in the fields; 0 if they contain no value."""
+    """Compute the largest absolute value in a field of offsets, or of changes of offsets; 0 if it has no value."""
     return float(np.abs(np.nan_to_num(field.offset_m)).max(initial=0.0))
 
 
