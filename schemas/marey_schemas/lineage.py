@@ -21,7 +21,7 @@ CUT_OFF = (
     f"The graph is cut off: it has more than {MOST_REVISIONS:,} revisions or {MOST_LINKS:,} links in one direction. "
     "The nearest ones are shown."
 )
-"""Note on a graph that is not complete."""
+"""Note that is shown with a graph that is not complete."""
 
 
 class LineageOptions(Options):
@@ -94,7 +94,8 @@ class LineageJob(Answer):
 class LineageGraph(Answer):
     """Graph of the sources of a revision, or of the results made from it, through any number of jobs."""
 
-    revisions: tuple[LineageRevision, ...] = Field(description="The revision that the graph starts from is the first.")
+    revisions: tuple[LineageRevision, ...] = Field(description="Revisions of the graph; the first is the revision "
+        "from which the graph starts.")
     links: tuple[LineageLink, ...]
     jobs: tuple[LineageJob, ...]
     complete: bool = Field(description="False if the graph was cut off, because it has too many revisions or links.")

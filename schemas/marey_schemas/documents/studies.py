@@ -41,7 +41,7 @@ class StudyDocument(Request):
         description="Text to which participants consent before the first trial."
     )
     motions: tuple[StudyMotion, ...] = Field(
-        min_length=SHOWN, max_length=MOST_MOTIONS, description="The motions, each a revision of another clip."
+        min_length=SHOWN, max_length=MOST_MOTIONS, description="The motions, each a revision of a different clip."
     )
     trials: int = Field(63, ge=1, le=MOST_TRIALS, description="Number of answered trials of each participant.")
     shown: Literal[4] = Field(SHOWN, description="Number of motions that a trial shows.")
