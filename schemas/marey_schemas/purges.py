@@ -74,7 +74,7 @@ class ItemHolder(Answer):
 
 
 class JobHolder(Answer):
-    """Job because of which an item is not purged: it has not ended, and reads the item or has created it."""
+    """Job that prevents the purge of an item: the job has not ended, and reads the item or has created it."""
 
     type: Literal["job"] = "job"
     job: str
@@ -102,7 +102,7 @@ class HeldItem(Answer):
     item: str
     kind: Kind
     path: str
-    holders: tuple[Holder, ...] = Field(description=f"What holds the item, at most {MOST_HOLDERS}.")
+    holders: tuple[Holder, ...] = Field(description=f"Objects that still need the item, at most {MOST_HOLDERS}.")
     others: int = Field(0, description="Number of further holders that are not listed.")
 
 
@@ -143,7 +143,8 @@ class DatasetPurgeAnswer(Answer):
     commits: int = Field(description="Number of versions of the dataset.")
     proposals: int = Field(description="Number of proposals of the dataset.")
     holders: tuple[Annotated[ItemHolder | JobHolder, Field(discriminator="type")], ...] = Field(
-        description=f"What cites a version of the dataset and prevents the purge, at most {MOST_HOLDERS}: items that "
+        description=f"Objects that refer to a version of the dataset and so prevent the purge, at most "
+            f"{MOST_HOLDERS}: items that "
         "jobs made from a version, and jobs that have not ended."
     )
     others: int = Field(0, description="Number of further holders that are not listed.")

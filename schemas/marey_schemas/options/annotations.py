@@ -15,7 +15,7 @@ Degrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 
 
 OUT_OF_REST = 0.25
-"""Distance from the rest position, as a share of the farthest reach, above which a hand counts as reaching."""
+"""Distance of a hand from its rest position, as a share of its farthest distance, above which the hand is reaching."""
 
 
 class ContactOptions(Options):

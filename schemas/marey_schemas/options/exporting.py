@@ -11,7 +11,7 @@ from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_FORMATS, 
 
 
 class MotionFileOptions(Options):
-    """Format of written motion files, and what the format leaves open."""
+    """Format of written motion files, with options that depend on the format."""
 
     format: ExportFormat = Field(DEFAULT_FORMAT, description="Format of the files.")
     unit: WrittenUnit = Field(

@@ -75,9 +75,10 @@ class ImportOptions(Options):
     @field_validator("collection")
     @classmethod
     def _names_folders(cls, path: str) -> str:
-        """Refuse parts of a path that stand for other folders in a file system, but would be names here."""
+        """Refuse . and .. in a path. They would refer to other folders in a file system, but would be names here."""
         if {".", ".."} & set(path.split("/")):
-            raise ValueError("a path of folders begins at the project and has no . or .. in it; name the folders")
+            raise ValueError("the path of a folder must not contain . or ..; write the names of the folders, "
+                "beginning at the top of the project")
         return path
 
     @property

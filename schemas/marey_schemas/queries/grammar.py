@@ -171,7 +171,7 @@ def _leaves(query: Query) -> Iterator[Query]:
 
 
 def with_clips(query: Query, found: Mapping[str, frozenset[str]]) -> Query:
-    """Return a query whose conditions `like(...)` have the clips that were found for them, by their source."""
+    """Return a copy of a query with the found clips in each condition `like(...)`; `found` maps sources to clips."""
     if isinstance(query, Likeness):
         return replace(query, clips=found.get(query.source))
     if isinstance(query, Negation):
@@ -296,7 +296,7 @@ def _likeness(tree: Any, source: str) -> Likeness:
         raise QueryError(str(error), _column(moment)) from None
     distance = _number(_text(limit), _column(limit))
     if distance < 0:
-        raise QueryError("a distance is at least 0", _column(limit))
+        raise QueryError("the distance must not be negative", _column(limit))
     named = _text(metric[0]) if metric else None
     if named == "":
         raise QueryError("name a metric, or leave it out for the default one", _column(metric[0]))

@@ -12,7 +12,7 @@ from marey_schemas.datasets.naming import MAIN, DatasetName, RefName
 from marey_schemas.names import CollectionPath, Message
 
 MOST_COMMITTED = 200_000
-"""Greatest number of entries that the commit of one job adds, changes or removes; this bounds the memory needed."""
+"""Greatest number of entries that the commit of a job adds, changes or removes; the limit bounds the memory used."""
 MOST_COMMITTED_AT_ONCE = 10_000
 """Greatest number of outputs whose commit is computed in the transaction that publishes them.
 
@@ -25,15 +25,15 @@ _PLACE = re.compile(r"([^/@]+)(?:@([^/@]+))?(/.*)?")
 
 
 class OutputsCommit(Request):
-    """Commit of the outputs of a job to a branch of a dataset, in the transaction that publishes these outputs."""
+    """Request to commit the outputs of a job to a branch of a dataset, in the transaction that publishes them."""
 
     dataset: DatasetName
     branch: RefName = MAIN
     folder: CollectionPath | None = Field(
         None,
-        description="Folder of the dataset that receives the outputs; the paths of the outputs below this folder are "
-        "their paths below `into`. Null: the outputs get the paths that they have in the project; for outputs in the "
-        "dataset's folder, the paths relative to that folder.",
+        description="Folder of the dataset that receives the outputs; an output gets the same path below this folder "
+            "as below `into`. Null: outputs in the project folder of the dataset get their paths relative to this "
+            "folder, other outputs their paths in the project.",
     )
     message: Message = Field("", description="Message of the commit; empty: the kind and the id of the job.")
     replace: bool = Field(

@@ -212,7 +212,7 @@ TREE = KindDeclaration(
 
 
 def _reads_answers(_params: Mapping[str, Any]) -> bool:
-    """Return that answers of participants, which are read while the job runs, may change between two jobs."""
+    """Return True: the job reads answers of participants while it runs, and these may change between two jobs."""
     return True
 
 

@@ -34,7 +34,7 @@ class JobState(StrEnum):
 
 
 class FailureReason(StrEnum):
-    """Reason why a job has failed and is not tried again."""
+    """Reason why a job has failed and is not retried."""
 
     ERROR = "error"
     TIMEOUT = "timeout"
@@ -48,9 +48,10 @@ NOTHING_DONE = "nothing-done"
 
 
 def nothing_done(result: Mapping[str, Any]) -> bool:
-    """Return whether the result of a job lists refused inputs, but neither outputs nor inputs without a finding.
+    """Return whether a job has refused inputs and made nothing: it has no outputs, and lists no inputs as `empty`.
 
-    `outputs` is the number of outputs; `empty` lists inputs that the job could use, and in which it found nothing.
+    In `result`, `outputs` is the number of outputs, and `empty` lists inputs that the job could use, but in which it
+    found nothing.
     """
     return bool(result.get("refused")) and not result.get("outputs") and not result.get("empty")
 
@@ -135,7 +136,7 @@ JobInput = ExistingInput | JobOutputsInput
 
 
 class Resources(Request):
-    """Limits of time and memory of one attempt to run a job, and what else it needs."""
+    """Limits of time and memory of one attempt to run a job, and other resources that the attempt needs."""
 
     time_limit_s: int = Field(3600, ge=1, le=7 * 86400)
     memory_limit_mb: int = Field(4096, ge=64, le=1_048_576)
@@ -155,7 +156,7 @@ class Resources(Request):
 
 
 CacheMode = Literal["use", "refresh", "off"]
-"""Use of the results of identical jobs."""
+"""Whether the results of identical jobs are reused."""
 
 
 class JobCreate(Request):
@@ -172,7 +173,8 @@ class JobCreate(Request):
         description="Final state of this job if a job in `after` does not succeed. fail: failed; skip: cancelled.",
     )
     concurrency_key: str | None = Field(
-        None, max_length=255, description="Key of a lock: one job per project and key runs at a time."
+        None, max_length=255, description="Key of a lock: of the jobs of a project with the same key, only one runs "
+            "at a time."
     )
     cache: CacheMode = Field(
         "use",

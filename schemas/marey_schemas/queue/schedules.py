@@ -89,7 +89,7 @@ class Schedule(Answer):
     overlapping: bool
     paused: bool
     description: str
-    author: str | None = Field(description="Name of the user as whom the server submits the jobs.")
+    author: str | None = Field(description="Name of the user on whose behalf the server submits the jobs.")
     created_at: datetime
     updated_at: datetime
     next_at: datetime | None = Field(

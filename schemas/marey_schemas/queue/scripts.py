@@ -41,7 +41,7 @@ LONGEST_NAME = 63
 """Greatest number of characters in the name of a parameter or a field."""
 
 WORKER_S, WORKER_MB = 1800, 2048
-"""Seconds and MiB that a worker may use beside the script, for example to fetch the commit."""
+"""Seconds, and MiB of memory, that a worker may use in addition to the script, for example to fetch the commit."""
 
 ScriptName = Annotated[str, StringConstraints(pattern=SLUG)]
 """Name of a script: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
@@ -71,7 +71,8 @@ class ScriptParameter(Request):
     minimum: float | None = Field(None, allow_inf_nan=False, description="Least value of a number.")
     maximum: float | None = Field(None, allow_inf_nan=False, description="Greatest value of a number.")
     choices: tuple[str, ...] = Field((), max_length=100, description="Allowed texts; empty: any text.")
-    default: Value | None = Field(None, description="Value if a run gives none; null: each run must give a value.")
+    default: Value | None = Field(None, description="Value that is used if a run gives no value; null: each run must "
+        "give a value.")
     description: Message = ""
 
     @model_validator(mode="after")
@@ -175,7 +176,7 @@ class ScriptLimits(Request):
 
     @property
     def resources(self) -> Resources:
-        """The limits of the job: those of the script, and what the worker needs beside it."""
+        """The limits of the job: those of the script, plus the time and memory that the worker itself needs."""
         time_limit_s, memory_limit_mb = self.seconds + WORKER_S, self.memory_mb + WORKER_MB
         return Resources(time_limit_s=time_limit_s, memory_limit_mb=memory_limit_mb)
 
@@ -267,7 +268,7 @@ class ScriptDeclaration(Request):
                 yield paths[match[1], match[2]]
 
     def input_specs(self) -> dict[str, InputSpec]:
-        """Return the inputs as the declaration of a job kind has them."""
+        """Return the inputs in the form in which job kinds declare inputs."""
         return {
             name: InputSpec(kind=one.kind, many=one.many, description=one.description)
             for name, one in self.inputs.items()

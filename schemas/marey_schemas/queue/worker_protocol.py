@@ -94,17 +94,17 @@ class PinnedInput(Answer):
         return RevisionRef(item=self.item, revision=self.revision)
 
     def as_input(self) -> ItemInput:
-        """Return the input in the form that is used in the record of the origin of a result."""
+        """Return the input as an `ItemInput`, the form in which the origin of a result is recorded."""
         return ItemInput(item=self.item, revision=self.revision)
 
 
 class JobTrace(Answer):
-    """Trace to which a job belongs, because the request that submitted the job was recorded."""
+    """Trace of the request that submitted a job, if it was recorded; spans of the job are added to it."""
 
     traceparent: str = Field(
         description="Span of the request that submitted the job, in the form of W3C Trace Context."
     )
-    waited_s: float = Field(description="Seconds for which the job could have run before it was claimed.")
+    waited_s: float = Field(description="Seconds for which the job was ready to run before it was claimed.")
 
 
 class Lease(Answer):
@@ -178,8 +178,8 @@ class StagedOutput(Request):
     )
     same_skeleton: bool = Field(
         False,
-        description="Publish nothing if the existing item has another skeleton; the skeleton of this output is not "
-        "published either. A skeleton of the same rig is no other one: the item keeps its own.",
+        description="Publish neither this output nor its skeleton if the existing item has another skeleton. If both "
+            "skeletons are the same rig, the output is published, and the item keeps its skeleton.",
     )
 
 

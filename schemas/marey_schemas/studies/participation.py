@@ -22,7 +22,7 @@ Place = Annotated[int, Field(ge=0, lt=SHOWN)]
 
 
 class StudyLink(Request):
-    """Request for what a link leads to."""
+    """Request for the study to which a participant's link leads."""
 
     code: LinkCode
 
@@ -87,7 +87,7 @@ class OpenTrial(Answer):
 
 
 class TrialStep(Answer):
-    """The open trial of a participant, or the news that there is none left."""
+    """Next step of a participant: the open trial, or null if no trial is left."""
 
     finished: bool
     answered: int

@@ -198,7 +198,7 @@ def _readable(context: TraceContext, span: Span, resource: Resource) -> Readable
 
 
 class _Seldom(logging.Handler):
-    """Handler that passes on at most one message in `WARN_EVERY_S` seconds, so that no collector can flood the log."""
+    """Handler that logs at most one message in `WARN_EVERY_S` seconds, so that no collector can flood the log."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -206,7 +206,7 @@ class _Seldom(logging.Handler):
         self._held_back = 0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log the message as one of Marey's, without the traceback, or count it."""
+        """Log the message as a warning of Marey, without the traceback; if it comes too soon, only count it."""
         if (now := time.monotonic()) < self._due:
             self._held_back += 1
             return
