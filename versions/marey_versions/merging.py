@@ -36,8 +36,9 @@ class MergeConflict(NamedTuple):
     clash: AnnotationClash | None = None
     """The reason why an annotation could not be merged segment by segment."""
     no_way_back: str | None = None
-    """Path at which the entry that gives way cannot stay, because another entry is there. Set only if a resolution has
-    decided the conflict: it remains a conflict, because the entry would be lost."""
+    """Path to which an entry would have to return, but at which another entry is. Set only if a resolution has decided
+    the conflict; the conflict remains, because the entry would be lost.
+    """
 
     @property
     def key(self) -> str:
@@ -57,8 +58,8 @@ class ChangedPart(NamedTuple):
 
 
 MergeParts = Callable[[Sequence[ChangedPart]], Sequence[str | AnnotationClash | None]]
-"""Function that merges the documents of parts. For each part, it returns the content digest of the merged document, the
-reason why the changes exclude each other, or None if parts of this kind are not merged.
+"""Function that merges the documents of parts. For each part, it returns one of three values: the content digest of the
+merged document, the reason why the changes exclude each other, or None if parts of this kind are not merged.
 """
 
 
@@ -286,10 +287,11 @@ def _gets_place_of_theirs(one: _Decided) -> bool:
 
 
 def _collide(one: _Decided, held: dict[str, _Decided], choices: Choices) -> MergeConflict | None:
-    """Decide which of two entries gets a key; the other one goes back to its own place.
+    """Decide which of two entries gets a key; the other entry returns to its earlier path.
 
-    `held` contains entries by key; one of them has the key that `one` should get. The other entry is dropped if it has
-    no earlier path, because a side has added it. The result is a conflict if there is no resolution, or if the earlier
+    `held` contains entries by key; one of them has the key that `one` should get. If a side has added the entry that
+    does not get the key, this entry has no earlier path and is dropped. The result is a conflict if there is no
+    resolution, or if the earlier
     path is taken.
     """
     key = one.result.key
@@ -371,5 +373,5 @@ def _merged_tags(base: DatasetEntry | None, ours: DatasetEntry, theirs: DatasetE
 
 
 def _newer(part: str, of_base: Mapping[str, str], ours: DatasetEntry, theirs: DatasetEntry) -> str | None:
-    """Return a part as the side that has changed it has it."""
+    """Return a part in the version of the side that has changed it."""
     return (theirs if ours.parts.get(part) == of_base.get(part) else ours).parts.get(part)

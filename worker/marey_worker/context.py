@@ -169,9 +169,9 @@ class Context:
         return [Item.model_validate(item) for item in found]
 
     def judgements(self, study: PinnedInput) -> list[JudgingParticipant]:
-        """Return what the participants who saw the revision of a study answered, under pseudonyms.
+        """Return the answers of the participants who saw a revision of a study; participants have pseudonyms.
 
-        Raises `Unreadable` if the author of the job may not read this.
+        Raises `Unreadable` if the user who submitted the job may not read the answers.
         """
         asked = self._send(lambda request: ReadJudgements(request, study.item, study.revision))
         return [JudgingParticipant.model_validate(one) for one in self._value(asked, "no-study")]

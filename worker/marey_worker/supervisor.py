@@ -214,8 +214,8 @@ class Supervisor:
 class _OpenClaim:
     """Claim that is repeated with the same token and the same id until it is answered.
 
-    The server repeats an answer only for the token with which the claim was sent first. So this token is used even if
-    it was replaced in the meantime.
+    The server repeats its answer only for the token with which the claim was first sent. So a repeated claim uses this
+    token, even if the worker has a newer token by then.
     """
 
     transport: Transport

@@ -42,7 +42,7 @@ class MemberKind(StrEnum):
     REVISION = "revisions"
     """Revision that documents refer to: its kind, and the content digests of its parts."""
     FACETS = "facets"
-    """Facets of revisions: values by the name of the facet, by the content digest of the revision."""
+    """Facets of revisions: for each content digest of a revision, the values of its facets by name."""
     DIFFERENCES = "differences"
     """Arrays of a document that the archive has only as differences; the digest in the name is that of the document.
 

@@ -56,11 +56,11 @@ class EntryChange(NamedTuple):
     value: Value | None
     """The entry after the commit; None if the commit removed it."""
     unchanged: Mapping[str, str]
-    """Parts whose documents the archive lacks; for each, the content digest of an earlier revision with this part."""
+    """Parts whose documents the archive lacks, each with the content digest of an earlier revision that has it."""
 
 
 class Archive:
-    """Archive that is open for reading; a member is read, and compared with its digest, when it is requested.
+    """Archive that is open for reading. Each member is read and compared with its digest when it is requested.
 
     Raises `BadArchive` if the file is not a complete archive, or if the name of a member is not valid.
     """
@@ -146,7 +146,7 @@ class Archive:
             raise BadArchive(f"{member.name}: the content of the member is not a list of changes: {error!r}") from error
 
     def facets(self) -> dict[str, dict[str, float]]:
-        """Return the facets of revisions by content digest; an interrupted writing may have left older values, too."""
+        """Return the facets of revisions by content digest; newer values replace those of an interrupted export."""
         found: dict[str, dict[str, float]] = {}
         for member in self.members:
             if member.kind is MemberKind.FACETS:

@@ -171,7 +171,7 @@ class _Job:
             yield SourceExample(_uid(one.pin), one.pin.path, clip, cuts, recordings[_uid(one.pin)])
 
     def _recordings(self, clips: Sequence[_Clip]) -> dict[str, Recording]:
-        """Return take and performer of each clip, from its part `info`; a clip without it is a take of its own."""
+        """Return take and performer of each clip, from its part `info`; a clip without `info` is a separate take."""
         infos = self._context.documents([one.pin for one in clips], "info", required=False)
         return {
             _uid(pin): Recording(pin.item) if tree is None else _recording(pin, ClipInfo.model_validate(tree))

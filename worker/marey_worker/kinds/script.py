@@ -75,7 +75,7 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
 
 
 def examine() -> tuple[str, str, str]:
-    """Run a command that does nothing as a script; return a check, its state (ok, warning or fault) and a detail."""
+    """Run an empty command as a script; return the check's name, its state (ok, warning or fault), and a detail."""
     if landlock_version() == 0:
         return "scripts", "fault", "this machine cannot confine scripts: they need Linux 5.13 with Landlock"
     with tempfile.TemporaryDirectory(prefix="marey-doctor-") as folder:
@@ -96,7 +96,7 @@ def _require_program(declared: ScriptDeclaration, code: Path) -> None:
 def _order(
     context: Context, params: ScriptParams, declared: ScriptDeclaration, folder: Path, inputs: dict[str, str]
 ) -> GuardedCommand:
-    """Return the command with its environment, which contains only what is named here, and its limits."""
+    """Return the command with its limits and its environment, which contains only the variables that are named here."""
     paths = {("input", name): path for name, path in inputs.items()}
     paths |= {("output", name): output_path(name, one) for name, one in declared.outputs.items()}
     first, *rest = declared.words(paths, declared.values_of(params.values))
@@ -141,7 +141,7 @@ def _words_of(end: CommandEnd) -> str:
 
 
 def _missing(end: CommandEnd) -> list[str]:
-    """Return in words what this system did not limit."""
+    """Return texts that name the protections and limits that this system did not provide."""
     return [*([] if end.isolated else [NOT_ISOLATED]), *([] if end.bounded else [NOT_BOUNDED])]
 
 

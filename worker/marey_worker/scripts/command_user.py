@@ -24,7 +24,7 @@ _THIS_PROCESS = struct.pack("=Ii", 0x20080522, 0)  # version 3 of the rights, pr
 
 
 def free_user() -> int | None:
-    """Return the id of a user without processes, or None if this process may not run a command as another user."""
+    """Return the id of a user who has no processes, or None if this process may not run commands as another user."""
     rights = _rights("CapEff")
     if os.geteuid() != 0 or any(not rights >> one & 1 for one in NEEDED):
         return None
@@ -34,7 +34,7 @@ def free_user() -> int | None:
 
 
 def give(folder: Path, user: int) -> bool:
-    """Make `user` the owner of a folder with all that is in it; return false if its file system allows no owners.
+    """Make `user` the owner of a folder and its contents; return false if the file system does not support owners.
 
     Links are not followed. Raises `OSError` if only a part can be given.
     """
@@ -61,9 +61,9 @@ def become(user: int) -> None:
 
 
 def look_as(user: int) -> None:
-    """Let this process, which stays root, read what the kernel shows of processes only to their user, `user`.
+    """Let this process, still as root, read facts about processes of `user` that the kernel shows only to `user`.
 
-    Some containers do not give root the right to read this of every user. Raises `NotConfinedError`.
+    In some containers, root has no right to read these facts about every user. Raises `NotConfinedError`.
     """
     rights = _rights("CapPrm")
     libc().setfsuid(user)  # removes the rights to files, which this process still needs

@@ -63,7 +63,8 @@ class GuardedCommand:
 class CommandEnd:
     """End of a command: its exit status (128 plus the number of a signal), or the reason why it was stopped.
 
-    `isolated` states whether it had namespaces of its own, and `bounded` whether the kernel limited its processes.
+    `isolated` states whether the command had namespaces of its own, and `bounded` whether the kernel limited the number
+    of its processes.
     """
 
     status: int | None
@@ -145,8 +146,8 @@ def _hold(order: GuardedCommand, output: int, user: int | None, *, bounded: bool
 def _take_precedence() -> None:
     """Let this process always run before those of the command, if the system allows it.
 
-    If the kernel does not limit the number of processes, the guard of a worker that runs as root must count them, and
-    could not do it in time if thousands of them shared the processors with it.
+    If the kernel does not limit the number of processes of the command, the guard must count them. It could not count
+    in time if it had to share the processors with thousands of these processes.
     """
     if os.geteuid() == 0:
         with contextlib.suppress(PermissionError):
@@ -284,7 +285,7 @@ def _resident(one: psutil.Process) -> int:
 
 
 def nameless_bytes(family: Collection[psutil.Process]) -> int:
-    """Return how many bytes files take that have no name any more, or never had one (memory files).
+    """Return the total size in bytes of files without a name: deleted files that are still in use, and memory files.
 
     These are files that processes have opened or mapped; a mapped file exists even if its descriptor is closed. Only
     root may ask for the size of such a file; for other users, a file counts up to the end of its mapped part.
@@ -309,7 +310,7 @@ def nameless_bytes(family: Collection[psutil.Process]) -> int:
 
 
 def _mapped_files(pid: int) -> Iterator[tuple[tuple[int, int], int]]:
-    """Yield the device and inode of each nameless file that a process has mapped, and its bytes."""
+    """Yield device and inode of each mapped file of a process that has no name, and the file's size in bytes."""
     try:
         lines = Path(f"/proc/{pid}/maps").read_text(errors="replace").splitlines()
     except OSError:
@@ -328,9 +329,9 @@ def _mapped_files(pid: int) -> Iterator[tuple[tuple[int, int], int]]:
 
 
 def fault_of_files(folder: Path, nameless: int, written_mb: int) -> str | None:
-    """Return why the files below a folder are too large, too many or out of sight, or None; links are not followed.
+    """Return why the files below a folder are not allowed (too large, too many, too deep or unreadable), or None.
 
-    `nameless` is the number of bytes that files without a name take in addition.
+    Links are not followed. `nameless` is the total size in bytes of files without a name, which is added.
     """
     total, count, waiting = nameless, 0, [(str(folder), 0)]
     while waiting:
