@@ -1,4 +1,4 @@
-"""Rule: no module imports itself through other modules. Imports in functions, and those for types only, count, too."""
+"""Rule: no module imports itself through other modules. Imports in functions and imports only for types count, too."""
 
 from __future__ import annotations
 

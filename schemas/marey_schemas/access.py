@@ -41,7 +41,7 @@ class Scope(StrEnum):
 
 
 class EndTokens(StrEnum):
-    """Choice of the tokens that a change of a user revokes; the token of the request itself always stays valid."""
+    """Tokens that a change of a user revokes. The token that authenticates the request always stays valid."""
 
     NONE = "none"
     SESSIONS = "sessions"
@@ -129,8 +129,8 @@ class TokenCreate(Request):
     labels: dict[str, str] | None = Field(
         None,
         description="Labels that a worker with this token may announce, by name; only for tokens with the scope "
-        "`work`. Jobs that require other labels cannot be claimed with this token. Null: the labels of the token that "
-        "creates this token; any labels if the creating token is not bound to labels.",
+            "`work`. Jobs that require other labels cannot be claimed with this token. Null: the labels of the token "
+            "that creates this token, or any labels if that token is not restricted to labels.",
     )
 
 
@@ -140,7 +140,7 @@ class TokenRotation(Request):
     rotation_id: str = Field(
         pattern=r"^[A-Za-z0-9_-]{32,64}$",
         description="Random text, for example 32 hexadecimal digits. A repeated request with the same `rotation_id` "
-        "gets the same new token. Keep it as secret as the token until you have the answer.",
+            "gets the same new token. Keep this text secret until you have the answer.",
     )
     grace_s: int = Field(
         3600,
@@ -298,7 +298,7 @@ class Member(Answer):
 
 
 EVERY_MEMBER = "*"
-"""User name that stands for all members when a role in a folder is set."""
+"""User name that means all members, in requests that set a role in a folder."""
 
 
 class FolderRoleChange(Request):
@@ -311,8 +311,8 @@ class FolderRole(Answer):
     """Role of a member in a folder and everything below it, where it replaces the member's role in the project."""
 
     user: str = Field(
-        description="The name of the member; `*` stands for all members without a role of their own in this folder, "
-        "except owners."
+        description="The name of the member; `*` means all members without a role of their own in this folder, "
+            "except owners."
     )
     folder: str = Field(description="The path of the folder.")
     collection: str = Field(description="The id of the folder.")

@@ -184,7 +184,7 @@ class CoverageNow(Answer):
     index: float = Field(description="Share of the cells that have enough data.")
     missing_s: float = Field(description="Seconds of data that all cells together still need.")
     targets: tuple[CoverageTarget, ...] = Field(
-        description="Cells to record next, the ones closest to the performer's present motion first."
+        description="Cells to record next. The cells closest to the performer's present motion are first."
     )
     performer: Performer | None
 

@@ -28,7 +28,8 @@ class LineageOptions(Options):
     """Options of a lineage graph: its direction and its depth."""
 
     direction: Literal["inputs", "results", "both"] = Field(
-        "both", description="`inputs`: what the revision was made from; `results`: what was made from it; `both`."
+        "both", description="`inputs`: the revisions from which the revision was made; `results`: the revisions that "
+        "were made from it; `both`: inputs and results."
     )
     depth: int = Field(
         MOST_REVISIONS,

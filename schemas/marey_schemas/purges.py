@@ -30,7 +30,8 @@ class PurgeRequest(Request):
         None, max_length=1300, description="Path, made of folder and name, that deleted items had."
     )
     collection: CollectionPath | None = Field(
-        None, description="Folder: the deleted items in it and below it; empty: those of the whole project."
+        None, description="Folder whose deleted items are purged, including those in folders below it; empty: the "
+            "deleted items of the whole project."
     )
     kind: Kind | None = Field(None, description="Kind of the items; absent: all kinds.")
     query: str | None = Field(
@@ -47,7 +48,8 @@ class PurgeRequest(Request):
     @model_validator(mode="after")
     def _names_items(self) -> Self:
         if self.item is None and self.path is None and self.collection is None and self.query is None:
-            raise ValueError("give an item, a path, a collection or a query; an empty collection is the whole project")
+            raise ValueError("give an item, a path, a collection or a query; an empty collection means the whole "
+                "project")
         return self
 
 
@@ -91,8 +93,8 @@ class PurgedItem(Answer):
     item: str
     kind: Kind
     path: str = Field(
-        description="Folder and name of the item, in a preview. Empty in the answer to a purge: this answer is stored "
-        "for repetitions of the request, and must not keep the name."
+        description="Folder and name of the item, in a preview. Empty in the answer to a purge, because this answer "
+            "is stored for repetitions of the request, and the name must not be stored."
     )
 
 
@@ -128,8 +130,8 @@ class DatasetPurgeRequest(Request):
     dataset: str = Field(
         min_length=1,
         max_length=64,
-        description="Id or name of a deleted dataset. A name that several deleted datasets have means the one that was "
-        "deleted last.",
+        description="Id or name of a deleted dataset. If several deleted datasets have this name, the dataset that "
+            "was deleted last is purged.",
     )
     preview: bool = Field(False, description="Report what the purge would do, but change nothing.")
 

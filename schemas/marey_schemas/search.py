@@ -104,7 +104,7 @@ class SearchRequest(RefineOptions):
 
     @property
     def asked_steps(self) -> tuple[SearchStep, ...]:
-        """The steps of the request; a single one if only `constraints` are given."""
+        """The steps of the request; a single step if the request gives only `constraints`."""
         return self.steps or (SearchStep(constraints=self.constraints),)
 
 

@@ -30,10 +30,10 @@ _SIGN = 0.068
 
 
 def draw_bars(subject: ComparedSubject, column: ComparedColumn) -> Sketch | None:
-    """Draw the mean of a field for each setting; return None if no setting has one.
+    """Draw the mean of a field for each setting; return None if no setting has a mean.
 
-    Without a zero on the axis (a logarithmic axis, or values that are close together), dots replace the bars, because
-    lengths of bars would mislead.
+    If the axis does not contain zero (it is logarithmic, or the values are close together), dots replace the bars,
+    because the lengths of bars would be misleading.
     """
     points = subject.points(column.name)
     if not points:

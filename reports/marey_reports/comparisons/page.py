@@ -40,13 +40,13 @@ def draw_comparison(
     parameter: str | None = None,
     log: bool = False,
 ) -> bytes:
-    """Draw runs: a page with all charts and tables as HTML, or one chart of one field as SVG or PNG.
+    """Draw a comparison of runs: an HTML page with all charts and tables, or one chart of one field as SVG or PNG.
 
     Parameters
     ----------
     comparison : with curves, if lines are to be drawn
-    plot : chart of a picture, or the only kind of chart of a page; None: the first kind that the runs have values for
-    parameter : name of the parameter on the horizontal axis; None: those that differ
+    plot : kind of the charts; None: all kinds on a page, in a picture the first kind for which the runs have values
+    parameter : name of the parameter on the horizontal axis; None: each parameter that differs
     log : whether axes of fields with positive values are logarithmic
 
     Returns

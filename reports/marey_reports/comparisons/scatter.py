@@ -51,8 +51,8 @@ class _Across(NamedTuple):
 def draw_scatter(subject: ComparedSubject, column: ComparedColumn, parameter: ComparedColumn) -> Sketch | None:
     """Draw a field over a parameter; return None if there are no numbers, or too many different texts.
 
-    Means are not joined by lines, because nothing is known of the values between them. If one further setting differs,
-    it has colours.
+    Means are not joined by lines, because nothing is known about values between them. If exactly one further parameter
+    differs, its values have different colours.
     """
     across = _across(subject, parameter)
     points = [one for one in subject.points(column.name) if across is not None and one.setting in across.places]

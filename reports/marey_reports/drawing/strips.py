@@ -132,7 +132,7 @@ def draw_clip_strip(poses: Sequence[Clip], frames: Sequence[int], frame_rate_hz:
 
 @dataclass(frozen=True, eq=False)
 class PoseRow:
-    """Poses of one motion, in one row of a strip.
+    """Content of a row of a strip: poses of one motion.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Verdicts in plain words: one sentence on all trials, one on each region, and phrases for the errors of trials."""
+"""Verdicts in plain words: a sentence about all trials, sentences about regions, and phrases for errors of trials."""
 
 from __future__ import annotations
 

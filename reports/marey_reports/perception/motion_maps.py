@@ -56,8 +56,9 @@ def draw_registration(
 ) -> Sketch:
     """Draw a clip against itself with its period, and two clips with their registration curve (figure 1).
 
-    `recorded` is the clip in which the period was found, by default `one`. Without a period, only the second map is
-    drawn. `rate_hz` is the frame rate of period and curve, by default that of `one`; the clips may have fewer frames.
+    `recorded` is the clip in which the period was found, by default the clip `one`. Without a period, only the second
+    map is drawn. `rate_hz` is the frame rate of period and curve, by default the frame rate of the clip `one`; the
+    clips may have lower frame rates.
     """
     rate = rate_hz or one.clip.rate_hz
     pairs = [(one, other)] if period is None else [(recorded or one, recorded or one), (one, other)]

@@ -36,8 +36,8 @@ class CheckoutRequest(Request):
     version: Version = MAIN
     query: Annotated[str, StringConstraints(min_length=1, max_length=MOST_CHARACTERS)] | None = Field(
         None,
-        description="Query that selects entries, as in lists of items. `path`, `folder`, `name` and `tag` are those of "
-        "the entry in the folder of the dataset; the other fields are those of its content.",
+        description="Query that selects entries, as in lists of items. The fields `path`, `folder`, `name` and `tag` "
+            "refer to the entry in the folder of the dataset, all other fields to the content of the entry.",
     )
     paths: Annotated[tuple[EntryPath, ...], AfterValidator(_not_too_long)] = Field(
         (), max_length=MOST_PATHS, description="Entries, or folders whose entries are selected; empty: all entries."
@@ -46,7 +46,7 @@ class CheckoutRequest(Request):
 
     @property
     def partial(self) -> bool:
-        """Whether the request selects entries."""
+        """Whether the request selects only some of the entries, by a query or by paths."""
         return self.query is not None or bool(self.paths)
 
 

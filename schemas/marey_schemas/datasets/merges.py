@@ -30,7 +30,7 @@ class Side(StrEnum):
 
 
 class Resolution(Request):
-    """Decision about a conflict: the side whose version of an entry is kept.
+    """Decision about a conflict: the side whose version of an entry the merge uses.
 
     If two different entries would have the same path, `take` selects the entry that gets the path. The other entry
     returns to the path that it has on the branch or in the base. If one side has added that entry, it has no earlier
@@ -76,7 +76,7 @@ class MergeRequest(CombineRequest):
 
 
 class PickRequest(CombineRequest):
-    """Request to apply the changes of one commit to a branch (cherry-pick), or to undo these changes there (revert)."""
+    """Request to apply the changes of one commit to a branch (cherry-pick), or to undo them on a branch (revert)."""
 
     version: Version = Field(description="Commit whose changes are applied or undone.")
     parent: Literal[1, 2] | None = Field(

@@ -22,7 +22,7 @@ RefName = Annotated[str, StringConstraints(pattern=REF)]
 Version = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}(?:~[0-9]{1,4})?$")]
 """Name of a version: a branch, a tag, or the digest of a commit (the first 8 digits are enough).
 
-With `~n` at the end, the name stands for the version n commits earlier.
+With `~n` at the end, the name refers to the version n commits earlier.
 """
 
 

@@ -44,13 +44,13 @@ class PredecessorAlignedOrigin(Request):
     """Files of Marey's predecessor that an aligned clip was imported from."""
 
     motion: StoredOriginal | None = Field(
-        None, description="The file of the motion; absent for files in other formats."
+        None, description="The file of the motion; absent if the file does not have the predecessor's format."
     )
     alignment: StoredOriginal
 
 
 class AlignmentInfo(Request):
-    """Part `info` of an aligned clip: the set of examples it belongs to, and the mapping to its source clip.
+    """Part `info` of an aligned clip: its set of examples, and the mapping of its time to the source clip.
 
     The part `motion` contains the frames of the aligned clip.
     """
@@ -67,7 +67,8 @@ class AlignmentInfo(Request):
     subject: str | None = Field(None, description="Performer, under a pseudonym.")
     reference: ExampleRef | None = Field(
         None,
-        description="The reference example: the time of all other examples is mapped to its time, the canonical time.",
+        description="The reference example. Its time is the canonical time, to which the time of all other examples "
+            "is mapped.",
     )
     set: Digest | None = Field(None, description="Digest of the options and of all clips that were aligned together; "
         "it identifies the set of examples.")

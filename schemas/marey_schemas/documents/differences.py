@@ -53,7 +53,8 @@ class DifferenceRequest(DifferenceOptions):
     )
     to: int | None = Field(None, ge=1, lt=2**31, description="Revision after the change. Absent: the newest.")
     to_item: str | None = Field(
-        None, max_length=64, description="Another item of the same kind in the project, whose revision is `to`."
+        None, max_length=64, description="Id of another item of the same kind in the project. If given, `to` is a "
+            "revision of this item."
     )
     plot: bool = Field(False, description="Include the values that a drawing of the difference needs.")
 
@@ -164,8 +165,8 @@ class MotionDifference(Answer):
     path: PathChange | None = Field(None, description="Change of the path of the body; absent if there is none.")
     translations: tuple[JointChange, ...] = Field(
         (),
-        description="Changed translations in centimetres, largest first, of all joints other than the one whose path "
-        "is compared.",
+        description="Changed translations in centimetres, largest first, of all joints except the joint whose path "
+            "is compared.",
     )
     translated_joints: tuple[tuple[str, ...], tuple[str, ...]] = Field(
         ((), ()),
@@ -224,7 +225,7 @@ class ModelDifference(Answer):
 
 
 class FieldChange(Answer):
-    """Change of a value in a document; only changes that no other member of the difference describes are listed."""
+    """Change of a value in a document. Changes that other members of the difference describe are not listed."""
 
     part: str
     pointer: str = Field(description="JSON pointer of the value in the document of the part.")

@@ -80,14 +80,14 @@ class RegionVerdict(Request):
 
     region: str = Field(max_length=64, description="Name of the region.")
     followed: int = Field(ge=0, description="Number of followed trials.")
-    trials: int = Field(ge=0, description="Number of trials; 0 if no trial asks for such motion.")
+    trials: int = Field(ge=0, description="Number of trials; 0 if no trial requires motion of this region.")
     sentence: str = Field(max_length=2000, description="The verdict in one sentence.")
 
 
 class EvaluationDocument(Request):
     """Part `evaluation`: options, provenance, metrics of every trial, usage, coverage, baseline.
 
-    Its members are those of `marey_motion.evaluation.result.EvaluationResult`, with arrays as leaves. This class
+    The document has the members of `marey_motion.evaluation.result.EvaluationResult`, with arrays as leaves. This class
     declares only the members that are shown in lists and summaries.
     """
 

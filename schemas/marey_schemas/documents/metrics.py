@@ -163,8 +163,9 @@ class MetricDocument(Request):
     )
     root_alignment: Literal["mean_heading", "kovar2d"] = Field(
         "mean_heading",
-        description="How place and heading are removed. mean_heading: the hips are at the origin, without the mean "
-        "heading of one second; kovar2d: each pair of poses is superposed.",
+        description="Method by which position and heading are removed. mean_heading: the hips are moved to the "
+            "origin, and the mean heading of one second is removed; kovar2d: the two poses of each pair are "
+            "superposed.",
     )
     length_unit_m: _Positive = Field(1.0, description="Metres in one unit of length.")
     velocity_interval_s: _Positive = Field(1.0 / 30.0, description="Seconds in one unit of time: velocities are "

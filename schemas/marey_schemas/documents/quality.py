@@ -222,7 +222,7 @@ class QualityDocument(Request):
     reference: MeasuredSet | None = Field(None, description="Measurements of the reference clips (ground truth); "
         "null if no reference was given.")
     changes: dict[str, QualityChange] = Field(
-        default_factory=dict, description="Totals minus those of the reference, by measure."
+        default_factory=dict, description="Total of the clips minus the total of the reference, by measure."
     )
     refused: tuple[dict[str, str], ...] = Field((), description="Clips that could not be measured, with the reasons.")
 

@@ -1,8 +1,8 @@
 """The commands of an edit: one model each, discriminated by `command`.
 
-Frames count from 0 and ranges are half-open; a stop of null is the end. Lengths are in metres and times in seconds.
-Angles are in degrees if the name of the field ends in `_deg`. Directions and positions are those of the world:
-right-handed, Y up.
+Frames count from 0. Ranges are half open; the stop null means the end of the clip. Lengths are in metres and times in
+seconds. Angles are in degrees if the name of the field ends in `_deg`. Directions and positions are in the world, which
+is right-handed with Y up.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class CloseLoop(NamedCommand):
 class CutLoop(NamedCommand):
     """Find a cycle of a periodic motion, and blend two successive cycles into a loop without a seam.
 
-    The loop begins at the origin and faces +z. Its frames are those of the clip, so it has its frame rate.
+    The loop begins at the origin and faces +z. It has the frame rate of the clip.
     """
 
     examples: ClassVar[Examples] = ({}, {"metric": "published/sigmoid"})
@@ -380,7 +380,7 @@ class Paste(NamedCommand):
     )
     command: Literal["paste"] = "paste"
     source: ItemId = Field(description="The clip to copy from.")
-    joints: Joints = Field(description="Joints to copy; both skeletons have them, with the same axes.")
+    joints: Joints = Field(description="Joints to copy. Both skeletons must have these joints, with the same axes.")
     source_frames: Frames | None = Field(None, description="Half-open range of frames to copy; absent: the whole clip.")
     frames: Frames | None = Field(None, description="Half-open range of frames to replace; absent: the whole motion.")
     border_s: Seconds = Field(

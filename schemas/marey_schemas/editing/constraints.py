@@ -132,8 +132,9 @@ class HingeLimit(_Limit):
     kind: Literal["hinge"] = "hinge"
     joint: JointName
     angle_deg: AngleRange = Field(
-        description="Least and greatest angle in degrees: for knees and elbows the bend, which is 0 in a straight limb "
-        "and positive in its natural direction on every skeleton; for other joints the angle from the rest pose."
+        description="Least and greatest angle in degrees. For knees and elbows, the angle is the bend: 0 in a "
+            "straight limb, positive in the natural direction on every skeleton. For other joints, it is the angle "
+            "from the rest pose."
     )
 
 

@@ -37,7 +37,7 @@ class Pairing:
     beside : names of the files that an import must contain besides `file` in order to pair `file` in this way
     notes : name of the file with its annotation or alignment; None if there is none
     shared : whether the companion is also imported on its own
-    code, reason : why the file is refused without a companion; empty if it has one or can do without
+    code, reason : why the file is refused without a companion; empty if the file has a companion or does not need one
     """
 
     file: str
@@ -62,10 +62,11 @@ def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
     only one possible companion, this file is chosen.
 
     The name of a skeleton of the predecessor ends in `skeleton` (walk_skeleton.json, walk.skeleton), and its stem is
-    the text before this word; without such a text (skeleton.json), it matches every file. A tree has the name of its
-    model with another ending (walk_cluster_tree.json for walk_mm.json), a skeleton model that of its skeleton
-    (walk_skeleton_model.json for walk_skeleton.json or walk.skeleton), and notes that of their motion
-    (walk_sections.json or walk_alignment.json for walk.bson.bz2 or walk.bvh).
+    the text before this word. If there is no text before it (skeleton.json), the skeleton matches every file. Three
+    kinds of files have the name of another file with a different ending: a tree the name of its model
+    (walk_cluster_tree.json for walk_mm.json), a skeleton model the name of its skeleton (walk_skeleton_model.json for
+    walk_skeleton.json or walk.skeleton), and notes the name of their motion (walk_sections.json or walk_alignment.json
+    for walk.bson.bz2 or walk.bvh).
     """
     folders: defaultdict[str, dict[str, str]] = defaultdict(dict)
     for name in sorted(names):

@@ -49,8 +49,8 @@ class AlignOptions(CostOptions):
         MEDOID,
         description="Clip whose time is the canonical time. medoid: the clip nearest to all others (of more than 200 "
         "clips, the clip of a random sample of 200 that is nearest to all others of the sample); "
-        "nearest_mean_length: the clip whose length is nearest to the mean; or the id of a clip, of which commands and "
-        "Python also take the path.",
+        "nearest_mean_length: the clip whose length is nearest to the mean; or the id of a clip; commands and Python "
+        "also accept the path of the clip.",
     )
     rate_hz: float | None = Field(
         None,

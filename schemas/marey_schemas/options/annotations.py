@@ -112,7 +112,7 @@ class WristContactProposal(_Proposal):
         "wrist_contact", description="Name of the method that proposes segments and keyframes."
     )
     hand: Literal["left", "right", "either"] = Field(
-        "either", description="Hand that reaches; either: the one that reaches farther."
+        "either", description="Hand that reaches; either: the hand that reaches farther."
     )
     least_reach_m: float = Field(
         0.2, gt=0, le=10, allow_inf_nan=False, description="Least distance of a reach, in metres."

@@ -24,8 +24,8 @@ class ObjectiveOptions(Options):
     pose_cost: _Price = Field(0.5, description="Metres that a pose cost of 1 m adds to the objective.")
     seconds: _Price = Field(
         0.0001,
-        description="Metres that each second of data adds to the objective; a clip that lowers the other terms by less "
-        "is removed.",
+        description="Metres that each second of data adds to the objective. A clip is removed if it lowers the other "
+            "terms by less than its duration adds.",
     )
 
 
@@ -96,8 +96,8 @@ class SuggestionOptions(ConfirmedEffects):
         50,
         ge=0,
         le=100_000,
-        description="Number of clips whose removal is tried, one at a time, beginning with the clips that the fewest "
-        "trials use; null: all.",
+        description="Number of clips whose removal is tried, one clip at a time, beginning with the clips that the "
+            "fewest trials use; null: all clips.",
     )
     duplicate_cm: float = Field(
         3.0,

@@ -46,13 +46,13 @@ class VerdictLimits(Options):
     )
     response_s: _Limit = Field(
         2.0,
-        description="Greatest median time to answer a switch of the speed, in seconds; switches without an answer "
-        "count as longer than all others.",
+        description="Greatest median time in which the character responds to a switch of the speed, in seconds. "
+            "Switches without a response count as longer than all others.",
     )
     skate_m_s: _Limit = Field(
         TOE_SPEED_M_S,
-        description="Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more; "
-        "by default the speed up to which a foot counts as standing.",
+        description="Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more. "
+            "The default is the greatest speed of a foot that counts as standing.",
     )
     skate_ratio: _Limit = Field(2.0, description="Greatest ratio of the mean speed of feet in contact to the same "
         "speed in the clips shown.")

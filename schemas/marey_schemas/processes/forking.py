@@ -47,7 +47,7 @@ STARTED = 1 << 16
 LOST = 1 << 17
 """Value in place of the exit status of a child whose fork server has ended."""
 THREADS_END_S = 2.0
-"""Longest wait in seconds for the end of other threads of a fork server, which work while modules are loaded.
+"""Longest wait in seconds for the end of the threads that a fork server uses while it loads modules.
 
 `Thread.join` returns a moment before the system has removed the thread.
 """
@@ -231,7 +231,7 @@ class ForkedChild(ConnectedChild):
 
 
 def require_one_thread() -> None:
-    """Wait until other threads of this process have ended; raises `RuntimeError` if that takes too long."""
+    """Wait until all other threads of this process have ended. Raises `RuntimeError` after `THREADS_END_S`."""
     deadline = time.monotonic() + THREADS_END_S
     while (threads := len(os.listdir("/proc/self/task"))) > 1:
         if time.monotonic() > deadline:

@@ -27,7 +27,7 @@ MOST_COMPARED_VALUES = 200
 MOST_LIKENESSES = 3
 """Greatest number of conditions `like(...)` in a query; each of them searches an index of motions."""
 MOST_ALIKE = 10_000
-"""Greatest number of clips that may meet one condition `like(...)`; the statement of the list contains their ids."""
+"""Greatest number of clips that may meet a condition `like(...)`, because the SQL statement contains their ids."""
 DEEPEST = 30
 """Greatest depth of nested brackets and negations."""
 
@@ -68,7 +68,7 @@ class QueryError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """Comparison of a field with values, at least one of which must match; the operator `has` takes no values.
+    """Comparison of a field with one or more values; it is true if at least one value matches. `has` takes no values.
 
     Values are numbers for fields of the type `number`, and texts for the type `text`. For the type `date`, they are
     dates, or times with a time zone.
@@ -93,7 +93,7 @@ class Likeness:
     """Name of a built-in metric, or path of a stored one; None: the default."""
     distance: float
     below: bool
-    """Whether the distance itself is excluded (`<`), or included (`<=`)."""
+    """Whether clips at exactly the given distance are excluded (`<`), or included (`<=`)."""
     source: str
     column: int
     clips: frozenset[str] | None = None

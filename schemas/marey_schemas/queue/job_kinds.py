@@ -242,7 +242,8 @@ INDEX = KindDeclaration(
         "index": InputSpec(
             kind=Kind.INDEX,
             required=False,
-            description="The index to update: the poses of clips that it contains at the same revision are kept.",
+            description="The index to update. Poses of clips that this index contains at the same revision are not "
+                "computed again.",
         ),
     },
     outputs={"index": Kind.INDEX},
@@ -300,8 +301,8 @@ def job_kinds() -> Mapping[str, KindDeclaration]:
             raise TypeError(f"the entry point {entry.value} in the group {ENTRY_POINT_GROUP} must be a KindDeclaration")
         if kind.name in kinds:
             raise ValueError(
-                f"the entry point {entry.value} declares the job kind {kind.name!r}, but another one "
-                "has this name already"
+                f"the entry point {entry.value} declares the job kind {kind.name!r}, but another job kind has this "
+                f"name already"
             )
         kinds[kind.name] = kind
     return MappingProxyType(kinds)

@@ -218,7 +218,7 @@ class JobOutput(Answer):
     item: str
     kind: Kind
     revision: int
-    created: bool = Field(description="False if the item had the same content before.")
+    created: bool = Field(description="Whether a revision was created. False: the item had the same content before.")
     skeleton_changed: bool = Field(
         False, description="Whether the new revision has another skeleton than the revision before."
     )
@@ -271,7 +271,7 @@ class Job(Answer):
     size: int | None = Field(None, description="Number of tasks that the job is split into.")
     children: dict[str, int] = Field(default_factory=dict, description="Number of tasks in each state.")
     retry_of: str | None = None
-    cached_from: str | None = Field(None, description="The job whose cached result this one reuses.")
+    cached_from: str | None = Field(None, description="Id of the job whose cached result this job reuses.")
     progress: Progress | None = None
     failure: JobFailure | None = None
     result: dict[str, Any] | None = None
@@ -279,7 +279,8 @@ class Job(Answer):
     publish_conflict: CommitConflict | None = Field(
         None, description="Reason why the outputs are not on the branch to which the job was to commit them."
     )
-    commit: JobCommit | None = Field(None, description="Commit of the outputs; null if the submission asks for none.")
+    commit: JobCommit | None = Field(None, description="Commit of the outputs; null if the submission requested no "
+        "commit.")
     author: str | None
     created_at: datetime
     run_at: datetime

@@ -53,8 +53,8 @@ EVALUATE = KindDeclaration(
 
 COMPARE = KindDeclaration(
     name="compare",
-    description="Compares two evaluations trial by trial, with confidence intervals of the changes, or several sets of "
-    "clips with the first one.",
+    description="Compares two evaluations trial by trial, with confidence intervals of the changes. Further "
+        "evaluations are compared with the first one.",
     params=job_params.CompareParams,
     implementation="marey_worker.kinds.compare:run",
     version=4,
@@ -128,7 +128,7 @@ _CANDIDATES = InputSpec(
     kind=Kind.CLIP,
     many=True,
     required=False,
-    description="Clips that may be added; those of the evaluated set are ignored.",
+    description="Clips that may be added; clips that the evaluated set already has are ignored.",
 )
 
 SUGGEST = KindDeclaration(

@@ -41,8 +41,8 @@ TimeZoneName = Annotated[
 Overlapping = Annotated[
     bool,
     Field(
-        description="Whether a job is submitted even if the previous job of the schedule has not ended. If false, such "
-        "times are skipped."
+        description="Whether a job is submitted even if the previous job of the schedule has not ended. If false, "
+            "the time is skipped in this case."
     ),
 ]
 
@@ -67,7 +67,8 @@ class ScheduleCreate(Request):
 class ScheduleChange(Request):
     """Request to change a schedule; absent fields stay as they are.
 
-    After any change but a pause or a new description, the server submits jobs as the user who made the change.
+    After a change, the server submits jobs as the user who made the change, unless only the pause or the description
+    was changed.
     """
 
     cron: Cron | None = None

@@ -48,8 +48,8 @@ class ClaimRequest(Request):
         None,
         min_length=16,
         max_length=64,
-        description="Random id of the claim. If a claim with the same id and the same token is repeated, it gets the "
-        "same leases, renewed.",
+        description="Random id of the claim. If a request is repeated with the same id and the same token, it gets "
+            "the leases of the first request, renewed.",
     )
 
 
@@ -138,7 +138,8 @@ class LeaseList(Answer):
 
     leases: tuple[Lease, ...] = ()
     state: JobState | None = Field(
-        None, description="State of the job, if the claim names one and gets no lease; null if there is no such job."
+        None, description="State of the job that the claim names, if the claim gets no lease; null if the job does "
+            "not exist, or if the claim names no job."
     )
 
 
@@ -233,7 +234,8 @@ class FailRequest(Request):
     )
     retryable: bool = True
     interrupted: bool = Field(
-        False, description="Whether the attempt ended because the worker was stopped; such attempts are not counted."
+        False, description="Whether the attempt ended because the worker was stopped. Such an attempt does not count "
+            "against the number of attempts."
     )
 
 

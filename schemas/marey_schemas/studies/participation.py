@@ -41,8 +41,8 @@ class StudyWelcome(Answer):
 class ParticipationCreate(Request):
     """Consent to take part, in exchange for a token.
 
-    The browser makes the key and stores it before it sends this request. So a repeated request gets the same token, and
-    nobody else can use the link again.
+    The browser creates the key, and stores the key before it sends this request. Therefore, a repeated request gets the
+    same token, and nobody else can use the link again.
     """
 
     code: LinkCode

@@ -224,7 +224,8 @@ class _Job:
             raise MotionError(
                 f"the clip has {len(known)} annotations that could be used (layers: {layers}); name one layer"
                 if known
-                else f"none of the given annotations{self._of_layer()} belongs to this clip; add one, or omit the clip",
+                else f"none of the given annotations{self._of_layer()} belongs to this clip; add an annotation of "
+                    f"the clip, or omit the clip",
                 code="several-annotations" if known else "no-annotation",
             )
         (one,) = known
@@ -350,7 +351,7 @@ class _Job:
 def _recording(pin: PinnedInput, info: ClipInfo) -> Recording:
     """Return take and performer of a clip.
 
-    Pieces that were cut from one clip have this clip as their take; otherwise the take's number in the records counts.
+    The take of a piece that was cut from a clip is this clip; otherwise, it is the take in the record of the clip.
     """
     cut_from = info.source.details.get("clip") if info.source is not None and info.source.format == "cut" else None
     item = cut_from.get("item") if isinstance(cut_from, dict) else None

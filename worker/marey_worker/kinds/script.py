@@ -55,7 +55,8 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
     if declared is None:
         raise JobRefused("no-declaration", "the job has no declaration of its script; submit it to a newer server")
     if declared.image is not None and declared.image != os.environ.get(IMAGE_VARIABLE):
-        raise JobRefused("wrong-image", f"the script needs the image {declared.image}; this worker runs in another one")
+        raise JobRefused("wrong-image", f"the script needs the image {declared.image}, but this worker runs in "
+            f"another image")
     if landlock_version() == 0:
         raise JobRefused("no-confinement", "this worker cannot confine scripts: it needs Linux 5.13 with Landlock")
     folder = Path(tempfile.mkdtemp(prefix="run-", dir=context.scratch))

@@ -101,7 +101,7 @@ def main() -> None:
 
 
 def _prepare(order: GuardedCommand) -> Separation:
-    """Create the namespaces of the command, and give its folder to its user, if it gets one of its own."""
+    """Create the namespaces of the command; if it gets its own user, make this user the owner of its folder."""
     folder = Path(order.folder)
     place = separate(folder, network=order.network, user=free_user())
     if place.user is None:
@@ -246,8 +246,8 @@ class _Watch:
     def _end_all(self) -> None:
         """Kill all processes of the command, until none is left.
 
-        The first process is killed first: if it has a namespace of its own, the kernel then kills all others at once,
-        even those that fork faster than they can be listed.
+        The first process of the command is killed first. If this process has its own namespace, the kernel then kills
+        all other processes of the command at once, even those that fork faster than they can be listed.
         """
         if self.status is None:
             os.kill(self._held, signal.SIGKILL)

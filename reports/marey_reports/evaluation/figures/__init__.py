@@ -1,4 +1,4 @@
-"""Figures of one evaluation or of two: the figures of Abichequer Sangalli et al. (2022), and a few more.
+"""Figures of one or two evaluations: the figures of Abichequer Sangalli et al. (2022), and a few more.
 
 matplotlib is loaded when the first figure is drawn. The same result gives the same bytes.
 """
@@ -78,7 +78,7 @@ COVERAGE_FIGURES = ("density", "points", "holes", "directions")
 SCENARIO_FIGURES = ("scenario-circle", "scenario-switching")
 TRIAL_FIGURES = ("transition-cost", "errors")
 USE_FIGURES = ("usage", "frame-use", "clip-graph")
-"""Figures that a chapter shows together, in a report of one evaluation or of two."""
+"""Names of the figures of each chapter, in reports of one or two evaluations."""
 SHARED_FIGURES = ("offsets", "density")
 """Figures that can show more than two results, as small multiples on one scale."""
 
