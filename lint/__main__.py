@@ -36,7 +36,7 @@ RULES: Mapping[str, Callable[[House], Iterator[Offence]]] = {
     "constants": constants.find,
     "migrations": migrations.find,
 }
-"""Rules by their names in `exceptions.toml`; the rule on wording is missing, because it has a baseline instead."""
+"""Rules by the names that `exceptions.toml` uses. The rule on wording is not included, because it has a baseline."""
 
 
 def check(house: House, root: Path) -> Iterator[tuple[str, Offence]]:

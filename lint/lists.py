@@ -11,7 +11,7 @@ FEWEST_WORDS = 3
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Yield the literal collections that repeat words of a vocabulary outside of the module that declares it."""
+    """Yield literal collections that repeat words of a vocabulary, except in the module that declares the words."""
     vocabularies = dict(_vocabularies(house))
     for module in house.modules.values():
         for node in ast.walk(module.tree):

@@ -2,7 +2,7 @@
 
 Such a migration may create tables and indexes, and add columns that are null or have a default in the database. A new
 index of an existing table must not be unique, because earlier servers may store equal values. Other SQL may only set
-or reset storage parameters of tables. What a migration does when it is undone is not checked.
+or reset storage parameters of tables. Downgrades are not checked.
 """
 
 from __future__ import annotations

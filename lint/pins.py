@@ -22,7 +22,7 @@ BELOW = {
     "build": None, "all": "build", "traces": "all", "kubernetes": "traces", "dev": "kubernetes", "bench": "dev",
     "audit": "dev",
 }  # fmt: skip
-"""Layers of packages, each with the layer that it extends.
+"""Names of layers of packages, each with the name of the layer below, which it extends.
 
 `build` is the build backend; the other layers are extras of `pyproject.toml`.
 """

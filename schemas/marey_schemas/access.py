@@ -52,7 +52,7 @@ DisplayName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 Password = Annotated[SecretStr, Field(min_length=10, max_length=1024)]
 LoginSeconds = Annotated[int, Field(ge=60, le=LONGEST_LOGIN_DAYS * DAY_S)]
 ScopeText = Annotated[str, StringConstraints(pattern=rf"^(?:{'|'.join(Scope)})(?:!project=[a-z0-9_-]{{1,64}})?$")]
-"""Scope, optionally bound to one project, as in `write!project=walk`."""
+"""Scope of a token, optionally limited to one project, as in `write!project=walk`."""
 
 
 class UserCreate(Request):
@@ -146,7 +146,7 @@ class TokenRotation(Request):
         3600,
         ge=60,
         le=7 * DAY_S,
-        description="Seconds for which the replaced token remains valid, but never beyond its expiry.",
+        description="Seconds for which the replaced token remains valid; it never remains valid after its expiry.",
     )
 
 

@@ -107,7 +107,8 @@ class CoverageStreamCreate(Request):
 class CoverageFrames(Request):
     """Next frames of a performance, as arrays of dtype <f4 or <f8."""
 
-    offset: int = Field(ge=0, le=2**53, description="Number of frames that were sent before these.")
+    offset: int = Field(ge=0, le=2**53, description="Number of frames that were sent before the frames of this "
+        "request.")
     poses: Annotated[NDArray[Any], ArrayOf(ndim=2)] | None = Field(
         None, description="[frames, 3 + 4*joints]: root translation (m), then local quaternions w,x,y,z."
     )
@@ -122,7 +123,8 @@ class CoverageFrames(Request):
         description="[frames, 3]: x and z of the torso on the ground (m), heading of the body (rad), not smoothed.",
     )
     ends_take: bool = Field(
-        False, description="The take ends after these frames: the performer pauses, or frames were lost."
+        False, description="Whether the take ends after these frames, because the performer pauses, or because "
+            "frames were lost."
     )
 
     @model_validator(mode="after")
@@ -157,7 +159,7 @@ class CoverageCell(Answer):
 
 
 class CoverageTarget(CoverageCell):
-    """A cell that lacks data, and the path to walk to fill it."""
+    """A cell that lacks data, and the path that the performer should walk to record this data."""
 
     path: tuple[tuple[float, float, float], ...] = Field(
         description="Points of the path, `path_step_s` apart, relative to the performer's place and heading: "

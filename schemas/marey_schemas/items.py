@@ -70,7 +70,7 @@ class ItemRevert(Request):
 
 
 class HidingCondition(Answer):
-    """Condition of a query, with the numbers of items that it excludes."""
+    """Condition of a query, with the numbers of items that the condition excludes."""
 
     condition: str
     hides: int = Field(description="Number of items that do not meet this condition.")

@@ -99,7 +99,7 @@ class PurgedItem(Answer):
 
 
 class HeldItem(Answer):
-    """Item that was not purged, because something still needs it."""
+    """Item that was not purged, because other objects still need it."""
 
     item: str
     kind: Kind
@@ -109,7 +109,7 @@ class HeldItem(Answer):
 
 
 class PurgeAnswer(Answer):
-    """Outcome of a purge: items that it deleted for good, or would delete, and items that it refused to delete."""
+    """Outcome of a purge: the items that were (or would be) deleted for good, and the items that are still needed."""
 
     preview: bool
     purged: tuple[PurgedItem, ...]

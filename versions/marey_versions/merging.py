@@ -64,7 +64,7 @@ merged document, the reason why the changes exclude each other, or None if parts
 
 
 class CombinedEntry(NamedTuple):
-    """Entry whose parts come from several versions, so that none of them has a revision with its content."""
+    """Entry whose parts come from several versions, so that no version has a revision with the content of the entry."""
 
     entry: DatasetEntry
     sides: tuple[DatasetEntry, ...]
@@ -101,8 +101,8 @@ def merge_entries(
     Parameters
     ----------
     ours, theirs : the entries that differ between the base and each side
-    resolutions : decisions about conflicts. Each decides one conflict, or one part of it; of several conflicts with the
-        same key, the first resolutions with this key decide the first, and so on
+    resolutions : decisions about conflicts. Each decides one conflict, or one part of a conflict. If several conflicts
+    have the same key, the first resolutions with this key decide the first of these conflicts, and so on
     merge_parts : merges the parts that both sides have changed; None: such parts are in conflict
 
     Returns
@@ -198,7 +198,7 @@ class _Sides:
 
     @property
     def by_name(self) -> dict[Side, DatasetEntry | None]:
-        """The entry by the name of the version; without the base if the base does not have it."""
+        """The entry by the name of the version; `base` is missing if the base does not have the entry."""
         found = {Side.OURS: self.ours, Side.THEIRS: self.theirs}
         return found if self.base is None else {**found, Side.BASE: self.base}
 

@@ -211,7 +211,7 @@ class RunningAttempt:
                 return stop
 
     def _check(self, child: ChildProcess | None) -> Stop | None:
-        """Send new output in a thread of its own every `LOG_EVERY_S` seconds; return the reason to stop now, or None.
+        """Send new output every `LOG_EVERY_S` seconds in a separate thread; return the reason to stop now, or None.
 
         If the server does not answer, only the thread that sends the log waits; inputs and results are not delayed.
         """
@@ -368,7 +368,7 @@ class RunningAttempt:
         )
 
     def _try_to_send_log(self) -> None:
-        """Send new output; if this fails, log the failure only, so that no result is lost because of it."""
+        """Send new output. A failure is only logged, so that no result is lost because of it."""
         try:
             self._job_log.send()
         except LeaseLost:

@@ -17,7 +17,7 @@ STAGING = "staging"
 
 
 def of_exception(error: BaseException) -> str:
-    """Return the signature of an exception: its type, and a digest of its type and traceback, but not of its text."""
+    """Return the signature of an exception: its type, and a digest of type and traceback. The text is not included."""
     frames = traceback.extract_tb(error.__traceback__)
     places = [f"{frame.filename.rpartition('/')[2]}:{frame.name}:{frame.lineno}" for frame in frames]
     digest = hashlib.sha256("\n".join([type(error).__qualname__, *places]).encode()).hexdigest()

@@ -182,7 +182,7 @@ class Supervisor:
     def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
         """Run a job; return a future that ends when the results are stored and the end of the job is reported.
 
-        After a success, this method returns before the future ends, so that the child can run the next job meanwhile.
+        After a success, this method returns before the future ends, so that the child can already run the next job.
         """
         place = (lease.job, lease.fence)  # a lost job may run again before its former attempt has ended
         self._running.add(place)
@@ -223,7 +223,9 @@ class _OpenClaim:
 
 
 class _SlotChild:
-    """Child process of a slot; it is replaced after it has died, and after a certain number of jobs."""
+    """Child process of a slot. It is replaced by a new process after it has died, and after a certain number of
+    jobs.
+    """
 
     def __init__(self, options: WorkerOptions) -> None:
         self._options = options

@@ -44,7 +44,7 @@ class _MeanCurve(NamedTuple):
 
 
 def draw_curves(subject: ComparedSubject, field: str) -> Sketch | None:
-    """Draw a field over steps; return None if no run logged it over steps.
+    """Draw a field over steps; return None if no run logged the field over steps.
 
     The first settings have colours, and the others are grey. A mean is drawn only at steps where all its runs have a
     number, because a mean of some of the runs would be misleading.

@@ -64,7 +64,7 @@ class Place(NamedTuple):
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty page with the given size in inches."""
+    """Return an empty page with the given width and height in inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER)

@@ -138,7 +138,7 @@ def stances_at(clip: Clip, body: StickFigure, frames: Indices) -> Stances:
 
 
 def _tips(skeleton: Skeleton, pelvis: int, sides: dict[int, int]) -> list[tuple[int, int]]:
-    """List the last bone of each drawn chain of joints: its outer point, which is an end site, and its inner joint.
+    """List the last bone of each drawn chain of joints, as its outer point, an end site, and its inner joint.
 
     The index of an end site is counted after all joints, as in `StickFigure.bones`.
     """

@@ -116,7 +116,7 @@ def draw_clip_strip(poses: Sequence[Clip], frames: Sequence[int], frame_rate_hz:
     Parameters
     ----------
     poses : one frame of the clip for each moment
-    frames : the numbers of these frames in the clip
+    frames : the indices of these frames in the clip
     frame_rate_hz : frames per second of the clip
     title : title of the picture, for readers who do not see it
     """
@@ -338,7 +338,7 @@ def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, l
 
 
 def _add(axes: Axes, artist: Artist, frame: Rectangle) -> None:
-    """Add an artist, and clip it to `frame` afterwards: `add_artist` replaces a clip path that is a rectangle."""
+    """Add an artist, then clip it to `frame`. This order matters: `add_artist` replaces a rectangular clip path."""
     axes.add_artist(artist).set_clip_path(frame)
 
 

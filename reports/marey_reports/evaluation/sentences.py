@@ -129,7 +129,7 @@ def _not_asked_for(coverage: Coverage, window_s: float) -> list[RegionVerdict]:
 
 
 def _problems(trials: Sequence[TrialVerdict]) -> str:
-    """Describe the limits that most of these trials exceed, each with the median of the values beyond the limit."""
+    """Describe the limits that are exceeded most often, each with the median of the values beyond the limit."""
     beyond: dict[Measure, list[LimitCheck]] = {}
     for trial in trials:
         worst: dict[Measure, LimitCheck] = {}

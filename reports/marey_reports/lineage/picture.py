@@ -1,4 +1,4 @@
-"""Picture of a lineage graph as SVG or PNG, and its form for Graphviz."""
+"""Picture of a lineage graph as SVG or PNG, or as a document in the language of Graphviz."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def _not_too_long(paths: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class CheckoutRequest(Request):
-    """Request to bring the folder of a dataset to the state of a version, or of a part of it.
+    """Request to bring the folder of a dataset to the state of a version, or of a part of the version.
 
     `query` and `paths` select the entries to check out; an entry must meet both. Without them, all entries are checked
     out.

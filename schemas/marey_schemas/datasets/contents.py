@@ -98,7 +98,7 @@ class ReceivedRevision(Request):
         default_factory=dict,
         max_length=MOST_RECEIVED_FACETS,
         description="Numbers that jobs have published about the revision. They are added to all revisions with this "
-        "content; numbers that the project has already stay.",
+            "content, but do not replace numbers that the project already has.",
     )
 
 
@@ -137,5 +137,5 @@ class ReceivedCommit(Request):
     )
     changes: tuple[ReceivedChange, ...] = Field(max_length=MOST_RECEIVED_CHANGES)
     begins: RefName | None = Field(
-        None, description="Branch without commits that is set to this commit; null: no branch is changed."
+        None, description="Branch that is set to this commit; it must have no commits yet. Null: no branch is changed."
     )

@@ -81,8 +81,8 @@ class PickRequest(CombineRequest):
     version: Version = Field(description="Commit whose changes are applied or undone.")
     parent: Literal[1, 2] | None = Field(
         None,
-        description="Parent with which the commit is compared to find its changes; required if the commit is a merge. "
-        "1: the branch that the merge changed; 2: the version that was merged.",
+        description="Number of the parent with which the commit is compared to find its changes; required if the "
+            "commit is a merge. 1: the newest commit of the branch before the merge; 2: the version that was merged.",
     )
 
 

@@ -101,7 +101,7 @@ class PathMove(Answer):
     turn_deg: float = Field(description="Turn about the vertical axis, left positive.")
     shift_cm: Vector3
     remaining_cm: float = Field(
-        description="Largest distance between the paths that remains once this movement is applied."
+        description="Largest distance between the paths that remains after this movement is applied."
     )
 
 
@@ -220,7 +220,8 @@ class ModelDifference(Answer):
     examples_added: tuple[str, ...] = ()
     examples_removed: tuple[str, ...] = ()
     mean_log_likelihood: tuple[float | None, float | None] = Field(
-        (None, None), description="Mean log-likelihood of each model's own examples; null if it is not stored."
+        (None, None), description="Mean log-likelihood of the training examples under each model; null if it is not "
+            "stored."
     )
 
 

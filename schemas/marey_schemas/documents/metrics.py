@@ -97,7 +97,8 @@ class MetricComponent(Request):
     constant: _Amount = Field(description="The constant c, which is added to the distance of poses that differ.")
     norm: _Amount = Field(description="The factor N, by which the weighted mean of F is multiplied.")
     weights: dict[JointClass, _Amount] = Field(
-        min_length=1, description="Weight of each joint class, with any sum; they are divided by their sum."
+        min_length=1, description="Weight of each joint class. The weights can have any sum, because they are "
+            "divided by their sum."
     )
     share: _Share = Field(description="Share of the component in the metric; the shares have the sum 1.")
     intervals: dict[JointClass, tuple[_Number, _Number]] = Field(
@@ -228,12 +229,12 @@ def built_in_names() -> tuple[str, ...]:
 
 
 def is_built_in(name: str) -> bool:
-    """Return whether a metric that needs no item has this name."""
+    """Return whether there is a built-in metric (which needs no item) with this name."""
     return re.fullmatch(_BUILT_IN_PATTERN, name) is not None
 
 
 def built_in_metric(name: str) -> MetricDocument:
-    """Return a metric that needs no item. Raises `KeyError` if none has this name."""
+    """Return the built-in metric with this name. Raises `KeyError` if there is none."""
     found = re.fullmatch(_BUILT_IN_PATTERN, name)
     if found is None:
         raise KeyError(name)

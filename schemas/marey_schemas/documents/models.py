@@ -247,7 +247,8 @@ def _without_time(provenance: Any) -> Any:
 def predecessor_time(model: Mapping[str, Any]) -> PredecessorTimeDocument | None:
     """Return the time function of a model as it was imported from Marey's predecessor.
 
-    Return None if it is not recorded, or if the time function of the part `model` was changed since.
+    Return None if no time function was recorded, or if the time function of the part `model` was changed since the
+    import.
     """
     try:
         origin = ModelProvenance.model_validate(model.get("provenance", {})).predecessor

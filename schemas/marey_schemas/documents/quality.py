@@ -163,7 +163,7 @@ class QualityConditions(Request):
 
 
 class QualityRow(Request):
-    """Clip with its numbers."""
+    """Row of the table of clips: a clip with the values of its measures."""
 
     item: str
     revision: int

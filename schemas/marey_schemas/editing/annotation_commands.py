@@ -147,7 +147,8 @@ class AnnotationImport(Request):
     labels: tuple[Label, ...] | None = Field(
         None,
         max_length=1000,
-        description="Labels to import; absent: all of them. Import labels whose segments overlap into separate layers.",
+        description="Labels to import; absent: all labels. Labels whose segments overlap must be imported into "
+            "separate layers.",
     )
     message: Message = ""
 

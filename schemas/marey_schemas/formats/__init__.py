@@ -14,8 +14,7 @@ ORIGINAL = "original"
 """Name of the export format that selects the imported file itself, in any format."""
 OCTETS = "application/octet-stream"
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The earliest time that a ZIP archive can store. Every file gets this time, so that equal content gives equal bytes.
-"""
+"""The earliest time that a ZIP archive can store. All files get this time, so that equal content gives equal bytes."""
 
 MOST_UNPACKED_BYTES = 1 << 29
 """Greatest unpacked size in bytes of a compressed file; readers stop unpacking there."""

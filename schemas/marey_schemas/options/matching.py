@@ -1,4 +1,4 @@
-"""Options of motion matching: the database of clips, and the controller that plays clips from it."""
+"""Options of motion matching: the database of clips, and the controller that plays clips from the database."""
 
 from __future__ import annotations
 

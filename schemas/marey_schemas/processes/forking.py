@@ -1,4 +1,4 @@
-"""Fork server: a process that loads modules once, and then forks children that have them already.
+"""Fork server: a process that loads modules once, and then forks children in which the modules are already loaded.
 
 Loading numeric modules and compiled kernels takes two seconds of processor time and 200 MB for each process. A forked
 child is ready in milliseconds and shares this memory. The fork server has only one thread, since locks that other
@@ -115,7 +115,7 @@ class ForkServer:
         return child
 
     def status_of(self, pid: int, timeout_s: float | None = None) -> int | None:
-        """Return the exit status of a child, or None if it still runs after `timeout_s`; without a timeout, wait."""
+        """Return the exit status of a child, or None if it still runs after `timeout_s`; without a timeout, wait on."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or pid in self._statuses, timeout_s)
             return self._statuses.get(pid, LOST if self._ended else None)

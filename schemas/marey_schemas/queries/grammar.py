@@ -85,7 +85,8 @@ class Condition:
 class Likeness:
     """Condition that a clip has a moment that looks like some frames of a clip: `like("walks/a:30-90") < 0.2`.
 
-    The database cannot evaluate it: an index of motions is searched before, and `with_clips` adds the clips found.
+    The database cannot evaluate this condition. So an index of motions is searched first, and `with_clips` adds the
+    clips that were found to the condition.
     """
 
     moment: Moment

@@ -140,14 +140,15 @@ CUT = KindDeclaration(
     version=3,
     inputs={
         "annotations": InputSpec(
-            kind=Kind.ANNOTATION, many=True, description="The annotations; each refers to a clip and its revision."
+            kind=Kind.ANNOTATION, many=True, description="The annotations; each annotation refers to a revision of a "
+                "clip."
         ),
         "clips": InputSpec(
             kind=Kind.CLIP,
             many=True,
             required=False,
-            description="The annotated clips, at the revisions to which the annotations refer. If they are given, the "
-            "history of the pieces lists them.",
+            description="The annotated clips, at the revisions to which the annotations refer. If the clips are "
+                "given, they are recorded as inputs of the pieces.",
         ),
     },
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
@@ -218,8 +219,9 @@ def _reads_answers(_params: Mapping[str, Any]) -> bool:
 
 ANALYSE_STUDY = KindDeclaration(
     name="analyse_study",
-    description="Computes the differences that the participants of a study perceived, the order and the groups of its "
-    "motions, and metrics that are fitted to these differences. Only maintainers may submit it.",
+    description="Analyses a study: computes the differences that its participants perceived, the order and the "
+        "groups of its motions, and metrics that are fitted to these differences. Only maintainers may submit such "
+        "jobs.",
     params=job_params.AnalyseStudyParams,
     implementation="marey_worker.kinds.analyse_study:run",
     version=1,

@@ -94,7 +94,7 @@ class JobKind(Answer):
 
 
 class ItemInput(Request):
-    """Item as an input, at the given revision, or else at its newest revision at the time of submission."""
+    """Item as an input, at the given revision; without a revision, at the newest one when the job is submitted."""
 
     item: str
     revision: int | None = Field(None, ge=1)
@@ -178,8 +178,8 @@ class JobCreate(Request):
     )
     cache: CacheMode = Field(
         "use",
-        description="use: reuse the result of an identical job; refresh: compute it again and store it for "
-        "later jobs; off: compute it again for this job only.",
+        description="use: reuse the result of an identical job; refresh: compute the result again and store it for "
+            "later jobs; off: compute the result again, for this job only.",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed of all random numbers; the same seed gives the same result.")
     max_attempts: int = Field(3, ge=1, le=20)

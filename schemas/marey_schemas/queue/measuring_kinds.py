@@ -122,7 +122,7 @@ QUALITY = KindDeclaration(
 )
 
 _EVALUATED = InputSpec(
-    kind=Kind.EVALUATION, description="The evaluation; its clips are read at the revisions that it used."
+    kind=Kind.EVALUATION, description="The evaluation. Its clips are read at the revisions that the evaluation used."
 )
 _CANDIDATES = InputSpec(
     kind=Kind.CLIP,

@@ -19,7 +19,7 @@ REFUSED_STATUS = 42
 """Exit status of a worker in a pod for a single job if the server refuses the worker; a restart would not help."""
 
 IMAGE_VARIABLE = "MAREY_SCRIPT_IMAGE"
-"""Environment variable with the image in which a worker runs; the launcher sets it for scripts with an own image."""
+"""Environment variable with the image in which a worker runs; the launcher sets it if a script names an image."""
 
 
 def with_digest(image: str) -> str:

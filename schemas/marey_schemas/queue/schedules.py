@@ -50,7 +50,7 @@ Overlapping = Annotated[
 class ScheduleCreate(Request):
     """Request to create a schedule.
 
-    The server submits its jobs as the user who created it, with the scopes of the token that was used.
+    The server submits the jobs as the user who created the schedule, with the scopes of the token of this request.
     """
 
     name: ScheduleName

@@ -144,7 +144,7 @@ class ScriptOutput(Request):
         "of one step; absent: the file is one JSON object.",
     )
     max_bytes: int = Field(64 * MIB, ge=1, le=GIB, description="Greatest size of the file.")
-    required: bool = Field(True, description="Whether a run without this file fails.")
+    required: bool = Field(True, description="Whether a run fails if the script does not write this file.")
     description: Message = ""
 
     @model_validator(mode="after")
@@ -199,8 +199,9 @@ class ScriptDeclaration(Request):
     limits: ScriptLimits = ScriptLimits()
     image: Image | None = Field(
         None,
-        description="Container image in which the script runs, named by its digest; it contains a worker of Marey. The "
-        "server must allow it, and start pods for single jobs. null: the image of the worker.",
+        description="Container image in which the script runs, named by its digest. The image must contain a worker "
+            "of Marey, the server must allow the image, and the server must start pods for single jobs. null: the "
+            "image of the worker.",
     )
 
     @field_validator("commit", mode="before")
@@ -322,8 +323,8 @@ class ScriptParams(ConsentOverride):
     )
     declaration: ScriptDeclaration | None = Field(
         None,
-        description="The script as it was registered when the job was submitted. The server fills it in; if a request "
-        "gives it, it must equal the registered script.",
+        description="The script as it was registered when the job was submitted. The server fills in this field; if "
+            "a request contains the field, its value must equal the registered script.",
     )
 
 

@@ -40,7 +40,7 @@ class ClaimRequest(Request):
     version: ShownText | None = Field(
         None, max_length=64, description="Version of Marey that the worker runs, shown to administrators."
     )
-    job: str | None = Field(None, description="Claim only this job.")
+    job: str | None = Field(None, description="Id of the only job that the worker claims; absent: any job.")
     task: int | None = Field(
         None, ge=0, le=1_000_000, description="Claim only the task of `job` that has this position."
     )
@@ -70,8 +70,8 @@ class PinnedInput(Answer):
     commit: str | None = Field(None, description="Commit of a dataset from which the input was taken.")
     consent_ended: str | None = Field(
         None,
-        description="Last day of the performer's consent, if the job would write the input to a file and this day has "
-        "passed, by the clock of the server in UTC.",
+        description="Last day of the performer's consent. Set only if this day has passed, by the clock of the "
+            "server in UTC, and the job would write the input to a file.",
     )
 
     @property

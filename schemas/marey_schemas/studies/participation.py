@@ -62,7 +62,7 @@ class Participation(Answer):
     """Progress of a participant."""
 
     title: str
-    clips: int = Field(description="Number of motions; their numbers are 0 to clips - 1.")
+    clips: int = Field(description="Number of motions. The motions are numbered from 0.")
     trials: int = Field(description="Number of trials to answer.")
     answered: int
     remaining: int
@@ -79,7 +79,7 @@ class NewParticipation(Answer):
 
 
 class OpenTrial(Answer):
-    """A trial that waits for its answer."""
+    """A trial that the participant has not answered yet."""
 
     number: int = Field(description="Number of the trial among all that were shown to this participant, from 1.")
     clips: tuple[int, ...] = Field(description="Numbers of the motions, by place on the screen.")

@@ -81,7 +81,7 @@ class Archive:
             else:
                 self._add(ArchiveMember.of_name(header.name), header)
         if manifest is None:
-            raise BadArchive(f"the archive has no {MANIFEST}: it was not written to its end, or was cut off")
+            raise BadArchive(f"the archive has no {MANIFEST}: the archive was not written completely, or was cut off")
         return manifest
 
     def _add(self, member: ArchiveMember, header: tarfile.TarInfo) -> None:
@@ -104,8 +104,8 @@ class Archive:
     def differences(self, document: str) -> dict[str, ArrayDifference]:
         """Return the arrays of a document that the archive has only as differences, by the digest of the array.
 
-        The archive must build on earlier versions. An array is compared with its digest only by a server that has the
-        base of the difference.
+        Only archives that build on earlier versions have differences. A server that has the base of a difference
+        compares the array with its digest; this method does not.
         """
         member = ArchiveMember(MemberKind.DIFFERENCES, document)
         if member not in self.members:

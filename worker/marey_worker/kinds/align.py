@@ -283,7 +283,7 @@ class _Job:
         )
 
     def _written_options(self) -> dict[str, Any]:
-        """Return the parameters; without a metric, they are written as before metrics could be chosen."""
+        """Return the parameters as a document; without a metric, the member `metric` is left out."""
         return self._params.model_dump(mode="json", exclude={"metric"} if self._params.metric is None else set())
 
     def _metric_tree(self) -> dict[str, Any]:

@@ -137,7 +137,7 @@ class _Importing:
             raise
 
     def _find_models(self, name: str, collection: str | None) -> tuple[int, list[NamedModel]]:
-        """Find models of this job and of the project by name; return their number and the first few of them.
+        """Find models of this job and of the project by name; return the number of matches, and the first few models.
 
         If this job creates a new revision of a model, the new revision is returned.
         """

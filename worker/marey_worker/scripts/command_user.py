@@ -1,8 +1,8 @@
 """Kernel user of a script whose worker runs as root.
 
 The kernel limits the number of processes (RLIMIT_NPROC) of every user but root. So the command of a script runs as a
-user that no other process has. It keeps one right of root, in order to open the files of root that Landlock lets it
-open, such as a Python environment in the home of root.
+user that no other process has. The command keeps one right of root, so that it can open files of root that Landlock
+allows, such as a Python environment in the home of root.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from marey_worker.scripts.confinement import check, libc
 
 FIRST_USER, USERS = 61184, 4336
-"""Ids that no account has; systemd gives them to services while these run."""
+"""Ids of users that no account has. systemd assigns ids in this range to services while they run."""
 CAP_CHOWN, CAP_DAC_OVERRIDE, CAP_FOWNER, CAP_KILL, CAP_SETUID = 0, 1, 3, 5, 7
 NEEDED = (CAP_CHOWN, CAP_DAC_OVERRIDE, CAP_FOWNER, CAP_KILL, CAP_SETUID)
 """Rights that root needs to change the user, to kill the processes of another user, and to remove their files."""

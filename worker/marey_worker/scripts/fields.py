@@ -87,7 +87,7 @@ def _parse_line(where: str, line: bytes, default_step: int) -> tuple[int, dict[s
 def _add(where: str, fields: dict[str, Value], field: str, value: Any) -> None:
     """Set a field to its last value; numbers that are not finite become the texts NaN, Infinity and -Infinity.
 
-    A run whose loss diverges is a result, too, and its last finite loss would be misleading.
+    The result of a run with a diverging loss is that text, because the last finite loss would be misleading.
     """
     fault = _fault_of_name(field) if field not in fields else None
     if isinstance(value, float) and not math.isfinite(value):

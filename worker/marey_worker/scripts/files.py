@@ -29,7 +29,8 @@ def write_inputs(
     consent has ended.
 
     The file `inputs.json` lists the items of each input with the names of their files. Raises `JobRefused` if the
-    consent for a clip has ended and the job does not allow it, and if a clip cannot be written in its format.
+    consent for a clip has ended and the job does not allow exports after the end, or if a clip cannot be written in the
+    format of its input.
     """
     paths: dict[str, str] = {}
     listed: dict[str, list[dict[str, Any]]] = {}

@@ -47,7 +47,7 @@ NO_PROGRAM_STATUS = 127
 
 @dataclass(frozen=True)
 class GuardedCommand:
-    """Command of a script, its folder, environment and limits."""
+    """Command of a script, with its folder, environment and limits."""
 
     argv: tuple[str, ...]
     folder: str
@@ -75,7 +75,7 @@ class CommandEnd:
 
 
 def main() -> None:
-    """Run the command of the order, and write its end to the pipe."""
+    """Run the command in the order from standard input, and write a `CommandEnd` to the pipe."""
     result = int(sys.argv[1])
     os.set_inheritable(result, False)
     given = json.load(sys.stdin)
@@ -115,7 +115,7 @@ def _prepare(order: GuardedCommand) -> Separation:
 def _hold(order: GuardedCommand, output: int, user: int | None, *, bounded: bool) -> NoReturn:
     """Start the confined command, wait for it, and exit with its status.
 
-    In a process namespace of its own, this is the first process: when it ends, the kernel kills all others.
+    In a process namespace of the command, this is the first process; when it ends, the kernel kills all others.
     """
     os.setsid()
     null = os.open(os.devnull, os.O_RDONLY)

@@ -84,7 +84,7 @@ class TrialView:
 
     @property
     def switched(self) -> NDArray[np.bool_]:
-        """Mask (S,) of the steps that jump to another frame because a search chose it, not because a clip ended."""
+        """Mask (S,) of the steps that jump to another frame because of a search, not because a clip ended."""
         return np.asarray(self.record.status[1:] == Status.REPLACING)
 
 
