@@ -69,7 +69,7 @@ def _helps(module: Module) -> Iterator[tuple[str, str]]:
 
 
 def _sentences(module: Module, tree: ast.AST) -> Iterator[tuple[str, str]]:
-    """Yield the literals of several words in an expression; values that an f-string inserts appear in braces."""
+    """Yield the string literals of several words in an expression; expressions in f-strings appear in braces."""
     if isinstance(tree, ast.JoinedStr | ast.Constant):
         text = "".join(_shown(part) for part in (tree.values if isinstance(tree, ast.JoinedStr) else [tree]))
         if " " in text.strip():

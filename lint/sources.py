@@ -27,7 +27,7 @@ Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 
 
 class Offence(NamedTuple):
-    """A place that breaks a rule. `subject` is what an exception names."""
+    """Place in the code that breaks a rule. Exceptions refer to it by its `subject`."""
 
     path: Path
     line: int

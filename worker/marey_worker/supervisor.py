@@ -223,9 +223,7 @@ class _OpenClaim:
 
 
 class _SlotChild:
-    """Child process of a slot. It is replaced by a new process after it has died, and after a certain number of
-    jobs.
-    """
+    """Child process of a slot, which is replaced after it has died and after a certain number of jobs."""
 
     def __init__(self, options: WorkerOptions) -> None:
         self._options = options

@@ -53,5 +53,5 @@ class StudyDocument(Request):
         items = [one.clip.item for one in self.motions if isinstance(one.clip, RevisionRef)]
         if len(set(items)) != len(items):
             twice = next(item for item in items if items.count(item) > 1)
-            raise ValueError(f"motions: the clip {twice} occurs twice; each motion must be another clip")
+            raise ValueError(f"motions: the clip {twice} occurs twice; each motion must be a different clip")
         return self

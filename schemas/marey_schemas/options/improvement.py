@@ -89,8 +89,8 @@ class SuggestionOptions(ConfirmedEffects):
         3,
         ge=0,
         le=100,
-        description="Number of clips to add whose effect on the trials is simulated, in the order of the additions; "
-        "each takes as long as an evaluation with `confirmation_replicates`.",
+        description="Number of suggested additions whose effect on the trials is simulated, in their order. Each "
+            "simulation takes as long as an evaluation with `confirmation_replicates`.",
     )
     consider: int | None = Field(
         50,

@@ -26,8 +26,8 @@ class VerdictLimits(Options):
     )
     speed_share: _Limit = Field(
         0.15,
-        description="Greatest error of the mean speed, as a share of the desired speed; for each speed of a switching "
-        "trial, away from the switches.",
+        description="Greatest error of the mean speed, as a share of the desired speed. In a switching trial, each "
+            "speed is measured separately, away from the switches.",
     )
     turn_deg_s: _Limit = Field(10.0, description="Greatest error of the mean turn rate, in degrees per second.")
     heading_deg: _Limit = Field(
@@ -35,9 +35,9 @@ class VerdictLimits(Options):
     )
     speed_wobble_share: _Limit = Field(
         0.2,
-        description="Greatest standard deviation of the speed, as a share of the desired speed; in a switching trial "
-        "away from the switches, as a share of the faster speed, because the character catches up after a switch. The "
-        "baseline reaches 0.19.",
+        description="Greatest standard deviation of the speed, as a share of the desired speed. In a switching "
+            "trial, it is measured away from the switches, as a share of the faster speed, because the character "
+            "catches up after a switch. The baseline reaches 0.19.",
     )
     turn_wobble_deg_s: _Limit = Field(
         25.0,

@@ -236,9 +236,10 @@ class ScriptDeclaration(Request):
             for name in names
         }
         for kind, name in sorted(used - declared):
-            raise ValueError(f"argv: the {kind} {name!r} is not declared")
+            raise ValueError(f"argv: the {kind} {name!r} is not declared; declare it, or remove the word")
         for kind, name in sorted(declared - used):
-            raise ValueError(f"argv: the {kind} {name!r} is declared, but no word is {{{kind}:{name}}}")
+            raise ValueError(f"argv: the {kind} {name!r} is declared, but no word is {{{kind}:{name}}}; add this "
+                f"word, or remove the declaration")
         if sum(output.kind == "fields" for output in self.outputs.values()) > 1:
             raise ValueError("outputs: at most one output can be of the kind fields")
         return self

@@ -20,7 +20,7 @@ from marey_schemas.sizes import MIB
 
 SCHEMA = "marey/archive@1"
 SCHEMA_WITH_FACETS = "marey/archive@2"
-"""Schema of archives that have facets; programs that know only the other schema refuse these archives."""
+"""Schema of archives that have facets; programs that know only the schema without facets refuse these archives."""
 SCHEMA_WITH_DIFFERENCES = "marey/archive@3"
 """Schema of archives in which arrays are described by their differences from arrays of earlier versions."""
 MANIFEST = "archive.json"
