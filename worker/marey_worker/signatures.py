@@ -13,7 +13,7 @@ NAME_CHARACTERS = 200
 """Greatest number of characters of the name of an exception class; the digest concerns the whole name."""
 
 STAGING = "staging"
-"""Signature of the failure that the server did not store results."""
+"""Signature of failures in which the server did not store the results."""
 
 
 def of_exception(error: BaseException) -> str:

@@ -78,7 +78,7 @@ class FrameRun(Answer):
 class Exceeding(Answer):
     """Size of a change over the matched frames, and the times at which the change exceeds the threshold."""
 
-    mean: float = Field(description="Mean over all matched frames.")
+    mean: float = Field(description="Mean size of the change over all matched frames.")
     largest: float
     largest_at: int = Field(description="Frame of the revision `after` with the largest change.")
     spans: tuple[Range, ...] = Field(
