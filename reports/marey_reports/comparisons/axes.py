@@ -77,5 +77,5 @@ def beside(axes: Axes, transform: Transform, inches: float) -> Transform:
 
     figure = axes.get_figure(root=True)
     if figure is None:
-        raise ValueError("the axes are on no page")
+        raise ValueError("the axes do not belong to a figure")
     return transform + ScaledTranslation(inches, 0.0, figure.dpi_scale_trans)

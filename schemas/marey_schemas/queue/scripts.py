@@ -82,9 +82,9 @@ class ScriptParameter(Request):
         if self.choices and self.type != "text":
             raise ValueError(f"choices need a parameter of the type text, not {self.type}")
         if any("\x00" in choice for choice in self.choices):
-            raise ValueError("choices: a text contains a zero character")
+            raise ValueError("choices: a text contains a NUL character; remove it")
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
-            raise ValueError("minimum is greater than maximum")
+            raise ValueError("minimum: must not be greater than maximum")
         if self.default is not None and (fault := self.fault_of(self.default)) is not None:
             raise ValueError(f"default: {fault}")
         return self
@@ -221,7 +221,7 @@ class ScriptDeclaration(Request):
     @model_validator(mode="after")
     def _check_words(self) -> Self:
         if any("\x00" in word for word in self.argv):
-            raise ValueError("argv: a word contains a zero character")
+            raise ValueError("argv: a word contains a NUL character; remove it")
         self._check_program()
         used = set()
         for place, word in enumerate(self.argv):

@@ -260,7 +260,8 @@ class _Job:
             return options
         named = [pin for pin in self._pins.values() if pin.item == options.reference]
         if not named:
-            raise JobRefused("unknown-reference", f"the reference {options.reference} is not one of the clips")
+            raise JobRefused("unknown-reference", f"the reference {options.reference} is not one of the clips; give "
+                "the id of one of them")
         return options.replace(reference=_uid(max(named, key=lambda pin: pin.revision)))
 
     def _digest(self, clips: Sequence[_Clip], examples: Sequence[SourceExample], rig: Rig) -> str:
