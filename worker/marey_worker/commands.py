@@ -152,7 +152,7 @@ def _known_kinds(names: tuple[str, ...]) -> tuple[str, ...]:
         raise MareyError(str(error)) from error
     if SCRIPT in found and SCRIPT not in runnable:
         raise MareyError(f"this worker cannot run scripts: set {REPOSITORIES_VARIABLE} to the repositories that "
-            f"scripts may use")
+            "scripts may use")
     return found or runnable
 
 

@@ -108,7 +108,7 @@ class ArrayDifference:
         spec = ArraySpec(self.dtype, self.shape)
         if spec != ArraySpec(base.dtype, base.shape) or not spec.shape:
             raise ArrayError("bad-array", f"the array difference describes an array {spec}, but its base has another "
-                f"dtype or shape")
+                "dtype or shape")
         frames, difference = self._checked(spec)
         dtype = np.dtype(spec.dtype)
 

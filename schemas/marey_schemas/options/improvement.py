@@ -55,7 +55,7 @@ class ConfirmedEffects(ObjectiveChoice):
         description="Number of further replicates in which the chosen effects are measured again; these measurements "
             f"are reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed. With "
         f"{LEAST_REPLICATES} to 6, an optimisation confirms no step whose effect is equal in all replicates, unless "
-        f"the step changes no trial.",
+        "the step changes no trial.",
     )
     confirmation_seed: int = Field(
         0,

@@ -304,7 +304,7 @@ def job_kinds() -> Mapping[str, KindDeclaration]:
         if kind.name in kinds:
             raise ValueError(
                 f"the entry point {entry.value} declares the job kind {kind.name!r}, but another job kind has this "
-                f"name already"
+                "name already"
             )
         kinds[kind.name] = kind
     return MappingProxyType(kinds)

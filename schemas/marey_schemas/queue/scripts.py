@@ -239,7 +239,7 @@ class ScriptDeclaration(Request):
             raise ValueError(f"argv: the {kind} {name!r} is not declared; declare it, or remove the word")
         for kind, name in sorted(declared - used):
             raise ValueError(f"argv: the {kind} {name!r} is declared, but no word is {{{kind}:{name}}}; add this "
-                f"word, or remove the declaration")
+                "word, or remove the declaration")
         if sum(output.kind == "fields" for output in self.outputs.values()) > 1:
             raise ValueError("outputs: at most one output can be of the kind fields")
         return self

@@ -40,7 +40,7 @@ class _Check:
         self._facets()
         if left := sorted(self.archive.members.keys() - self.checked):
             raise BadArchive(f"{left[0].name}: no version in the archive contains this member; the member was added "
-                f"later")
+                "later")
 
     def _changes_of(self, commit: str) -> None:
         self._mark(ArchiveMember(MemberKind.CHANGES, commit))
@@ -49,7 +49,7 @@ class _Check:
                 if unchanged and not self.archive.manifest.base:
                     raise BadArchive(
                         f"{ArchiveMember(MemberKind.CHANGES, commit).name}: the member refers to an earlier archive, "
-                        f"but this archive contains the whole history; the archive was altered"
+                        "but this archive contains the whole history; the archive was altered"
                     )
                 documents = [digest for part, digest in value["parts"].items() if part not in unchanged]
                 self._revision(revision_content(path_and_kind(key)[1], value["parts"]), documents)

@@ -225,7 +225,7 @@ class _Job:
                 f"the clip has {len(known)} annotations that could be used (layers: {layers}); name one layer"
                 if known
                 else f"none of the given annotations{self._of_layer()} belongs to this clip; add an annotation of "
-                    f"the clip, or omit the clip",
+                    "the clip, or omit the clip",
                 code="several-annotations" if known else "no-annotation",
             )
         (one,) = known

@@ -111,7 +111,7 @@ class _Cutting:
         if clip.item not in self._clips:
             raise MotionError(
                 f"the annotation refers to the clip {clip.item}, which is not among the given clips; add this clip, "
-                f"or give no clips at all",
+                "or give no clips at all",
                 code="clip-not-given",
             )
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])

@@ -57,7 +57,7 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
             "the job again")
     if declared.image is not None and declared.image != os.environ.get(IMAGE_VARIABLE):
         raise JobRefused("wrong-image", f"the script needs the image {declared.image}, but this worker runs in "
-            f"another image")
+            "another image")
     if landlock_version() == 0:
         raise JobRefused("no-confinement", "this worker cannot confine scripts: run the worker on Linux 5.13 or "
             "later with Landlock")
