@@ -20,7 +20,7 @@ def read_exceptions(path: Path = EXCEPTIONS) -> dict[str, dict[str, str]]:
 
 
 def apply_exceptions(rule: str, offences: Iterable[Offence], reasons: Mapping[str, str]) -> Iterator[Offence]:
-    """Yield the offences that have no reason, and a further offence for each reason that belongs to no offence.
+    """Yield the offences without an exception, and an offence for each exception that no offence needs.
 
     The keys of `reasons` are subjects, or patterns of them such as "marey_server.handlers.*".
     """

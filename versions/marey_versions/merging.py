@@ -102,7 +102,7 @@ def merge_entries(
     ----------
     ours, theirs : the entries that differ between the base and each side
     resolutions : decisions about conflicts. Each decides one conflict, or one part of a conflict. If several conflicts
-    have the same key, the first resolutions with this key decide the first of these conflicts, and so on
+        have the same key, the first resolutions with this key decide the first of these conflicts, and so on
     merge_parts : merges the parts that both sides have changed; None: such parts are in conflict
 
     Returns
@@ -291,8 +291,7 @@ def _collide(one: _Decided, held: dict[str, _Decided], choices: Choices) -> Merg
 
     `held` contains entries by key; one of them has the key that `one` should get. If a side has added the entry that
     does not get the key, this entry has no earlier path and is dropped. The result is a conflict if there is no
-    resolution, or if the earlier
-    path is taken.
+    resolution, or if the earlier path is taken.
     """
     key = one.result.key
     other = held[key]

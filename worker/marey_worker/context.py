@@ -120,7 +120,7 @@ class Context:
     def document(self, kind: Kind, item: str, revision: int, part: str, *, required: bool = True) -> Any:
         """Return a part of a revision, with arrays as numpy arrays.
 
-        If the part does not exist, raises `NoSuchThing`, or returns None if the part is not required.
+        If the part does not exist, returns None if `required` is false; otherwise raises `NoSuchThing`.
         """
         ((_, document),) = self._read_ahead([(None, PartPlace(kind=kind, item=item, revision=revision, part=part))])
         if document is None and required:
@@ -133,8 +133,8 @@ class Context:
     ) -> Iterator[tuple[PinnedInput, Any]]:
         """Yield each input with its part named `part`.
 
-        If the part does not exist, and it is not `required`, None is yielded in place of the part. While the caller
-        uses one input, the parts of the next inputs are read.
+        If the part does not exist, None is yielded in its place if `required` is false; otherwise, `NoSuchThing` is
+        raised. While the caller uses one input, the parts of the next inputs are read.
         """
         for pin, (document,) in self.documents_of_each(pins, part):
             if document is None and required:

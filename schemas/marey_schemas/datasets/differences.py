@@ -11,7 +11,7 @@ from marey_schemas.datasets.commits import Commit, Entry
 from marey_schemas.kinds import Kind
 
 ChangeKind = Literal["added", "removed", "moved", "changed"]
-"""Kind of change of an entry, or of a part of an entry, between two versions; only entries are moved."""
+"""Kind of change of an entry, or of a part of an entry, between two versions; parts are never moved by themselves."""
 
 
 class ListedCommit(Commit):

@@ -130,12 +130,12 @@ class Proposal(Answer):
     source: str = Field(description="Version whose changes are proposed, as the author named it.")
     target: str = Field(description="Branch that gets the changes.")
     head: str = Field(
-        description="Digest of the newest proposed commit; after the end of the proposal, of the commit that was the "
-        "newest at the end."
+        description="Digest of the newest proposed commit. After the end of the proposal: the commit that was the "
+            "newest at that time."
     )
     target_commit: str | None = Field(
-        description="Digest of the newest commit of the target; after the end of the proposal, of the commit that was "
-        "the newest just before the end."
+        description="Digest of the newest commit of the target branch. After the end of the proposal: the commit "
+            "that was the newest just before the end."
     )
     merged: str | None = Field(
         description="Digest of the commit that the merge made; null if the proposal is not merged."

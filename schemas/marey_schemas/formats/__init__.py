@@ -56,8 +56,8 @@ class FileFormat:
     media_type : media type of written files
     reads, writes : kinds of content that can be read from files of the format, and that can be written to them
     units : units of length in which files can be written; if there are several, the caller chooses one
-    begins : pattern that the beginning of a file matches only if the file has the format; None if only names identify
-    it
+    begins : pattern that the beginning of a file matches only if the file has the format; None if only its
+        name identifies a file of the format
     other_endings : endings that also identify the format of a named file, but are ignored in a search of a folder
     euler : whether rotations are Euler angles; an export keeps the rotation orders of the imported file
     archives : endings of files that are ZIP archives; the reader unpacks them

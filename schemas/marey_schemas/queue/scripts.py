@@ -189,9 +189,9 @@ class ScriptDeclaration(Request):
     argv: tuple[Annotated[str, StringConstraints(min_length=1, max_length=1000)], ...] = Field(
         min_length=1,
         max_length=MOST_WORDS,
-        description="Words of the command. The first is `python`, followed by a file of the commit, or is a program of "
-        "the commit such as `./measure`. A word `{parameter:name}`, `{input:name}` or `{output:name}` stands for a "
-        "value or the path of a file. No shell reads the words.",
+        description="Words of the command. The first word is `python`, followed by a file of the commit, or a "
+            "program of the commit, such as `./measure`. A word `{parameter:name}` is replaced by a value, a word "
+            "`{input:name}` or `{output:name}` by the path of a file. No shell interprets the words.",
     )
     parameters: dict[FieldName, ScriptParameter] = Field(default_factory=dict, max_length=MOST_DECLARED)
     inputs: dict[FieldName, ScriptInput] = Field(default_factory=dict, max_length=MOST_DECLARED)
