@@ -11,7 +11,7 @@ from marey_schemas.names import ProjectName, UserName
 from marey_schemas.sizes import DAY_S, LOGIN_DAYS, LONGEST_LOGIN_DAYS
 
 MOST_RUNNING = 1_000_000
-"""Greatest limit of running jobs that a project can have."""
+"""Greatest value of the limit of a project's running jobs."""
 
 
 class Role(StrEnum):
