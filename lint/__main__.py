@@ -55,8 +55,9 @@ def main() -> int:
     With `--shrink`, lower the counts in `wording.toml` to the present numbers instead.
     """
     parser = argparse.ArgumentParser(prog="python -m lint", description=__doc__)
-    parser.add_argument("--shrink", action="store_true", help="lower the counts in wording.toml to the present "
-        "numbers of offences")
+    parser.add_argument(
+        "--shrink", action="store_true", help="lower the counts in wording.toml to the present numbers of offences"
+    )
     house = read_house(ROOT)
     if parser.parse_args().shrink:
         shrink_baseline(wording.find(house), ROOT)

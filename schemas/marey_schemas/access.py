@@ -94,7 +94,7 @@ class User(Answer):
     last_seen_at: datetime | None = Field(
         None,
         description="Time when a token or an identity of the user was last used, to the hour. Uses of tokens that "
-            "were deleted later do not count. Null: there was no use, or the caller is not an administrator.",
+        "were deleted later do not count. Null: there was no use, or the caller is not an administrator.",
     )
     rev: int
 
@@ -129,8 +129,8 @@ class TokenCreate(Request):
     labels: dict[str, str] | None = Field(
         None,
         description="Labels that a worker with this token may announce, by name; only for tokens with the scope "
-            "`work`. Jobs that require other labels cannot be claimed with this token. Null: the labels of the token "
-            "that creates this token, or any labels if that token is not restricted to labels.",
+        "`work`. Jobs that require other labels cannot be claimed with this token. Null: the labels of the token "
+        "that creates this token, or any labels if that token is not restricted to labels.",
     )
 
 
@@ -140,7 +140,7 @@ class TokenRotation(Request):
     rotation_id: str = Field(
         pattern=r"^[A-Za-z0-9_-]{32,64}$",
         description="Random text, for example 32 hexadecimal digits. A repeated request with the same `rotation_id` "
-            "gets the same new token. Keep this text secret until you have the answer.",
+        "gets the same new token. Keep this text secret until you have the answer.",
     )
     grace_s: int = Field(
         3600,
@@ -219,7 +219,7 @@ class Project(Answer):
     most_running_jobs: int | None = Field(
         None,
         description="Greatest number of the project's jobs that may run at the same time, as set by an "
-            "administrator. Null: there is no limit, or the caller is not a member.",
+        "administrator. Null: there is no limit, or the caller is not a member.",
     )
     rev: int
 
@@ -247,7 +247,7 @@ class ProjectQuotaChange(QuotaChange):
         ge=0,
         le=MOST_RUNNING,
         description="Greatest number of the project's jobs that workers run at the same time; null: no limit. A "
-            "lower limit does not stop jobs that are running.",
+        "lower limit does not stop jobs that are running.",
     )
 
 
@@ -278,7 +278,7 @@ class ProjectQuotasInUse(QuotasInUse):
     running_jobs: RunningJobs | None = Field(
         None,
         description="Number of the project's jobs that workers run, and its limit. A job that is divided into tasks "
-            "does not count, but its tasks do. Null: the server is too old.",
+        "does not count, but its tasks do. Null: the server is too old.",
     )
 
 
@@ -312,7 +312,7 @@ class FolderRole(Answer):
 
     user: str = Field(
         description="The name of the member; `*` means all members without a role of their own in this folder, "
-            "except owners."
+        "except owners."
     )
     folder: str = Field(description="The path of the folder.")
     collection: str = Field(description="The id of the folder.")

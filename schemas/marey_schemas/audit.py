@@ -74,7 +74,7 @@ class AuditEntry(Answer):
     project: str | None = Field(description="Present name of the project; null: the entry concerns the whole server.")
     actor: str | None = Field(
         description="Name of the user who made the change, or `job:<id>` for a job; null: the server or a "
-            "participant of a study made it."
+        "participant of a study made it."
     )
     token: str | None = Field(None, description="Id of the token that the actor used; null: none, as in a sign-in.")
     about: str = Field(

@@ -30,8 +30,9 @@ class ConsentOverride(Request):
         description="Whether clips are exported although the consent of the performer has ended. Requires the role "
         "maintainer and a reason; an event records both.",
     )
-    consent_reason: ConsentReason | None = Field(None, description="Reason why clips are exported although the "
-        "consent of the performer has ended.")
+    consent_reason: ConsentReason | None = Field(
+        None, description="Reason why clips are exported although the consent of the performer has ended."
+    )
 
     @model_validator(mode="after")
     def _check_reason(self) -> Self:

@@ -55,8 +55,9 @@ class CoverageStreamCreate(Request):
         None, description="Skeleton of the poses that will be sent; not needed if only `roots` are sent."
     )
     evaluation: ItemId | None = Field(
-        None, description="Evaluation from which the stream takes its grid and its initial coverage. Absent: the "
-            "coverage is empty at first."
+        None,
+        description="Evaluation from which the stream takes its grid and its initial coverage. Absent: the "
+        "coverage is empty at first.",
     )
     speeds_m_s: tuple[Speed, ...] | None = Field(
         None,
@@ -107,8 +108,9 @@ class CoverageStreamCreate(Request):
 class CoverageFrames(Request):
     """Next frames of a performance, as arrays of dtype <f4 or <f8."""
 
-    offset: int = Field(ge=0, le=2**53, description="Number of frames that were sent before the frames of this "
-        "request.")
+    offset: int = Field(
+        ge=0, le=2**53, description="Number of frames that were sent before the frames of this request."
+    )
     poses: Annotated[NDArray[Any], ArrayOf(ndim=2)] | None = Field(
         None, description="[frames, 3 + 4*joints]: root translation (m), then local quaternions w,x,y,z."
     )
@@ -123,8 +125,9 @@ class CoverageFrames(Request):
         description="[frames, 3]: x and z of the torso on the ground (m), heading of the body (rad), not smoothed.",
     )
     ends_take: bool = Field(
-        False, description="Whether the take ends after these frames, because the performer pauses, or because "
-            "frames were lost."
+        False,
+        description="Whether the take ends after these frames, because the performer pauses, or because "
+        "frames were lost.",
     )
 
     @model_validator(mode="after")
@@ -195,8 +198,9 @@ class CoverageProgress(CoverageNow):
     """Coverage after the frames of a request, and the changes of the coverage by these frames."""
 
     offset: int = Field(description="Number of frames received so far.")
-    windows: int = Field(description="Number of one-second windows that these frames completed, regardless of their "
-        "cells.")
+    windows: int = Field(
+        description="Number of one-second windows that these frames completed, regardless of their cells."
+    )
     changed: tuple[CoverageCell, ...] = Field(description="Cells whose data increased.")
 
 
@@ -226,9 +230,7 @@ class CoverageStreamState(CoverageStream, CoverageNow):
     deficit_s: tuple[tuple[float, ...], ...] = Field(
         description="[speeds, turn rates]: seconds of data that each cell still needs."
     )
-    delay_s: float = Field(
-        description="Delay of the newest measured window behind the newest frame, in seconds."
-    )
+    delay_s: float = Field(description="Delay of the newest measured window behind the newest frame, in seconds.")
 
 
 # --- what a stream takes of an evaluation's document -----------------------------------------------------------------

@@ -44,8 +44,8 @@ class ImportEntry(Answer):
     name: str
     status: Literal["created", "unchanged", "failed", "companion"] = Field(
         description="created: the item was created, or a new revision of it if `revision` is greater than 1; "
-            "unchanged: the item has the same content already; failed: the file was refused; companion: the file was "
-            "read together with another file."
+        "unchanged: the item has the same content already; failed: the file was refused; companion: the file was "
+        "read together with another file."
     )
     item: str | None = None
     revision: int | None = None

@@ -157,8 +157,9 @@ class LineageEdge(Answer):
     item: str
     kind: Kind
     name: str = Field(description="Name of the item; empty if it was purged.")
-    purged: bool = Field(False, description="Whether the item was purged (deleted for good); only its place in the "
-        "lineage is left.")
+    purged: bool = Field(
+        False, description="Whether the item was purged (deleted for good); only its place in the lineage is left."
+    )
     revision: int
     job: str | None
     role: str = Field(description="Name of the job input for which the revision was used.")
@@ -249,5 +250,5 @@ class EventFeed(Page):
     items: tuple[Event, ...]
     more: bool = Field(
         description="Whether further events existed when this page was read; to read them, send the number of the "
-            "last event of this page as `after`."
+        "last event of this page as `after`."
     )

@@ -28,8 +28,9 @@ class LineageOptions(Options):
     """Options of a lineage graph: its direction and its depth."""
 
     direction: Literal["inputs", "results", "both"] = Field(
-        "both", description="`inputs`: the revisions from which the revision was made; `results`: the revisions that "
-        "were made from it; `both`: inputs and results."
+        "both",
+        description="`inputs`: the revisions from which the revision was made; `results`: the revisions that "
+        "were made from it; `both`: inputs and results.",
     )
     depth: int = Field(
         MOST_REVISIONS,
@@ -95,8 +96,9 @@ class LineageJob(Answer):
 class LineageGraph(Answer):
     """Graph of the sources of a revision, or of the results made from it, through any number of jobs."""
 
-    revisions: tuple[LineageRevision, ...] = Field(description="Revisions of the graph; the first is the revision "
-        "from which the graph starts.")
+    revisions: tuple[LineageRevision, ...] = Field(
+        description="Revisions of the graph; the first is the revision from which the graph starts."
+    )
     links: tuple[LineageLink, ...]
     jobs: tuple[LineageJob, ...]
     complete: bool = Field(description="False if the graph was cut off, because it has too many revisions or links.")

@@ -30,8 +30,9 @@ class PurgeRequest(Request):
         None, max_length=1300, description="Path, made of folder and name, that deleted items had."
     )
     collection: CollectionPath | None = Field(
-        None, description="Folder whose deleted items are purged, including those in folders below it; empty: the "
-            "deleted items of the whole project."
+        None,
+        description="Folder whose deleted items are purged, including those in folders below it; empty: the "
+        "deleted items of the whole project.",
     )
     kind: Kind | None = Field(None, description="Kind of the items; absent: all kinds.")
     query: str | None = Field(
@@ -48,8 +49,9 @@ class PurgeRequest(Request):
     @model_validator(mode="after")
     def _names_items(self) -> Self:
         if self.item is None and self.path is None and self.collection is None and self.query is None:
-            raise ValueError("give an item, a path, a collection or a query; an empty collection means the whole "
-                "project")
+            raise ValueError(
+                "give an item, a path, a collection or a query; an empty collection means the whole project"
+            )
         return self
 
 
@@ -94,7 +96,7 @@ class PurgedItem(Answer):
     kind: Kind
     path: str = Field(
         description="Folder and name of the item, in a preview. Empty in the answer to a purge, because this answer "
-            "is stored for repetitions of the request, and the name must not be stored."
+        "is stored for repetitions of the request, and the name must not be stored."
     )
 
 
@@ -131,7 +133,7 @@ class DatasetPurgeRequest(Request):
         min_length=1,
         max_length=64,
         description="Id or name of a deleted dataset. If several deleted datasets have this name, the dataset that "
-            "was deleted last is purged.",
+        "was deleted last is purged.",
     )
     preview: bool = Field(False, description="Report what the purge would do, but change nothing.")
 
@@ -146,7 +148,7 @@ class DatasetPurgeAnswer(Answer):
     proposals: int = Field(description="Number of proposals of the dataset.")
     holders: tuple[Annotated[ItemHolder | JobHolder, Field(discriminator="type")], ...] = Field(
         description=f"Objects that refer to a version of the dataset and so prevent the purge, at most "
-            f"{MOST_HOLDERS}: items that "
+        f"{MOST_HOLDERS}: items that "
         "jobs made from a version, and jobs that have not ended."
     )
     others: int = Field(0, description="Number of further holders that are not listed.")

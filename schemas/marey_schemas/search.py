@@ -68,7 +68,7 @@ class SearchRequest(RefineOptions):
         ge=1,
         le=4,
         description="Number of passes. The first pass searches the samples of the tree; each further pass searches "
-            "near the best samples so far.",
+        "near the best samples so far.",
     )
     refine: bool = Field(True, description="Improve the result of the tree by numerical optimisation.")
     transition_tolerance_m: Distance = Field(

@@ -42,8 +42,8 @@ class BrowserSignInCreate(Request):
         ge=1024,
         le=65535,
         description="Port on which the program waits for the code, on the machine of the browser: the server "
-            "redirects the browser to http://127.0.0.1:<port>/. Null: the browser shows the code, and the person "
-            "copies it into the program.",
+        "redirects the browser to http://127.0.0.1:<port>/. Null: the browser shows the code, and the person "
+        "copies it into the program.",
     )
     expires_in_s: LoginSeconds = Field(
         LOGIN_DAYS * DAY_S, description="Seconds for which the new token is valid; the server may allow fewer."

@@ -251,8 +251,7 @@ def to_png(figure: Figure) -> bytes:
 
 
 def to_svg(figure: Figure, title: str) -> str:
-    """Return the figure as SVG, with text as text, not outlines; the same version of matplotlib gives the same bytes.
-    """
+    """Return the figure as SVG, with text, not outlines; the same version of matplotlib gives the same bytes."""
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     with _svg_settings():

@@ -37,7 +37,7 @@ class CheckoutRequest(Request):
     query: Annotated[str, StringConstraints(min_length=1, max_length=MOST_CHARACTERS)] | None = Field(
         None,
         description="Query that selects entries, as in lists of items. The fields `path`, `folder`, `name` and `tag` "
-            "refer to the entry in the folder of the dataset, all other fields to the content of the entry.",
+        "refer to the entry in the folder of the dataset, all other fields to the content of the entry.",
     )
     paths: Annotated[tuple[EntryPath, ...], AfterValidator(_not_too_long)] = Field(
         (), max_length=MOST_PATHS, description="Entries, or folders whose entries are selected; empty: all entries."
@@ -57,8 +57,11 @@ class CheckoutAnswer(Answer):
     taken: int | None = Field(
         None, description="Number of entries that the folder has now. Null: the server is too old."
     )
-    entries: int | None = Field(None, description="Number of entries of the whole version, including those that were "
-        "not selected. Null: the server is too old.")
+    entries: int | None = Field(
+        None,
+        description="Number of entries of the whole version, including those that were "
+        "not selected. Null: the server is too old.",
+    )
     added: int
     removed: int
     moved: int

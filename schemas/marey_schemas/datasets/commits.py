@@ -105,8 +105,9 @@ class Entry(Answer):
 
     path: str
     kind: Kind
-    parts: dict[str, str] = Field(description="Content digest of each part. Equal parts have the same digest on "
-        "every server.")
+    parts: dict[str, str] = Field(
+        description="Content digest of each part. Equal parts have the same digest on every server."
+    )
     tags: tuple[str, ...]
     item: str | None = Field(description="Item of this project that has a revision with this content.")
     revision: int | None
@@ -119,7 +120,7 @@ class Origin(Answer):
     path: str = Field(description="Path of the entry in that commit; a later commit may have moved the entry.")
     certain: bool = Field(
         description="Whether this commit is known to have made the change; false: this commit or an earlier one made "
-            "the change."
+        "the change."
     )
 
 

@@ -98,7 +98,7 @@ class ReceivedRevision(Request):
         default_factory=dict,
         max_length=MOST_RECEIVED_FACETS,
         description="Numbers that jobs have published about the revision. They are added to all revisions with this "
-            "content, but do not replace numbers that the project already has.",
+        "content, but do not replace numbers that the project already has.",
     )
 
 

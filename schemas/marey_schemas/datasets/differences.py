@@ -59,7 +59,7 @@ class DatasetDifference(Answer):
     folders: dict[str, dict[ChangeKind, int]] = Field(
         default_factory=dict,
         description="Number of differing entries directly in each folder, by kind of change. A removed entry counts "
-            "in the folder that contained it. The limit of the list of entries also limits the number of folders.",
+        "in the folder that contained it. The limit of the list of entries also limits the number of folders.",
     )
     entries: tuple[EntryDifference, ...]
     complete: bool = Field(description="Whether all differing entries are listed and counted.")

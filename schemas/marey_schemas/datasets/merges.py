@@ -47,8 +47,8 @@ class Resolution(Request):
     part: PartName | None = Field(
         None,
         description="Part of the conflict that this resolution decides, such as `motion`, `path` or `tags`; null: "
-            "all parts. A part that was computed from another part, such as the sample tree from the model, is "
-            "decided together with the other part.",
+        "all parts. A part that was computed from another part, such as the sample tree from the model, is "
+        "decided together with the other part.",
     )
 
 
@@ -82,7 +82,7 @@ class PickRequest(CombineRequest):
     parent: Literal[1, 2] | None = Field(
         None,
         description="Number of the parent with which the commit is compared to find its changes; required if the "
-            "commit is a merge. 1: the newest commit of the branch before the merge; 2: the version that was merged.",
+        "commit is a merge. 1: the newest commit of the branch before the merge; 2: the version that was merged.",
     )
 
 
@@ -123,8 +123,9 @@ class EntryConflict(Answer):
         "applied; empty for other conflicts.",
     )
     segments: ConflictingSegments | None = Field(
-        None, description="Segments of an annotation that exclude each other; null if the conflict does not concern "
-            "segments."
+        None,
+        description="Segments of an annotation that exclude each other; null if the conflict does not concern "
+        "segments.",
     )
 
 
@@ -136,7 +137,7 @@ class MergeAnswer(Answer):
     )
     base: str | None = Field(
         description="Digest of the base, the commit with which both sides are compared; null if the sides have no "
-            "common commit."
+        "common commit."
     )
     ours: str = Field(description="Digest of the newest commit of the branch.")
     theirs: str | None = Field(

@@ -50,8 +50,9 @@ class Dataset(Answer):
     id: str
     name: str
     description: str
-    collection: str | None = Field(description="Folder whose content the commits record; null: commits list their "
-        "changes explicitly.")
+    collection: str | None = Field(
+        description="Folder whose content the commits record; null: commits list their changes explicitly."
+    )
     checked_out: CheckedOut | None = Field(
         None, description="Version in the folder; null if no version was committed or checked out there."
     )

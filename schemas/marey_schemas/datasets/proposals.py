@@ -81,8 +81,9 @@ class CheckReport(Request):
     name: CheckName
     state: CheckState
     commit: Version | None = Field(
-        None, description="Commit that was checked; null: the newest one. A report on any other commit than the "
-            "newest is refused."
+        None,
+        description="Commit that was checked; null: the newest one. A report on any other commit than the "
+        "newest is refused.",
     )
     job: ItemId | None = Field(
         None,
@@ -131,11 +132,11 @@ class Proposal(Answer):
     target: str = Field(description="Branch that gets the changes.")
     head: str = Field(
         description="Digest of the newest proposed commit. After the end of the proposal: the commit that was the "
-            "newest at that time."
+        "newest at that time."
     )
     target_commit: str | None = Field(
         description="Digest of the newest commit of the target branch. After the end of the proposal: the commit "
-            "that was the newest just before the end."
+        "that was the newest just before the end."
     )
     merged: str | None = Field(
         description="Digest of the commit that the merge made; null if the proposal is not merged."
@@ -172,8 +173,10 @@ class Review(Answer):
     verdict: Verdict
     text: str
     commit: str = Field(description="Digest of the commit that was reviewed.")
-    stale: bool = Field(description="Whether the proposal has a later commit than the reviewed one; if so, an "
-        "approval in this review does not count.")
+    stale: bool = Field(
+        description="Whether the proposal has a later commit than the reviewed one; if so, an "
+        "approval in this review does not count."
+    )
     at: datetime
 
 
@@ -205,7 +208,7 @@ class Mergeability(Answer):
     )
     changes: int | None = Field(
         description="Number of entries that the merge would change. Null: the number was not computed, because a "
-            "side has changed too many entries, or because the merge is impossible."
+        "side has changed too many entries, or because the merge is impossible."
     )
     conflict_count: int | None = Field(description="Number of conflicts; null: it was not computed.")
     conflicts: tuple[EntryConflict, ...] = Field(description="The first conflicts, by path.")

@@ -26,7 +26,7 @@ class ProtectionRule(Request):
     direct_commits: bool = Field(
         False,
         description="Whether commits and merges without a proposal are allowed; cannot be combined with `approvals`, "
-            "`checks` or `up_to_date`.",
+        "`checks` or `up_to_date`.",
     )
     approvals: int = Field(
         0, ge=0, le=MOST_REQUIRED, description="Number of users, other than the author, who must approve a proposal."

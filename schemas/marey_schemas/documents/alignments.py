@@ -36,8 +36,9 @@ class AlignedPlacement(Request):
     x: Metres = 0.0
     y: Metres = Field(0.0, allow_inf_nan=False, description="Height that was subtracted from the clip, in metres.")
     z: Metres = 0.0
-    joint: JointName | None = Field(None, description="The joint whose position `x`, `y` and `z` state; default: the "
-        "root.")
+    joint: JointName | None = Field(
+        None, description="The joint whose position `x`, `y` and `z` state; default: the root."
+    )
 
 
 class PredecessorAlignedOrigin(Request):
@@ -68,10 +69,13 @@ class AlignmentInfo(Request):
     reference: ExampleRef | None = Field(
         None,
         description="The reference example. Its time is the canonical time, to which the time of all other examples "
-            "is mapped.",
+        "is mapped.",
     )
-    set: Digest | None = Field(None, description="Digest of the options and of all clips that were aligned together; "
-        "it identifies the set of examples.")
+    set: Digest | None = Field(
+        None,
+        description="Digest of the options and of all clips that were aligned together; "
+        "it identifies the set of examples.",
+    )
     frame_rate_hz: float = Field(
         gt=0, allow_inf_nan=False, description="Rate of the canonical frames and of `source_frames`, in hertz."
     )
@@ -88,11 +92,12 @@ class AlignmentInfo(Request):
         ge=0,
         allow_inf_nan=False,
         description="Mean cost of the alignment per frame, in square metres; without a unit if the cost is a "
-            "perceptual metric.",
+        "perceptual metric.",
     )
     metric: MetricIdentity | None = Field(
-        None, description="Perceptual metric whose distance of poses was the cost of the alignment. Costs under "
-            "different metrics are not comparable."
+        None,
+        description="Perceptual metric whose distance of poses was the cost of the alignment. Costs under "
+        "different metrics are not comparable.",
     )
     options: AlignParams | None = Field(None, description="Options of the alignment; absent if unknown.")
     predecessor: PredecessorAlignedOrigin | None = None

@@ -102,7 +102,7 @@ class ClipSource(Request):
     content: Digest | None = Field(
         None,
         description="Content digest of the part `motion` as it was read from a file of Marey's predecessor; absent "
-            "for files in other formats, and if the import changed the motion.",
+        "for files in other formats, and if the import changed the motion.",
     )
     format: str | None = None
     details: dict[str, Any] = Field(

@@ -49,12 +49,13 @@ class DifferenceRequest(DifferenceOptions):
         ge=1,
         lt=2**31,
         description="Revision before the change. Absent: the revision before `to`, or the newest revision if "
-            "`to_item` is given.",
+        "`to_item` is given.",
     )
     to: int | None = Field(None, ge=1, lt=2**31, description="Revision after the change. Absent: the newest.")
     to_item: str | None = Field(
-        None, max_length=64, description="Id of another item of the same kind in the project. If given, `to` is a "
-            "revision of this item."
+        None,
+        max_length=64,
+        description="Id of another item of the same kind in the project. If given, `to` is a revision of this item.",
     )
     plot: bool = Field(False, description="Include the values that a drawing of the difference needs.")
 
@@ -114,7 +115,7 @@ class PathChange(Exceeding):
     moved: PathMove | None = Field(
         None,
         description="Movement of the whole path, if a movement explains at least nine tenths of the change; "
-            "otherwise absent. The turn of this movement is not reported among the changes of the root's rotation.",
+        "otherwise absent. The turn of this movement is not reported among the changes of the root's rotation.",
     )
 
 
@@ -154,7 +155,7 @@ class MotionDifference(Answer):
     frames_per_frame: float = Field(
         1.0,
         description="Number of frames in the revision `after` that correspond to one matched frame in `before`; 1 "
-            "unless the motion was resampled.",
+        "unless the motion was resampled.",
     )
     duration_ratio: float = Field(
         1.0,
@@ -166,12 +167,12 @@ class MotionDifference(Answer):
     translations: tuple[JointChange, ...] = Field(
         (),
         description="Changed translations in centimetres, largest first, of all joints except the joint whose path "
-            "is compared.",
+        "is compared.",
     )
     translated_joints: tuple[tuple[str, ...], tuple[str, ...]] = Field(
         ((), ()),
         description="Joints, other than the root, whose translations are stored: the joints in `before`, and the "
-            "joints in `after`.",
+        "joints in `after`.",
     )
 
 
@@ -220,8 +221,8 @@ class ModelDifference(Answer):
     examples_added: tuple[str, ...] = ()
     examples_removed: tuple[str, ...] = ()
     mean_log_likelihood: tuple[float | None, float | None] = Field(
-        (None, None), description="Mean log-likelihood of the training examples under each model; null if it is not "
-            "stored."
+        (None, None),
+        description="Mean log-likelihood of the training examples under each model; null if it is not stored.",
     )
 
 
@@ -242,7 +243,7 @@ class DifferencePlot(Answer):
     frame_rate_hz: float = Field(description="Frame rate of the revision `after`.")
     frames: tuple[int, ...] = Field(
         description="First frame of each row of `rotation_deg`; the last element is the frame after the end of the "
-            "last row."
+        "last row."
     )
     rotation_deg: MatchedFloats = Field(
         description="[rows, joints]: largest change of rotation within the row's frames, in degrees; -1: no frame is "

@@ -91,14 +91,14 @@ class MetricComponent(Request):
     measurement: Measurement
     shaping: Shaping = Field(
         description="The function F of x, the difference of a joint class. euclid: x²; manhattan: x; sigmoid: x / (x "
-            "+ 1); power: x^exponent."
+        "+ 1); power: x^exponent."
     )
     exponent: float = Field(1.0, gt=0, le=10, allow_inf_nan=False, description="Exponent of the shaping `power`.")
     constant: _Amount = Field(description="The constant c, which is added to the distance of poses that differ.")
     norm: _Amount = Field(description="The factor N, by which the weighted mean of F is multiplied.")
     weights: dict[JointClass, _Amount] = Field(
-        min_length=1, description="Weight of each joint class. The weights can have any sum, because they are "
-            "divided by their sum."
+        min_length=1,
+        description="Weight of each joint class. The weights can have any sum, because they are divided by their sum.",
     )
     share: _Share = Field(description="Share of the component in the metric; the shares have the sum 1.")
     intervals: dict[JointClass, tuple[_Number, _Number]] = Field(
@@ -127,12 +127,13 @@ class MetricFit(Request):
     r2: _Number | None = Field(None, description="Share of the variance that the fit explains.")
     spearman: _Number | None = Field(None, description="Rank correlation of fitted and perceived differences.")
     noise_ceiling: _Amount | None = Field(
-        None, description="Standard error of the perceived differences. A fit with a smaller error than this "
-            "describes noise."
+        None,
+        description="Standard error of the perceived differences. A fit with a smaller error than this "
+        "describes noise.",
     )
     left_out_rmse: _Amount | None = Field(
-        None, description="Root mean square error of the fit for motions that were left out of it, one motion at a "
-            "time."
+        None,
+        description="Root mean square error of the fit for motions that were left out of it, one motion at a time.",
     )
 
 
@@ -156,8 +157,9 @@ class MetricDocument(Request):
         "log_norm: norm of the logarithm of the rotation, equal to half_angle.",
     )
     side_reduce: Literal["mean", "sum"] = Field(
-        "mean", description="Whether the difference of a joint class is the mean or the sum of the differences of "
-        "the left and right joints."
+        "mean",
+        description="Whether the difference of a joint class is the mean or the sum of the differences of "
+        "the left and right joints.",
     )
     identity: Literal["zero", "constant"] = Field(
         "zero", description="Distance of equal poses. zero: 0; constant: c, the constant that each component adds."
@@ -165,18 +167,20 @@ class MetricDocument(Request):
     root_alignment: Literal["mean_heading", "kovar2d"] = Field(
         "mean_heading",
         description="Method by which position and heading are removed. mean_heading: the hips are moved to the "
-            "origin, and the mean heading of one second is removed; kovar2d: the two poses of each pair are "
-            "superposed.",
+        "origin, and the mean heading of one second is removed; kovar2d: the two poses of each pair are "
+        "superposed.",
     )
     length_unit_m: _Positive = Field(1.0, description="Metres in one unit of length.")
-    velocity_interval_s: _Positive = Field(1.0 / 30.0, description="Seconds in one unit of time: velocities are "
-        "displacements within this time.")
+    velocity_interval_s: _Positive = Field(
+        1.0 / 30.0, description="Seconds in one unit of time: velocities are displacements within this time."
+    )
     frame_rate_hz: float = Field(
         METRIC_RATE_HZ, ge=1, le=1000, allow_inf_nan=False, description="Frame rate at which clips are measured."
     )
     code_version: str = Field(METRIC_CODE, max_length=64, description="Version of the computation of distances.")
-    fit: MetricFit | None = Field(None, description="Agreement with the judgements; null if the metric was not "
-        "fitted to judgements.")
+    fit: MetricFit | None = Field(
+        None, description="Agreement with the judgements; null if the metric was not fitted to judgements."
+    )
     notes: tuple[Annotated[str, Field(max_length=1000)], ...] = Field(
         (), max_length=32, description="Remarks that people should know before they use the metric."
     )

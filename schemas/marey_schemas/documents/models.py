@@ -36,7 +36,7 @@ class FunctionalComponentsDocument(Request):
     directions: Stack = Field(description="[k, n, D] change of the coefficients per unit of each score.")
     projections: Stack = Field(
         description="[k, n, D]: each score is the inner product of one matrix [n, D] with the coefficients after "
-            "subtraction of their mean."
+        "subtraction of their mean."
     )
     variances: Vector = Field(description="[k] variances of the examples' scores.")
     energy: Vector = Field(description="[k] share of the variance that the first 1, 2, ... components explain.")

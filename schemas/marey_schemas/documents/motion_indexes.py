@@ -25,8 +25,9 @@ class IndexShard(Request):
     poses: StoredFile = Field(description="Features of the poses of these clips.")
     rows: int = Field(ge=1, description="Number of poses.")
     dropped: tuple[_Number, ...] = Field(
-        (), max_length=100_000, description="Positions, in the list of clips, of the clips that no longer belong to "
-            "the index."
+        (),
+        max_length=100_000,
+        description="Positions, in the list of clips, of the clips that no longer belong to the index.",
     )
 
 

@@ -35,7 +35,7 @@ class PredecessorRecord(Request):
         default_factory=dict,
         max_length=MOST_SHOWN,
         description="Values by their JSON Pointers in the document. Credentials are hidden, and long texts are cut "
-            "off.",
+        "off.",
     )
     fields_left_out: int = Field(0, ge=0, description="Number of further values, which are only in the file.")
     original: StoredOriginal = Field(description="The imported file.")

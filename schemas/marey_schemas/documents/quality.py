@@ -155,8 +155,9 @@ class QualityConditions(Request):
         "detected", description="Origin of the contact labels: detected by speed, or annotations of the clips."
     )
     grouping: Literal["take"] = Field(
-        "take", description="Unit that is drawn at random to compute intervals. take: the clips of a take together; "
-        "a clip without a recorded take counts as a separate take."
+        "take",
+        description="Unit that is drawn at random to compute intervals. take: the clips of a take together; "
+        "a clip without a recorded take counts as a separate take.",
     )
     draws: int = Field(ge=0, description="Number of draws for intervals.")
     seed: int = Field(ge=0, description="Seed of the draws.")
@@ -168,8 +169,9 @@ class QualityRow(Request):
     item: str
     revision: int
     name: str = Field(description="Path of the clip.")
-    take: str = Field(description="Take of the clip. Clips of the same take are drawn together when intervals are "
-        "computed.")
+    take: str = Field(
+        description="Take of the clip. Clips of the same take are drawn together when intervals are computed."
+    )
     seconds: _Finite
     frames: int = Field(description="Number of measured frames.")
     frame_rate_hz: _Finite = Field(description="Frame rate of the clip before it was resampled.")
@@ -195,10 +197,12 @@ class MeasuredSet(Request):
 
     clips: tuple[QualityRow, ...]
     totals: dict[str, QualityTotal]
-    speed_seconds: tuple[_Finite, ...] = Field(description="Number of windows of one second in each bin of "
-        "`speed_edges_m_s`.")
-    turn_seconds: tuple[_Finite, ...] = Field(description="Number of windows of one second in each bin of "
-        "`turn_edges_deg_s`.")
+    speed_seconds: tuple[_Finite, ...] = Field(
+        description="Number of windows of one second in each bin of `speed_edges_m_s`."
+    )
+    turn_seconds: tuple[_Finite, ...] = Field(
+        description="Number of windows of one second in each bin of `turn_edges_deg_s`."
+    )
 
 
 class QualityChange(Request):
@@ -219,8 +223,9 @@ class QualityDocument(Request):
     speed_edges_m_s: tuple[float, ...] = SPEED_EDGES_M_S
     turn_edges_deg_s: tuple[float, ...] = TURN_EDGES_DEG_S
     measured: MeasuredSet
-    reference: MeasuredSet | None = Field(None, description="Measurements of the reference clips (ground truth); "
-        "null if no reference was given.")
+    reference: MeasuredSet | None = Field(
+        None, description="Measurements of the reference clips (ground truth); null if no reference was given."
+    )
     changes: dict[str, QualityChange] = Field(
         default_factory=dict, description="Total of the clips minus the total of the reference, by measure."
     )

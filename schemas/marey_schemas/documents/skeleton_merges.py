@@ -26,7 +26,7 @@ class SkeletonMergeRequest(Request):
     kept: ItemId | None = Field(
         None,
         description="Id of the skeleton that remains. Absent: for each rig, the skeleton with a joint mapping made "
-            "by hand, or else the skeleton that most items use.",
+        "by hand, or else the skeleton that most items use.",
     )
     dry_run: bool = Field(False, description="Show what would be merged, and change nothing.")
 

@@ -129,8 +129,9 @@ class AnnotationImport(Request):
     """
 
     document: dict[str, Any] | None = Field(
-        None, description="Document in the form in which the predecessor stores or exports it. Give either "
-            "`document` or `file`."
+        None,
+        description="Document in the form in which the predecessor stores or exports it. Give either "
+        "`document` or `file`.",
     )
     file: ImportFile | None = Field(
         None, description="File with the document, as JSON, BSON or compressed BSON; the server already has its bytes."
@@ -148,7 +149,7 @@ class AnnotationImport(Request):
         None,
         max_length=1000,
         description="Labels to import; absent: all labels. Labels whose segments overlap must be imported into "
-            "separate layers.",
+        "separate layers.",
     )
     message: Message = ""
 

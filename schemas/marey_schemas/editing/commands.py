@@ -124,8 +124,8 @@ class Concatenate(NamedCommand):
     blend_s: Seconds = Field(0.3, description="Duration of the blend in seconds; 0: a hard cut.")
     keep_feet: bool = Field(
         True,
-        description="Keep a foot in place if it stands before and after the seam, and keep all feet above their "
-            "floors. false: only rotations and the path of the root are blended.",
+        description="Keep a foot in place if it is in contact before and after the seam, and keep all feet above their "
+        "floors. false: only rotations and the path of the root are blended.",
     )
 
 
@@ -338,7 +338,7 @@ class Smooth(NamedCommand):
         le=60,
         allow_inf_nan=False,
         description="Width of the filter, in seconds: each frame becomes a weighted mean of the frames within this "
-            "width.",
+        "width.",
     )
     order: int = Field(3, ge=0, le=9, description="Degree of the polynomials of the filter savitzky_golay.")
     joints: Joints | None = Field(None, description="Joints to smooth; absent: all.")
@@ -346,7 +346,7 @@ class Smooth(NamedCommand):
     keep_feet: bool = Field(
         True,
         description="Smooth the paths of the feet separately, so that contacts are kept and no foot sinks into its "
-            "floor. false: the positions of the feet follow from the smoothed rotations.",
+        "floor. false: the positions of the feet follow from the smoothed rotations.",
     )
     frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
     border_s: Seconds = Field(
@@ -360,8 +360,9 @@ class RotateJoint(NamedCommand):
     examples: ClassVar[Examples] = ({"joint": "LeftArm", "angle_deg": 20.0, "axis": [0.0, 1.0, 0.0], "space": "world"},)
     command: Literal["rotate_joint"] = "rotate_joint"
     joint: JointName = Field(description="Name of the joint.")
-    angle_deg: Degrees = Field(description="Angle of the rotation, in degrees; smaller in the frames in which the "
-        "change is blended in or out.")
+    angle_deg: Degrees = Field(
+        description="Angle of the rotation, in degrees; smaller in the frames in which the change is blended in or out."
+    )
     axis: Axis = Field(description="Direction of the rotation axis.")
     space: Literal["joint", "parent", "world"] = Field(
         "joint", description="Frame of reference of `axis`: the joint's own, its parent's, or the world's."

@@ -134,8 +134,8 @@ class HingeLimit(_Limit):
     joint: JointName
     angle_deg: AngleRange = Field(
         description="Least and greatest angle in degrees. For knees and elbows, the angle is the bend: 0 in a "
-            "straight limb, positive in the natural direction on every skeleton. For other joints, it is the angle "
-            "from the rest pose."
+        "straight limb, positive in the natural direction on every skeleton. For other joints, it is the angle "
+        "from the rest pose."
     )
 
 
@@ -205,8 +205,8 @@ class PlantOptions(Options):
     blend_s: Seconds = Field(
         0.15,
         description="Seconds before and after a contact in which the motion of the foot is blended. If a leg is too "
-            "short, the body is also lowered a little, beginning up to three times this time before the contact, and "
-            "ending up to three times this time after it.",
+        "short, the body is also lowered a little, beginning up to three times this time before the contact, and "
+        "ending up to three times this time after it.",
     )
     knee_damping_deg: float = Field(
         10.0,

@@ -31,8 +31,9 @@ class EditPreviewRequest(Request):
     )
     piece: int = Field(0, ge=0, lt=10_000, description="Index of the result to return, if the commands split the clip.")
     fields: tuple[Literal["motion", "positions", "findings"], ...] = Field(
-        ("motion", "findings"), max_length=3, description="Content of the answer, in addition to the numbers of "
-            "clips and frames."
+        ("motion", "findings"),
+        max_length=3,
+        description="Content of the answer, in addition to the numbers of clips and frames.",
     )
 
     @model_validator(mode="after")

@@ -107,8 +107,9 @@ class ArrayDifference:
         """
         spec = ArraySpec(self.dtype, self.shape)
         if spec != ArraySpec(base.dtype, base.shape) or not spec.shape:
-            raise ArrayError("bad-array", f"the array difference describes an array {spec}, but its base has another "
-                "dtype or shape")
+            raise ArrayError(
+                "bad-array", f"the array difference describes an array {spec}, but its base has another dtype or shape"
+            )
         frames, difference = self._checked(spec)
         dtype = np.dtype(spec.dtype)
 
@@ -122,8 +123,9 @@ class ArrayDifference:
         leaf = {"dtype": spec.dtype, "shape": spec.shape, "encoding": "blocks", "data": data}
         array = array_from_leaf(leaf)
         if array_digest(array) != self.digest:
-            raise ArrayError("bad-array", "the array that results from base and difference does not have the digest "
-                "that was sent")
+            raise ArrayError(
+                "bad-array", "the array that results from base and difference does not have the digest that was sent"
+            )
         return with_blocks(leaf, array)
 
     def _checked(self, spec: ArraySpec) -> tuple[NDArray[np.intp], NDArray[Any]]:

@@ -65,7 +65,7 @@ class AlignOptions(CostOptions):
         ge=0,
         le=60,
         description="Greatest number of consecutive steps of the path that advance only one of the two clips. With "
-            "the limit n, a frame is matched with at most n + 1 frames. null: no limit.",
+        "the limit n, a frame is matched with at most n + 1 frames. null: no limit.",
     )
     weights: dict[JointName, _Weight] = Field(
         default_factory=dict,

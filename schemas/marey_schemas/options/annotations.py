@@ -125,8 +125,9 @@ class WristContactProposal(_Proposal):
         description="Share of the farthest distance from rest at which a hand has arrived.",
     )
     release: bool = Field(
-        False, description="Also add a keyframe `release` at the last frame in which the hand is still far from its "
-            "rest position."
+        False,
+        description="Also add a keyframe `release` at the last frame in which the hand is still far from its "
+        "rest position.",
     )
 
 

@@ -20,8 +20,8 @@ class MotionFileOptions(Options):
     fold_positions: bool = Field(
         False,
         description="In BVH files, write positions only for the root, for programs that ignore positions of other "
-            "joints. The path of the joint that carries the body is transferred to the root, and other joints get "
-            "their median offsets.",
+        "joints. The path of the joint that carries the body is transferred to the root, and other joints get "
+        "their median offsets.",
     )
 
     @model_validator(mode="after")

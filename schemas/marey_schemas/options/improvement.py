@@ -25,7 +25,7 @@ class ObjectiveOptions(Options):
     seconds: _Price = Field(
         0.0001,
         description="Metres that each second of data adds to the objective. A clip is removed if it lowers the other "
-            "terms by less than its duration adds.",
+        "terms by less than its duration adds.",
     )
 
 
@@ -45,15 +45,15 @@ class ConfirmedEffects(ObjectiveChoice):
         ge=1,
         le=64,
         description="Number of replicates of each trial in which effects are estimated, in order to choose among "
-            "them. They are numbered from 0, like the replicates of the evaluation. Confirmations use replicates "
-            "with higher numbers than both.",
+        "them. They are numbered from 0, like the replicates of the evaluation. Confirmations use replicates "
+        "with higher numbers than both.",
     )
     confirmation_replicates: int = Field(
         8,
         ge=0,
         le=64,
         description="Number of further replicates in which the chosen effects are measured again; these measurements "
-            f"are reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed. With "
+        f"are reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed. With "
         f"{LEAST_REPLICATES} to 6, an optimisation confirms no step whose effect is equal in all replicates, unless "
         "the step changes no trial.",
     )
@@ -62,7 +62,7 @@ class ConfirmedEffects(ObjectiveChoice):
         ge=0,
         lt=2**63,
         description="Seed of the replicates for confirmation. With another seed, the same choices are confirmed in "
-            "different replicates.",
+        "different replicates.",
     )
 
     @field_validator("confirmation_replicates")
@@ -90,14 +90,14 @@ class SuggestionOptions(ConfirmedEffects):
         ge=0,
         le=100,
         description="Number of suggested additions whose effect on the trials is simulated, in their order. Each "
-            "simulation takes as long as an evaluation with `confirmation_replicates`.",
+        "simulation takes as long as an evaluation with `confirmation_replicates`.",
     )
     consider: int | None = Field(
         50,
         ge=0,
         le=100_000,
         description="Number of clips whose removal is tried, one clip at a time, beginning with the clips that the "
-            "fewest trials use; null: all clips.",
+        "fewest trials use; null: all clips.",
     )
     duplicate_cm: float = Field(
         3.0,
@@ -138,7 +138,7 @@ class OptimisationOptions(ConfirmedEffects):
         le=1000,
         allow_inf_nan=False,
         description="Least decrease of the objective that a step must achieve, in metres. The value 0 is enough to "
-            "exclude effects of chance, because every step must also be confirmed.",
+        "exclude effects of chance, because every step must also be confirmed.",
     )
     max_steps: int = Field(50, ge=1, le=10_000, description="Greatest number of steps.")
     max_evaluations: int | None = Field(

@@ -42,8 +42,9 @@ class DatabaseOptions(Options):
     """Options of the conversion of clips to a database for motion matching."""
 
     mirroring: Mirroring = Field(
-        "none", description="Mirrored copies of the clips. none: the clips alone; add: every clip and its mirrored "
-        "copy; only: the mirrored copies alone."
+        "none",
+        description="Mirrored copies of the clips. none: the clips alone; add: every clip and its mirrored "
+        "copy; only: the mirrored copies alone.",
     )
     end_policy: EndPolicy = Field(
         "clamp",

@@ -25,9 +25,9 @@ class RetargetOptions(Options):
     hands_from: HandsFrom = Field(
         "shoulders",
         description="Centre and factor by which keep_hands scales the positions of the hands. shoulders: from the "
-            "middle of the shoulders, by the ratio of the arm lengths or less, so that all positions are within "
-            "reach; world: from the origin, by the scale of the root's path, for hands on objects or on the floor. "
-            "An arm that is too short is stretched.",
+        "middle of the shoulders, by the ratio of the arm lengths or less, so that all positions are within "
+        "reach; world: from the origin, by the scale of the root's path, for hands on objects or on the floor. "
+        "An arm that is too short is stretched.",
     )
 
     @model_validator(mode="after")

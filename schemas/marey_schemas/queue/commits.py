@@ -32,14 +32,14 @@ class OutputsCommit(Request):
     folder: CollectionPath | None = Field(
         None,
         description="Folder of the dataset that receives the outputs; an output gets the same path below this folder "
-            "as below `into`. Null: outputs in the project folder of the dataset get their paths relative to this "
-            "folder, other outputs their paths in the project.",
+        "as below `into`. Null: outputs in the project folder of the dataset get their paths relative to this "
+        "folder, other outputs their paths in the project.",
     )
     message: Message = Field("", description="Message of the commit; empty: the kind and the id of the job.")
     replace: bool = Field(
         False,
         description="Also remove earlier entries of the folder that the job did not produce this time. Only entries "
-            "of the kinds that the job makes are removed.",
+        "of the kinds that the job makes are removed.",
     )
 
     @classmethod
@@ -101,7 +101,7 @@ class JobCommit(Answer):
     replace: bool
     base: str | None = Field(
         description="Newest commit of the branch at the time when the inputs of the job were fixed. Later changes by "
-            "others are not overwritten."
+        "others are not overwritten."
     )
     digest: str | None = Field(
         None, description="Commit that has the outputs; null before the end of the job, and if no entry changed."

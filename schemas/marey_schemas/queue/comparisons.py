@@ -69,8 +69,9 @@ class ComparedColumn(Answer):
     of: Source
     differs: bool = Field(description="Whether the runs have different values.")
     numeric: bool = Field(description="Whether all values are numbers.")
-    goal: Goal | None = Field(None, description="Whether the highest or the lowest value of the field is the best; "
-        "absent: not known.")
+    goal: Goal | None = Field(
+        None, description="Whether the highest or the lowest value of the field is the best; absent: not known."
+    )
     best: float | None = Field(None, description="Best value of the field in a single run.")
     best_mean: float | None = Field(None, description="Best mean of the field over the runs of a setting.")
 
@@ -82,14 +83,15 @@ class ComparedRun(Answer):
     commit: str
     seed: int
     created_at: datetime
-    inputs: dict[str, str] = Field(description="Name and revision of the item of each input, or the number of items "
-        "if the input has several.")
+    inputs: dict[str, str] = Field(
+        description="Name and revision of the item of each input, or the number of items if the input has several."
+    )
     values: dict[str, Value] = Field(description="Values of the parameters.")
     fields: dict[str, Value] = Field(description="Logged fields.")
     setting: int = Field(description="Index of the setting in `settings`.")
     counted: bool = Field(
         description="Whether the means of the setting include this run. Of several runs with the same seed, the "
-            "means include only the newest, because a repetition with the same seed is no further sample."
+        "means include only the newest, because a repetition with the same seed is no further sample."
     )
     curves: dict[str, Curve] = Field({}, description="Curves of the requested fields.")
 

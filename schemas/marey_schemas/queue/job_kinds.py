@@ -140,15 +140,16 @@ CUT = KindDeclaration(
     version=3,
     inputs={
         "annotations": InputSpec(
-            kind=Kind.ANNOTATION, many=True, description="The annotations; each annotation refers to a revision of a "
-                "clip."
+            kind=Kind.ANNOTATION,
+            many=True,
+            description="The annotations; each annotation refers to a revision of a clip.",
         ),
         "clips": InputSpec(
             kind=Kind.CLIP,
             many=True,
             required=False,
             description="The annotated clips, at the revisions to which the annotations refer. If the clips are "
-                "given, they are recorded as inputs of the pieces.",
+            "given, they are recorded as inputs of the pieces.",
         ),
     },
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
@@ -220,8 +221,8 @@ def _reads_answers(_params: Mapping[str, Any]) -> bool:
 ANALYSE_STUDY = KindDeclaration(
     name="analyse_study",
     description="Analyses a study: computes the differences that its participants perceived, the order and the "
-        "groups of its motions, and metrics that are fitted to these differences. Only maintainers may submit such "
-        "jobs.",
+    "groups of its motions, and metrics that are fitted to these differences. Only maintainers may submit such "
+    "jobs.",
     params=job_params.AnalyseStudyParams,
     implementation="marey_worker.kinds.analyse_study:run",
     version=1,
@@ -245,7 +246,7 @@ INDEX = KindDeclaration(
             kind=Kind.INDEX,
             required=False,
             description="The index to update. Poses of clips that this index contains at the same revision are not "
-                "computed again.",
+            "computed again.",
         ),
     },
     outputs={"index": Kind.INDEX},

@@ -56,8 +56,11 @@ class AlignParams(AlignOptions, MetricChoice, SuffixedResults):
     labels: tuple[Label, ...] = Field(
         (), max_length=1000, description="Labels whose segments and keyframes cut the clips; empty: all labels."
     )
-    mirroring: Literal["none", "add"] = Field("none", description="Mirrored copies of the clips. none: only the "
-        "clips themselves are aligned; add: each clip and its mirrored copy.")
+    mirroring: Literal["none", "add"] = Field(
+        "none",
+        description="Mirrored copies of the clips. none: only the "
+        "clips themselves are aligned; add: each clip and its mirrored copy.",
+    )
 
 
 _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")

@@ -173,13 +173,14 @@ class JobCreate(Request):
         description="Final state of this job if a job in `after` does not succeed. fail: failed; skip: cancelled.",
     )
     concurrency_key: str | None = Field(
-        None, max_length=255, description="Key of a lock: of the jobs of a project with the same key, only one runs "
-            "at a time."
+        None,
+        max_length=255,
+        description="Key of a lock: of the jobs of a project with the same key, only one runs at a time.",
     )
     cache: CacheMode = Field(
         "use",
         description="use: reuse the result of an identical job; refresh: compute the result again and store it for "
-            "later jobs; off: compute the result again, for this job only.",
+        "later jobs; off: compute the result again, for this job only.",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed of all random numbers; the same seed gives the same result.")
     max_attempts: int = Field(3, ge=1, le=20)
@@ -279,8 +280,9 @@ class Job(Answer):
     publish_conflict: CommitConflict | None = Field(
         None, description="Reason why the outputs are not on the branch to which the job was to commit them."
     )
-    commit: JobCommit | None = Field(None, description="Commit of the outputs; null if the submission requested no "
-        "commit.")
+    commit: JobCommit | None = Field(
+        None, description="Commit of the outputs; null if the submission requested no commit."
+    )
     author: str | None
     created_at: datetime
     run_at: datetime

@@ -54,7 +54,7 @@ EVALUATE = KindDeclaration(
 COMPARE = KindDeclaration(
     name="compare",
     description="Compares two evaluations trial by trial, with confidence intervals of the changes. Further "
-        "evaluations are compared with the first one.",
+    "evaluations are compared with the first one.",
     params=job_params.CompareParams,
     implementation="marey_worker.kinds.compare:run",
     version=4,

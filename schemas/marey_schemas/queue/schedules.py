@@ -42,7 +42,7 @@ Overlapping = Annotated[
     bool,
     Field(
         description="Whether a job is submitted even if the previous job of the schedule has not ended. If false, "
-            "the time is skipped in this case."
+        "the time is skipped in this case."
     ),
 ]
 

@@ -71,8 +71,9 @@ class ScriptParameter(Request):
     minimum: float | None = Field(None, allow_inf_nan=False, description="Least value of a number.")
     maximum: float | None = Field(None, allow_inf_nan=False, description="Greatest value of a number.")
     choices: tuple[str, ...] = Field((), max_length=100, description="Allowed texts; empty: any text.")
-    default: Value | None = Field(None, description="Value that is used if a run gives no value; null: each run must "
-        "give a value.")
+    default: Value | None = Field(
+        None, description="Value that is used if a run gives no value; null: each run must give a value."
+    )
     description: Message = ""
 
     @model_validator(mode="after")
@@ -190,8 +191,8 @@ class ScriptDeclaration(Request):
         min_length=1,
         max_length=MOST_WORDS,
         description="Words of the command. The first word is `python`, followed by a file of the commit, or a "
-            "program of the commit, such as `./measure`. A word `{parameter:name}` is replaced by a value, a word "
-            "`{input:name}` or `{output:name}` by the path of a file. No shell interprets the words.",
+        "program of the commit, such as `./measure`. A word `{parameter:name}` is replaced by a value, a word "
+        "`{input:name}` or `{output:name}` by the path of a file. No shell interprets the words.",
     )
     parameters: dict[FieldName, ScriptParameter] = Field(default_factory=dict, max_length=MOST_DECLARED)
     inputs: dict[FieldName, ScriptInput] = Field(default_factory=dict, max_length=MOST_DECLARED)
@@ -200,8 +201,8 @@ class ScriptDeclaration(Request):
     image: Image | None = Field(
         None,
         description="Container image in which the script runs, named by its digest. The image must contain a worker "
-            "of Marey, the server must allow the image, and the server must start pods for single jobs. null: the "
-            "image of the worker.",
+        "of Marey, the server must allow the image, and the server must start pods for single jobs. null: the "
+        "image of the worker.",
     )
 
     @field_validator("commit", mode="before")
@@ -238,8 +239,10 @@ class ScriptDeclaration(Request):
         for kind, name in sorted(used - declared):
             raise ValueError(f"argv: the {kind} {name!r} is not declared; declare it, or remove the word")
         for kind, name in sorted(declared - used):
-            raise ValueError(f"argv: the {kind} {name!r} is declared, but no word is {{{kind}:{name}}}; add this "
-                "word, or remove the declaration")
+            raise ValueError(
+                f"argv: the {kind} {name!r} is declared, but no word is {{{kind}:{name}}}; add this "
+                "word, or remove the declaration"
+            )
         if sum(output.kind == "fields" for output in self.outputs.values()) > 1:
             raise ValueError("outputs: at most one output can be of the kind fields")
         return self
@@ -325,7 +328,7 @@ class ScriptParams(ConsentOverride):
     declaration: ScriptDeclaration | None = Field(
         None,
         description="The script as it was registered when the job was submitted. The server fills in this field; if "
-            "a request contains the field, its value must equal the registered script.",
+        "a request contains the field, its value must equal the registered script.",
     )
 
 

@@ -49,7 +49,7 @@ class ClaimRequest(Request):
         min_length=16,
         max_length=64,
         description="Random id of the claim. If a request is repeated with the same id and the same token, it gets "
-            "the leases of the first request, renewed.",
+        "the leases of the first request, renewed.",
     )
 
 
@@ -71,7 +71,7 @@ class PinnedInput(Answer):
     consent_ended: str | None = Field(
         None,
         description="Last day of the performer's consent. Set only if this day has passed, by the clock of the "
-            "server in UTC, and the job would write the input to a file.",
+        "server in UTC, and the job would write the input to a file.",
     )
 
     @property
@@ -138,8 +138,9 @@ class LeaseList(Answer):
 
     leases: tuple[Lease, ...] = ()
     state: JobState | None = Field(
-        None, description="State of the job that the claim names, if the claim gets no lease; null if the job does "
-            "not exist, or if the claim names no job."
+        None,
+        description="State of the job that the claim names, if the claim gets no lease; null if the job does "
+        "not exist, or if the claim names no job.",
     )
 
 
@@ -180,7 +181,7 @@ class StagedOutput(Request):
     same_skeleton: bool = Field(
         False,
         description="Publish neither this output nor its skeleton if the existing item has another skeleton. If both "
-            "skeletons are the same rig, the output is published, and the item keeps its skeleton.",
+        "skeletons are the same rig, the output is published, and the item keeps its skeleton.",
     )
 
 
@@ -234,8 +235,9 @@ class FailRequest(Request):
     )
     retryable: bool = True
     interrupted: bool = Field(
-        False, description="Whether the attempt ended because the worker was stopped. Such an attempt does not count "
-            "against the number of attempts."
+        False,
+        description="Whether the attempt ended because the worker was stopped. Such an attempt does not count "
+        "against the number of attempts.",
     )
 
 

@@ -19,8 +19,9 @@ class Worker(Answer):
     seen_at: datetime = Field(description="Time of the last claim or the last renewal of a lease.")
     running: int = Field(description="Number of attempts that the worker runs.")
     version: str | None = Field(
-        None, description="Version of Marey that the worker reported to this server; null if it reported no version, "
-            "or only to another server."
+        None,
+        description="Version of Marey that the worker reported to this server; null if it reported no version, "
+        "or only to another server.",
     )
     kinds: tuple[str, ...] | None = Field(
         None, description="Kinds of jobs that the worker claims; null if it claims jobs from another server only."

@@ -39,8 +39,9 @@ class _Check:
             self._document(self.documents.pop())
         self._facets()
         if left := sorted(self.archive.members.keys() - self.checked):
-            raise BadArchive(f"{left[0].name}: no version in the archive contains this member; the member was added "
-                "later")
+            raise BadArchive(
+                f"{left[0].name}: no version in the archive contains this member; the member was added later"
+            )
 
     def _changes_of(self, commit: str) -> None:
         self._mark(ArchiveMember(MemberKind.CHANGES, commit))

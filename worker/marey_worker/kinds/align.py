@@ -225,7 +225,7 @@ class _Job:
                 f"the clip has {len(known)} annotations that could be used (layers: {layers}); name one layer"
                 if known
                 else f"none of the given annotations{self._of_layer()} belongs to this clip; add an annotation of "
-                    "the clip, or omit the clip",
+                "the clip, or omit the clip",
                 code="several-annotations" if known else "no-annotation",
             )
         (one,) = known
@@ -260,8 +260,10 @@ class _Job:
             return options
         named = [pin for pin in self._pins.values() if pin.item == options.reference]
         if not named:
-            raise JobRefused("unknown-reference", f"the reference {options.reference} is not one of the clips; give "
-                "the id of one of them")
+            raise JobRefused(
+                "unknown-reference",
+                f"the reference {options.reference} is not one of the clips; give the id of one of them",
+            )
         return options.replace(reference=_uid(max(named, key=lambda pin: pin.revision)))
 
     def _digest(self, clips: Sequence[_Clip], examples: Sequence[SourceExample], rig: Rig) -> str:

@@ -53,14 +53,17 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
     """
     declared = params.declaration
     if declared is None:
-        raise JobRefused("no-declaration", "the job has no declaration of its script; update the server, and submit "
-            "the job again")
+        raise JobRefused(
+            "no-declaration", "the job has no declaration of its script; update the server, and submit the job again"
+        )
     if declared.image is not None and declared.image != os.environ.get(IMAGE_VARIABLE):
-        raise JobRefused("wrong-image", f"the script needs the image {declared.image}, but this worker runs in "
-            "another image")
+        raise JobRefused(
+            "wrong-image", f"the script needs the image {declared.image}, but this worker runs in another image"
+        )
     if landlock_version() == 0:
-        raise JobRefused("no-confinement", "this worker cannot confine scripts: run the worker on Linux 5.13 or "
-            "later with Landlock")
+        raise JobRefused(
+            "no-confinement", "this worker cannot confine scripts: run the worker on Linux 5.13 or later with Landlock"
+        )
     folder = Path(tempfile.mkdtemp(prefix="run-", dir=context.scratch))
     for below in (CODE, OUTPUTS, "tmp"):
         (folder / below).mkdir()

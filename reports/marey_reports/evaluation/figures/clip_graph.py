@@ -51,8 +51,7 @@ class _Line(NamedTuple):
 
 
 def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
-    """Draw the graph of clips for the suite or one trial; the panels of two subjects have each clip at the same place.
-    """
+    """Draw the graph of clips for the suite or one trial; two subjects have their clips at the same places."""
     popularity = [_popularity(subject, trial) for subject in subjects]
     switches = [subject.switches(trial) for subject in subjects]
     uids = _most_used(popularity, min(options.most_clips, MOST_CLIPS))
@@ -171,8 +170,7 @@ def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line])
 
 
 def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], most: int, logarithmic: bool) -> None:
-    """Draw a dot for each displayed range of frames. Dots have few sizes, because an SVG stores a shape for each size.
-    """
+    """Draw a dot for each displayed range of frames. Few sizes are used, because an SVG stores a shape per size."""
     colours = _colours(circles)
     places, levels, looks = [np.empty((0, 2))], [np.empty(0, np.int64)], []
     for uid, total in dots.items():

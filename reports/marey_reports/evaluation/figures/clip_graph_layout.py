@@ -19,8 +19,7 @@ FEWEST_DOTS, FULLEST = 12, 72  # dots on one circle
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """Circle that represents a clip: centre, radius, number of frames, and number of dots, each for a range of frames.
-    """
+    """Circle of a clip: centre, radius, number of frames, and number of dots; a dot shows a range of frames."""
 
     centre: Floats
     radius: float
