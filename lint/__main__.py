@@ -36,7 +36,7 @@ RULES: Mapping[str, Callable[[House], Iterator[Offence]]] = {
     "constants": constants.find,
     "migrations": migrations.find,
 }
-"""Rules by their names in `exceptions.toml`; the rule on wording is missing, because it has a baseline instead."""
+"""Rules by the names that `exceptions.toml` uses. The rule on wording is not included, because it has a baseline."""
 
 
 def check(house: House, root: Path) -> Iterator[tuple[str, Offence]]:
@@ -55,7 +55,9 @@ def main() -> int:
     With `--shrink`, lower the counts in `wording.toml` to the present numbers instead.
     """
     parser = argparse.ArgumentParser(prog="python -m lint", description=__doc__)
-    parser.add_argument("--shrink", action="store_true", help="lower the counts in wording.toml to what is left")
+    parser.add_argument(
+        "--shrink", action="store_true", help="lower the counts in wording.toml to the present numbers of offences"
+    )
     house = read_house(ROOT)
     if parser.parse_args().shrink:
         shrink_baseline(wording.find(house), ROOT)

@@ -1,4 +1,4 @@
-"""Rule: no module imports itself through other modules. Imports in functions, and those for types only, count, too."""
+"""Rule: no module imports itself through other modules. Imports in functions and imports only for types count, too."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lint.sources import House, Offence
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Yield one circle of imports for each package that has one."""
+    """Yield one circular chain of imports for each package that contains such a chain."""
     for package in sorted({name.partition(".")[0] for name in house.modules}):
         names = sorted(name for name in house.modules if name.partition(".")[0] == package)
         try:

@@ -10,7 +10,7 @@ from lint.sources import House, Module, Offence
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Yield the classes whose name another class has, too."""
+    """Yield the classes that have the same name as another class."""
     found: dict[str, list[tuple[Module, int]]] = defaultdict(list)
     for module in house.modules.values():
         for _, node in module.definitions:

@@ -16,7 +16,7 @@ _MADE_BY_GIT = ("Merge ", 'Revert "', "fixup! ", "squash! ", "amend! ")
 
 
 def faults_of(subject: str) -> list[str]:
-    """Return descriptions of what is wrong with a subject; empty if nothing is."""
+    """Return a description of each fault of a subject; an empty list if the subject has no fault."""
     if subject.startswith(_MADE_BY_GIT):
         return []
     faults = []

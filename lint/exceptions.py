@@ -20,7 +20,7 @@ def read_exceptions(path: Path = EXCEPTIONS) -> dict[str, dict[str, str]]:
 
 
 def apply_exceptions(rule: str, offences: Iterable[Offence], reasons: Mapping[str, str]) -> Iterator[Offence]:
-    """Yield the offences that have no reason, and a further offence for each reason that belongs to no offence.
+    """Yield the offences without an exception, and an offence for each exception that no offence needs.
 
     The keys of `reasons` are subjects, or patterns of them such as "marey_server.handlers.*".
     """
@@ -40,7 +40,10 @@ def read_baseline(path: Path = BASELINE) -> dict[str, int]:
 
 
 def apply_baseline(offences: Iterable[Offence], allowed: Mapping[str, int], root: Path) -> Iterator[Offence]:
-    """Yield the offences of each file that has more than `allowed`, and an offence for each count that is too large."""
+    """Yield the offences of files that exceed their counts in `allowed`.
+
+    If a file has fewer offences than its count, an offence about this count is yielded instead.
+    """
     by_file: dict[str, list[Offence]] = {}
     for offence in offences:
         by_file.setdefault(shown(offence.path, root), []).append(offence)
@@ -56,7 +59,8 @@ def apply_baseline(offences: Iterable[Offence], allowed: Mapping[str, int], root
 def shrink_baseline(offences: Iterable[Offence], root: Path, path: Path = BASELINE) -> None:
     """Lower the counts of the baseline to the present numbers of offences.
 
-    The count of a file rises only if the total does not, for example after texts have moved to this file.
+    The count of a single file may rise, for example after texts have moved to this file, but only if the total of all
+    files does not rise.
     """
     allowed = read_baseline(path)
     counts = Counter(shown(offence.path, root) for offence in offences)
@@ -66,5 +70,5 @@ def shrink_baseline(offences: Iterable[Offence], root: Path, path: Path = BASELI
 
 
 def shown(path: Path, root: Path) -> str:
-    """Return a path as people write it: below the checkout, with slashes."""
+    """Return a path for messages: relative to the checkout if the path is in it, with slashes."""
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.as_posix()

@@ -1,4 +1,4 @@
-"""Rule: a function has at most 40 lines without its signature, a module at most 400; docstrings do not count.
+"""Rule: a function has at most 40 lines, without its signature, and a module at most 400; docstrings do not count.
 
 A line of text in a page has at most 120 characters; tables, code and addresses of links may be longer.
 """

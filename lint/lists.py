@@ -11,7 +11,7 @@ FEWEST_WORDS = 3
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Yield the literal collections that repeat words of a vocabulary outside of the module that declares it."""
+    """Yield literal collections that repeat words of a vocabulary, except in the module that declares the words."""
     vocabularies = dict(_vocabularies(house))
     for module in house.modules.values():
         for node in ast.walk(module.tree):
@@ -45,7 +45,7 @@ def _is_enum(base: ast.expr) -> bool:
 
 
 def _words(node: ast.AST) -> set[str]:
-    """Return the words of a literal collection that consists of words alone."""
+    """Return the elements of a literal list, tuple or set if all of them are texts; otherwise an empty set."""
     if not isinstance(node, ast.List | ast.Tuple | ast.Set) or not node.elts:
         return set()
     words = {one.value for one in node.elts if isinstance(one, ast.Constant) and isinstance(one.value, str)}

@@ -2,7 +2,7 @@
 
 Such a migration may create tables and indexes, and add columns that are null or have a default in the database. A new
 index of an existing table must not be unique, because earlier servers may store equal values. Other SQL may only set
-or reset storage parameters of tables. What a migration does when it is undone is not checked.
+or reset storage parameters of tables. Downgrades are not checked.
 """
 
 from __future__ import annotations
@@ -89,12 +89,12 @@ def _argument(call: ast.Call, position: int, name: str) -> str:
 
 
 def _is_set(call: ast.Call, name: str, but_for: str = "False") -> bool:
-    """Return whether a call has the keyword argument `name` with another value than `but_for`."""
+    """Return whether a call has the keyword argument `name`, with a value other than `but_for`."""
     return any(one.arg == name and ast.unparse(one.value) != but_for for one in call.keywords)
 
 
 def _fault_of_column(call: ast.Call) -> str:
-    """Return what is wrong with an added column; empty if earlier servers can go on inserting rows without it."""
+    """Return what is wrong with an added column; empty if earlier servers can still insert rows without this column."""
     columns = [one for one in ast.walk(call) if isinstance(one, ast.Call) and ast.unparse(one.func).endswith("Column")]
     if len(columns) != 1:
         return "the added column cannot be checked, because it is not written as `sa.Column(...)` in the call"

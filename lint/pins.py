@@ -22,7 +22,7 @@ BELOW = {
     "build": None, "all": "build", "traces": "all", "kubernetes": "traces", "dev": "kubernetes", "bench": "dev",
     "audit": "dev",
 }  # fmt: skip
-"""Layers of packages, each with the layer that it extends.
+"""Names of layers of packages, each with the name of the layer below, which it extends.
 
 `build` is the build backend; the other layers are extras of `pyproject.toml`.
 """
@@ -63,17 +63,17 @@ def split(every: dict[str, str], needed: dict[str, set[str]]) -> dict[str, list[
 
 
 def with_extras(pin: str, form: str) -> str:
-    """Return a pin whose name has the extras that it has in `form`, which pins the same package."""
+    """Return `pin` with the extras that the package has in `form`, another pin of the same package."""
     return form.partition("==")[0] + pin[pin.index("==") :]
 
 
 def further_extras(
     layer: str, every: dict[str, str], forms: dict[str, dict[str, str]], homes: dict[str, list[str]]
 ) -> list[str]:
-    """Return pins of packages of lower layers that this layer needs with extras which no lower layer has.
+    """Return pins of packages that a lower layer pins, but that this layer needs with further extras.
 
-    pip does not accept a pin without these extras. A pin with them cannot be in a lower layer, because the packages of
-    the extras are not pinned there.
+    pip does not accept a pin without these extras. A pin with these extras cannot be in a lower layer, because the
+    lower layer does not pin the packages that the extras need.
     """
     lower = list(layers_of(BELOW[layer]))
     pins = []

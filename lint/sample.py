@@ -17,7 +17,7 @@ SIZES = {"docstrings": 60, "error texts": 40, "help texts": 20, "pages": 5}
 
 
 def draw(house: House, seed: int) -> dict[str, list[tuple[str, str]]]:
-    """Return random texts with their places, by kind of text. The same house and seed give the same texts."""
+    """Return random texts with their places, by kind of text. Equal code and an equal seed give equal texts."""
     modules = [house.modules[name] for name in sorted(house.modules)]
     texts = {
         "docstrings": [one for module in modules for one in _docstrings(module)],
@@ -69,7 +69,7 @@ def _helps(module: Module) -> Iterator[tuple[str, str]]:
 
 
 def _sentences(module: Module, tree: ast.AST) -> Iterator[tuple[str, str]]:
-    """Yield the literals of several words in an expression; values that an f-string inserts appear in braces."""
+    """Yield the string literals of several words in an expression; expressions in f-strings appear in braces."""
     if isinstance(tree, ast.JoinedStr | ast.Constant):
         text = "".join(_shown(part) for part in (tree.values if isinstance(tree, ast.JoinedStr) else [tree]))
         if " " in text.strip():

@@ -27,7 +27,7 @@ Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 
 
 class Offence(NamedTuple):
-    """A place that breaks a rule. `subject` is what an exception names."""
+    """Place in the code that breaks a rule. Exceptions refer to it by its `subject`."""
 
     path: Path
     line: int
@@ -71,7 +71,7 @@ def _definitions(node: ast.AST, prefix: str) -> Iterator[tuple[str, Definition]]
 
 @dataclass(frozen=True)
 class House:
-    """All modules of the product by name, and the pages that people read."""
+    """Modules of the product by name, pages that people read, and other files that use names of the product."""
 
     modules: dict[str, Module]
     pages: dict[Path, str] = field(default_factory=dict)

@@ -52,7 +52,7 @@ def _unused_locals(module: Module, name: str, outer: Function) -> Iterator[Offen
 
 
 def _locals(node: ast.AST) -> Iterator[Function]:
-    """Yield the local functions of a function, but not functions inside these or inside local classes."""
+    """Yield the functions that are defined directly in a function, not those inside a local function or local class."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, Function):
             yield child
@@ -72,7 +72,7 @@ def _is_entry(node: Definition) -> bool:
 
 
 def _is_of_format(module: Module, node: Definition) -> bool:
-    """Return whether a definition is the reader or writer of a format, which callers find by the module's name."""
+    """Return whether a definition is the reader or writer of a file format, looked up by the name of its module."""
     folder, _, name = module.name.rpartition(".")
     return folder == "marey_motion.formats" and node.name in (f"read_{name}", f"write_{name}")
 

@@ -26,7 +26,7 @@ PHRASES = {
     r"\b(?:no|make|makes|making) room\b": "no space, or free space",
     r"\bmade to do harm\b": "malicious",
 }  # fmt: skip
-"""Phrases that need a second reading, as regular expressions, and plain words for them."""
+"""Phrases that are hard to understand, as regular expressions, each with plain words that replace it."""
 
 OLD_NAMES = {
     "settling": "propagation",

@@ -11,7 +11,7 @@ from marey_schemas.names import ProjectName, UserName
 from marey_schemas.sizes import DAY_S, LOGIN_DAYS, LONGEST_LOGIN_DAYS
 
 MOST_RUNNING = 1_000_000
-"""Greatest limit of running jobs that a project can have."""
+"""Greatest value of the limit of a project's running jobs."""
 
 
 class Role(StrEnum):
@@ -41,7 +41,7 @@ class Scope(StrEnum):
 
 
 class EndTokens(StrEnum):
-    """Choice of the tokens that a change of a user revokes; the token of the request itself always stays valid."""
+    """Tokens that a change of a user revokes. The token that authenticates the request always stays valid."""
 
     NONE = "none"
     SESSIONS = "sessions"
@@ -52,7 +52,7 @@ DisplayName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 Password = Annotated[SecretStr, Field(min_length=10, max_length=1024)]
 LoginSeconds = Annotated[int, Field(ge=60, le=LONGEST_LOGIN_DAYS * DAY_S)]
 ScopeText = Annotated[str, StringConstraints(pattern=rf"^(?:{'|'.join(Scope)})(?:!project=[a-z0-9_-]{{1,64}})?$")]
-"""Scope, optionally bound to one project, as in `write!project=walk`."""
+"""Scope of a token, optionally limited to one project, as in `write!project=walk`."""
 
 
 class UserCreate(Request):
@@ -93,8 +93,8 @@ class User(Answer):
     created_at: datetime
     last_seen_at: datetime | None = Field(
         None,
-        description="Latest use of a token or an identity of the user, to the hour; null if there is none, or if the "
-        "caller is no administrator. Uses of tokens that were deleted do not count.",
+        description="Time when a token or an identity of the user was last used, to the hour. Uses of tokens that "
+        "were deleted later do not count. Null: there was no use, or the caller is not an administrator.",
     )
     rev: int
 
@@ -129,24 +129,24 @@ class TokenCreate(Request):
     labels: dict[str, str] | None = Field(
         None,
         description="Labels that a worker with this token may announce, by name; only for tokens with the scope "
-        "`work`. Jobs that require other labels cannot be claimed with this token. Null: the labels of the token that "
-        "creates this token; any labels if the creating token is not bound to labels.",
+        "`work`. Jobs that require other labels cannot be claimed with this token. Null: the labels of the token "
+        "that creates this token, or any labels if that token is not restricted to labels.",
     )
 
 
 class TokenRotation(Request):
-    """Request to replace the token that authenticates the request by a new token with the same rights and expiry."""
+    """Request to replace the token that authenticates this request; the new token has the same rights and expiry."""
 
     rotation_id: str = Field(
         pattern=r"^[A-Za-z0-9_-]{32,64}$",
         description="Random text, for example 32 hexadecimal digits. A repeated request with the same `rotation_id` "
-        "gets the same new token. Keep it as secret as the token until you have the answer.",
+        "gets the same new token. Keep this text secret until you have the answer.",
     )
     grace_s: int = Field(
         3600,
         ge=60,
         le=7 * DAY_S,
-        description="Seconds for which the replaced token remains valid, but never beyond its expiry.",
+        description="Seconds for which the replaced token remains valid; it never remains valid after its expiry.",
     )
 
 
@@ -218,8 +218,8 @@ class Project(Answer):
     deleted_at: datetime | None = None
     most_running_jobs: int | None = Field(
         None,
-        description="Greatest number of the project's jobs that run at the same time, as an administrator set it; "
-        "null: no limit, or the caller is not a member.",
+        description="Greatest number of the project's jobs that may run at the same time, as set by an "
+        "administrator. Null: there is no limit, or the caller is not a member.",
     )
     rev: int
 
@@ -232,7 +232,7 @@ class QuotaChange(Request):
 
     items: int | None = Field(None, ge=0, le=2**53, description="Largest number of items.")
     stored_bytes: int | None = Field(
-        None, ge=0, le=2**53, description="Largest number of bytes that all revisions of the items take together."
+        None, ge=0, le=2**53, description="Largest total size of all revisions of the items, in bytes."
     )
 
 
@@ -246,8 +246,8 @@ class ProjectQuotaChange(QuotaChange):
         None,
         ge=0,
         le=MOST_RUNNING,
-        description="Greatest number of the project's jobs that workers run at the same time; null: no limit. Jobs "
-        "that run already continue.",
+        description="Greatest number of the project's jobs that workers run at the same time; null: no limit. A "
+        "lower limit does not stop jobs that are running.",
     )
 
 
@@ -277,7 +277,8 @@ class ProjectQuotasInUse(QuotasInUse):
 
     running_jobs: RunningJobs | None = Field(
         None,
-        description="The project's jobs that workers run; parents of tasks do not count. Null: the server is too old.",
+        description="Number of the project's jobs that workers run, and its limit. A job that is divided into tasks "
+        "does not count, but its tasks do. Null: the server is too old.",
     )
 
 
@@ -297,7 +298,7 @@ class Member(Answer):
 
 
 EVERY_MEMBER = "*"
-"""User name that stands for all members when a role in a folder is set."""
+"""User name that means all members, in requests that set a role in a folder."""
 
 
 class FolderRoleChange(Request):
@@ -310,7 +311,7 @@ class FolderRole(Answer):
     """Role of a member in a folder and everything below it, where it replaces the member's role in the project."""
 
     user: str = Field(
-        description="The name of the member; `*` stands for all members without a role of their own in this folder, "
+        description="The name of the member; `*` means all members without a role of their own in this folder, "
         "except owners."
     )
     folder: str = Field(description="The path of the folder.")

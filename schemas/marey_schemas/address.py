@@ -9,7 +9,7 @@ DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460
 
 SERVER_VARIABLES = ("MAREY_SERVER", "MAREY_URL")
-"""Environment variables with the address of the server, which clients and workers read; the first that is set counts.
+"""Environment variables from which clients and workers read the address of the server; the first that is set is used.
 
-The second one is the earlier name.
+The second variable is the name that earlier releases used.
 """

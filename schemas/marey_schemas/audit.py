@@ -1,4 +1,4 @@
-"""Audit log: who gave or took access, deleted or restored something, and when."""
+"""Audit log: who granted or withdrew access, or deleted or restored an object, and when."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "token.rotated": "replaced a token of the user",
     "token.revoked": "revoked a token of the user",
 }
-"""Words for each kind of entry, such as "added the member"; in a sentence, they connect `actor` and `about`."""
+"""Words for each kind of entry, such as "added the member"; a sentence has them between `actor` and `about`."""
 
 
 class AuditEntry(Answer):
@@ -73,7 +73,8 @@ class AuditEntry(Answer):
     kind: str
     project: str | None = Field(description="Present name of the project; null: the entry concerns the whole server.")
     actor: str | None = Field(
-        description="Name of the user who made the change, or `job:<id>`; null: the server, or a study's participant."
+        description="Name of the user who made the change, or `job:<id>` for a job; null: the server or a "
+        "participant of a study made it."
     )
     token: str | None = Field(None, description="Id of the token that the actor used; null: none, as in a sign-in.")
     about: str = Field(
@@ -87,5 +88,5 @@ class AuditEntry(Answer):
 
     @property
     def words(self) -> str:
-        """The words of `AUDIT_WORDS` for this entry, such as "added the member"; for a kind without words, the kind."""
+        """The words of `AUDIT_WORDS` for this kind of entry, such as "added the member"; else `kind` itself."""
         return next((words for kind, words in AUDIT_WORDS.items() if kind == self.kind), self.kind)

@@ -1,4 +1,4 @@
-"""Consent of performers: the text of refusals, and permissions to export clips whose consent has ended."""
+"""Consent of performers: texts of refusals, and permissions to export clips after the end of the consent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import Field, StringConstraints, model_validator
 from marey_schemas.base import Request
 
 CONSENT_EXPIRED = "consent-expired"
-"""Code of the error, and of the refusals of jobs, for clips whose consent has ended."""
+"""Code of errors, and of refusals in jobs, for clips that are not exported because their consent has ended."""
 
 CONSENT_REMEDY = (
     "If the performer has agreed to a later day, record that day as `consent_until`. Otherwise, a maintainer of the "
@@ -30,7 +30,9 @@ class ConsentOverride(Request):
         description="Whether clips are exported although the consent of the performer has ended. Requires the role "
         "maintainer and a reason; an event records both.",
     )
-    consent_reason: ConsentReason | None = Field(None, description="Reason for `allow_expired_consent`.")
+    consent_reason: ConsentReason | None = Field(
+        None, description="Reason why clips are exported although the consent of the performer has ended."
+    )
 
     @model_validator(mode="after")
     def _check_reason(self) -> Self:

@@ -55,7 +55,9 @@ class CoverageStreamCreate(Request):
         None, description="Skeleton of the poses that will be sent; not needed if only `roots` are sent."
     )
     evaluation: ItemId | None = Field(
-        None, description="Evaluation whose grid and coverage are the initial state of the stream."
+        None,
+        description="Evaluation from which the stream takes its grid and its initial coverage. Absent: the "
+        "coverage is empty at first.",
     )
     speeds_m_s: tuple[Speed, ...] | None = Field(
         None,
@@ -106,7 +108,9 @@ class CoverageStreamCreate(Request):
 class CoverageFrames(Request):
     """Next frames of a performance, as arrays of dtype <f4 or <f8."""
 
-    offset: int = Field(ge=0, le=2**53, description="Number of frames that were sent before these.")
+    offset: int = Field(
+        ge=0, le=2**53, description="Number of frames that were sent before the frames of this request."
+    )
     poses: Annotated[NDArray[Any], ArrayOf(ndim=2)] | None = Field(
         None, description="[frames, 3 + 4*joints]: root translation (m), then local quaternions w,x,y,z."
     )
@@ -121,7 +125,9 @@ class CoverageFrames(Request):
         description="[frames, 3]: x and z of the torso on the ground (m), heading of the body (rad), not smoothed.",
     )
     ends_take: bool = Field(
-        False, description="The take ends after these frames: the performer pauses, or frames were lost."
+        False,
+        description="Whether the take ends after these frames, because the performer pauses, or because "
+        "frames were lost.",
     )
 
     @model_validator(mode="after")
@@ -156,7 +162,7 @@ class CoverageCell(Answer):
 
 
 class CoverageTarget(CoverageCell):
-    """A cell that lacks data, and the path to walk to fill it."""
+    """A cell that lacks data, and the path that the performer should walk to record this data."""
 
     path: tuple[tuple[float, float, float], ...] = Field(
         description="Points of the path, `path_step_s` apart, relative to the performer's place and heading: "
@@ -183,7 +189,7 @@ class CoverageNow(Answer):
     index: float = Field(description="Share of the cells that have enough data.")
     missing_s: float = Field(description="Seconds of data that all cells together still need.")
     targets: tuple[CoverageTarget, ...] = Field(
-        description="Cells to record next, the ones closest to the performer's present motion first."
+        description="Cells to record next. The cells closest to the performer's present motion are first."
     )
     performer: Performer | None
 
@@ -192,7 +198,9 @@ class CoverageProgress(CoverageNow):
     """Coverage after the frames of a request, and the changes of the coverage by these frames."""
 
     offset: int = Field(description="Number of frames received so far.")
-    windows: int = Field(description="Number of one-second windows that these frames completed, in any cell.")
+    windows: int = Field(
+        description="Number of one-second windows that these frames completed, regardless of their cells."
+    )
     changed: tuple[CoverageCell, ...] = Field(description="Cells whose data increased.")
 
 
@@ -222,16 +230,14 @@ class CoverageStreamState(CoverageStream, CoverageNow):
     deficit_s: tuple[tuple[float, ...], ...] = Field(
         description="[speeds, turn rates]: seconds of data that each cell still needs."
     )
-    delay_s: float = Field(
-        description="Seconds between a frame and the end of the window of frames in which it is measured."
-    )
+    delay_s: float = Field(description="Delay of the newest measured window behind the newest frame, in seconds.")
 
 
 # --- what a stream takes of an evaluation's document -----------------------------------------------------------------
 
 
 class MeasuredOptions(Answer):
-    """Those options of an evaluation that determine its coverage."""
+    """Options of an evaluation that determine its coverage; all other options are left out."""
 
     grid: Grid
     coverage_least_s: float = Field(gt=0, le=3600)

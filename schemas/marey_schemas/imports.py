@@ -43,7 +43,9 @@ class ImportEntry(Answer):
 
     name: str
     status: Literal["created", "unchanged", "failed", "companion"] = Field(
-        description="created: the item, or a new revision of it if `revision` is greater than 1."
+        description="created: the item was created, or a new revision of it if `revision` is greater than 1; "
+        "unchanged: the item has the same content already; failed: the file was refused; companion: the file was "
+        "read together with another file."
     )
     item: str | None = None
     revision: int | None = None
@@ -75,7 +77,7 @@ def notes_output(file_name: str, layer: str) -> str:
 
 
 class Made(Protocol):
-    """Revision that was published for a file."""
+    """Revision that the server published for an imported file."""
 
     @property
     def item(self) -> str:
@@ -99,14 +101,15 @@ SKELETON_DIFFERS = Refusal(
     detail="an item of this name exists with another skeleton; import the file into another folder, or give it a new "
     "revision with the skeleton of this file by --replace (in requests: replace_skeleton=true)",
 )
-"""Reason for which nothing is published for a file: it would change the skeleton of an item."""
+"""Refusal of a file for which nothing is published, because it would change the skeleton of an existing item."""
 
 
 def published_entry(entry: ImportEntry, made: Mapping[str, Made]) -> ImportEntry:
     """Return the entry of a file that was read, completed with what was published for the file.
 
-    `made` contains the published revisions by the names of their drafts. If it lacks the file, the file is refused,
-    because an item of this name has another skeleton. Files without an own item, such as skeletons, have the skeleton.
+    `made` contains the published revisions by the names of their drafts. If `made` does not contain the file, the file
+    is refused, because an item of this name has another skeleton. If the file contains only a skeleton, the entry names
+    the item of the skeleton.
     """
     refused = entry.error is not None and entry.error.code == SKELETON_DIFFERS.code
     if entry.status not in ("created", "unchanged") and not refused:

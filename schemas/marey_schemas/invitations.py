@@ -24,7 +24,11 @@ Code = Annotated[SecretStr, Field(max_length=200)]
 class InvitationTerms(Request):
     """Limits of a new invitation."""
 
-    note: Note = Field("", description="For whom or what the invitation is; only those who may withdraw it see this.")
+    note: Note = Field(
+        "",
+        description="Person or purpose that the invitation is for; shown only to users who may "
+        "withdraw the invitation.",
+    )
     expires_in_s: int = Field(7 * DAY_S, ge=60, le=MAX_DAYS * DAY_S, description="Seconds until the invitation ends.")
     uses: int = Field(1, ge=1, le=MAX_USES, description="Number of people who can use the invitation.")
 

@@ -70,7 +70,7 @@ class ItemRevert(Request):
 
 
 class HidingCondition(Answer):
-    """Condition of a query, with the numbers of items that it excludes."""
+    """Condition of a query, with the numbers of items that the condition excludes."""
 
     condition: str
     hides: int = Field(description="Number of items that do not meet this condition.")
@@ -157,7 +157,9 @@ class LineageEdge(Answer):
     item: str
     kind: Kind
     name: str = Field(description="Name of the item; empty if it was purged.")
-    purged: bool = Field(False, description="Whether the item was deleted for good; nothing else is left of it.")
+    purged: bool = Field(
+        False, description="Whether the item was purged (deleted for good); only its place in the lineage is left."
+    )
     revision: int
     job: str | None
     role: str = Field(description="Name of the job input for which the revision was used.")
@@ -184,7 +186,7 @@ class Staleness(Answer):
     revision: int
     stale: bool
     because: tuple[LineageEdge, ...] = Field(
-        (), description="Inputs that have newer revisions than the ones that were used."
+        (), description="Inputs that now have newer revisions than those from which the item was made."
     )
 
 
@@ -240,13 +242,13 @@ class Event(Answer):
 
 
 class EventFeed(Page):
-    """Events in their order, and whether further events exist.
+    """One page of events in their order, and whether further events exist.
 
-    `next_cursor` and `count` are always null; the number of the last event, as `after`, gives the next page.
+    `next_cursor` and `count` are always null. To read the next page, send the number of the last event as `after`.
     """
 
     items: tuple[Event, ...]
     more: bool = Field(
-        description="Whether further events followed this page when it was read; `after` with the number of its last "
-        "event returns them."
+        description="Whether further events existed when this page was read; to read them, send the number of the "
+        "last event of this page as `after`."
     )

@@ -21,14 +21,16 @@ CUT_OFF = (
     f"The graph is cut off: it has more than {MOST_REVISIONS:,} revisions or {MOST_LINKS:,} links in one direction. "
     "The nearest ones are shown."
 )
-"""Note on a graph that is not complete."""
+"""Note that is shown with a graph that is not complete."""
 
 
 class LineageOptions(Options):
     """Options of a lineage graph: its direction and its depth."""
 
     direction: Literal["inputs", "results", "both"] = Field(
-        "both", description="`inputs`: what the revision was made from; `results`: what was made from it; `both`."
+        "both",
+        description="`inputs`: the revisions from which the revision was made; `results`: the revisions that "
+        "were made from it; `both`: inputs and results.",
     )
     depth: int = Field(
         MOST_REVISIONS,
@@ -94,7 +96,9 @@ class LineageJob(Answer):
 class LineageGraph(Answer):
     """Graph of the sources of a revision, or of the results made from it, through any number of jobs."""
 
-    revisions: tuple[LineageRevision, ...] = Field(description="The revision that the graph starts from is the first.")
+    revisions: tuple[LineageRevision, ...] = Field(
+        description="Revisions of the graph; the first is the revision from which the graph starts."
+    )
     links: tuple[LineageLink, ...]
     jobs: tuple[LineageJob, ...]
     complete: bool = Field(description="False if the graph was cut off, because it has too many revisions or links.")

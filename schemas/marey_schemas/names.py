@@ -25,7 +25,7 @@ FORMS = {
     DIGEST_PATTERN: "be sha256: followed by 64 hexadecimal digits in lower case",
     REF: "have at most 128 letters, digits, dots, - and _, and begin and end with a letter or a digit",
 }
-"""What texts with a pattern must do, in words, for messages to people."""
+"""Requirements by pattern, in words, for messages to people; each continues a sentence after "must"."""
 
 ProjectName = Annotated[str, StringConstraints(pattern=SLUG)]
 """Name of a project: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
@@ -52,7 +52,7 @@ Digest = Annotated[str, StringConstraints(pattern=DIGEST_PATTERN)]
 """Digest of bytes: `sha256:` and 64 hexadecimal digits."""
 
 ShownText = Annotated[str, StringConstraints(min_length=1, pattern=r"^[^\x00-\x1f\x7f-\x9f]+$")]
-"""Text of a program that is shown to people: without control characters, with which it could change a terminal."""
+"""Text of a program that is shown to people. It contains no control characters, which could change a terminal."""
 
 PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 

@@ -30,7 +30,9 @@ class PurgeRequest(Request):
         None, max_length=1300, description="Path, made of folder and name, that deleted items had."
     )
     collection: CollectionPath | None = Field(
-        None, description="Folder: the deleted items in it and below it; empty: those of the whole project."
+        None,
+        description="Folder whose deleted items are purged, including those in folders below it; empty: the "
+        "deleted items of the whole project.",
     )
     kind: Kind | None = Field(None, description="Kind of the items; absent: all kinds.")
     query: str | None = Field(
@@ -47,7 +49,9 @@ class PurgeRequest(Request):
     @model_validator(mode="after")
     def _names_items(self) -> Self:
         if self.item is None and self.path is None and self.collection is None and self.query is None:
-            raise ValueError("give an item, a path, a collection or a query; an empty collection is the whole project")
+            raise ValueError(
+                "give an item, a path, a collection or a query; an empty collection means the whole project"
+            )
         return self
 
 
@@ -74,7 +78,7 @@ class ItemHolder(Answer):
 
 
 class JobHolder(Answer):
-    """Job because of which an item is not purged: it has not ended, and reads the item or has created it."""
+    """Job that prevents the purge of an item: the job has not ended, and reads the item or has created it."""
 
     type: Literal["job"] = "job"
     job: str
@@ -91,23 +95,23 @@ class PurgedItem(Answer):
     item: str
     kind: Kind
     path: str = Field(
-        description="Folder and name of the item, in a preview. Empty in the answer to a purge: this answer is stored "
-        "for repetitions of the request, and must not keep the name."
+        description="Folder and name of the item, in a preview. Empty in the answer to a purge, because this answer "
+        "is stored for repetitions of the request, and the name must not be stored."
     )
 
 
 class HeldItem(Answer):
-    """Item that was not purged, because something still needs it."""
+    """Item that was not purged, because other objects still need it."""
 
     item: str
     kind: Kind
     path: str
-    holders: tuple[Holder, ...] = Field(description=f"What holds the item, at most {MOST_HOLDERS}.")
+    holders: tuple[Holder, ...] = Field(description=f"Objects that still need the item, at most {MOST_HOLDERS}.")
     others: int = Field(0, description="Number of further holders that are not listed.")
 
 
 class PurgeAnswer(Answer):
-    """Outcome of a purge: items that it deleted for good, or would delete, and items that it refused to delete."""
+    """Outcome of a purge: the items that were (or would be) deleted for good, and the items that are still needed."""
 
     preview: bool
     purged: tuple[PurgedItem, ...]
@@ -128,8 +132,8 @@ class DatasetPurgeRequest(Request):
     dataset: str = Field(
         min_length=1,
         max_length=64,
-        description="Id or name of a deleted dataset. A name that several deleted datasets have means the one that was "
-        "deleted last.",
+        description="Id or name of a deleted dataset. If several deleted datasets have this name, the dataset that "
+        "was deleted last is purged.",
     )
     preview: bool = Field(False, description="Report what the purge would do, but change nothing.")
 
@@ -143,7 +147,8 @@ class DatasetPurgeAnswer(Answer):
     commits: int = Field(description="Number of versions of the dataset.")
     proposals: int = Field(description="Number of proposals of the dataset.")
     holders: tuple[Annotated[ItemHolder | JobHolder, Field(discriminator="type")], ...] = Field(
-        description=f"What cites a version of the dataset and prevents the purge, at most {MOST_HOLDERS}: items that "
+        description=f"Objects that refer to a version of the dataset and so prevent the purge, at most "
+        f"{MOST_HOLDERS}: items that "
         "jobs made from a version, and jobs that have not ended."
     )
     others: int = Field(0, description="Number of further holders that are not listed.")

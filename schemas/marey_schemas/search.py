@@ -31,7 +31,7 @@ SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOS
 
 
 class StartPlacement(Request):
-    """Position and heading in the world at which a motion starts: those of the model's coordinate frame."""
+    """Position and heading of the model's coordinate frame in the world, which determine where a motion starts."""
 
     x: Coordinate = Field(0.0, description="Position along x, in metres.")
     z: Coordinate = Field(0.0, description="Position along z, in metres.")
@@ -67,8 +67,8 @@ class SearchRequest(RefineOptions):
         PASSES,
         ge=1,
         le=4,
-        description="Number of passes; 1: only the tree's samples; each further pass searches near the best "
-        "samples so far.",
+        description="Number of passes. The first pass searches the samples of the tree; each further pass searches "
+        "near the best samples so far.",
     )
     refine: bool = Field(True, description="Improve the result of the tree by numerical optimisation.")
     transition_tolerance_m: Distance = Field(
@@ -104,7 +104,7 @@ class SearchRequest(RefineOptions):
 
     @property
     def asked_steps(self) -> tuple[SearchStep, ...]:
-        """The steps of the request; a single one if only `constraints` are given."""
+        """The steps of the request; a single step if the request gives only `constraints`."""
         return self.steps or (SearchStep(constraints=self.constraints),)
 
 
@@ -160,7 +160,7 @@ class SearchAnswer(Answer):
     errors: tuple[ConstraintError, ...]
     reached: bool = Field(description="Whether all constraints are met.")
     out_of_reach: tuple[int, ...] = Field(
-        (), description="Indices of the entries of `errors` whose error exceeds 5 cm before inverse kinematics."
+        (), description="Indices in `errors` of the constraints whose error exceeds 5 cm before inverse kinematics."
     )
     iterations: int = Field(description="Number of iterations of the optimisation.")
     motion: MotionDocument | None = None

@@ -60,7 +60,7 @@ class _SearchConstraint(Tagged):
     at: Moment = Field(
         description="Time of the constraint: the label of a keyframe of the model, start, end, or a canonical frame."
     )
-    weight: Positive = Field(1.0, description="Weight of the constraint.")
+    weight: Positive = Field(1.0, description="Weight of the error of the constraint, relative to other constraints.")
 
 
 class _PositionConstraint(_SearchConstraint):

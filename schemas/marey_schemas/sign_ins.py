@@ -21,10 +21,10 @@ VIEW_PATH = "/view"
 """Path, below the address of the server, of the page that shows clips."""
 
 PLAYER_PATH = "/pages/player"
-"""Path, below the root of the API, of the page without motion from which clients make pages that need no server."""
+"""Path, below the root of the API, of an empty page that clients complete to pages that need no server."""
 
 STUDY_PATH = "/studies"
-"""Path, below the address of the server, of the page that shows a study to those who carry it out."""
+"""Path, below the address of the server, of the page for the people who carry out a study."""
 
 Subject = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[\x20-\x7e]+$")]
 """Id of a person at an identity provider: at most 255 ASCII characters (OpenID Connect Core, section 2)."""
@@ -41,8 +41,9 @@ class BrowserSignInCreate(Request):
         None,
         ge=1024,
         le=65535,
-        description="Port of this machine at which the program waits for the code: the server sends the browser to "
-        "http://127.0.0.1:<port>/. Null: the browser shows the code, and the person copies it into the program.",
+        description="Port on which the program waits for the code, on the machine of the browser: the server "
+        "redirects the browser to http://127.0.0.1:<port>/. Null: the browser shows the code, and the person "
+        "copies it into the program.",
     )
     expires_in_s: LoginSeconds = Field(
         LOGIN_DAYS * DAY_S, description="Seconds for which the new token is valid; the server may allow fewer."

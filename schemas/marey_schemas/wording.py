@@ -26,7 +26,7 @@ def one_of(names: Sequence[str]) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name that is most like a misspelt one, upper and lower case being equal; None if none is."""
+    """Return the known name that is most similar to a misspelt name, ignoring case; None if no name is similar."""
     by_lower = {one.lower(): one for one in known}
     near = get_close_matches(name.lower(), by_lower, n=1)
     return by_lower[near[0]] if near else None
@@ -45,6 +45,6 @@ def plain_reason(message: str) -> str:
 def printable(text: str) -> str:
     """Return a text whose control characters are escaped, except ends of lines.
 
-    Other users wrote parts of many texts, and must not control the terminal of who reads them.
+    Many texts contain parts that other users wrote, and these must not control the terminal of the reader.
     """
     return "".join(one if one.isprintable() or one == "\n" else ascii(one)[1:-1] for one in text)

@@ -172,7 +172,7 @@ def test_a_preview_changes_nothing_and_events_record_the_purge(lab: Lab, owner: 
 
 WRONG: list[Any] = [
     ({}, 422, "give an item, a path, a collection or a query"),
-    ({"preview": True}, 422, "an empty collection is the whole project"),
+    ({"preview": True}, 422, "an empty collection means the whole project"),
     ({"collection": "raw", "older_than_days": -1}, 422, "older_than_days"),
     ({"collection": "raw", "oldr_than_days": 1}, 422, "oldr_than_days"),
     ({"collection": "raw", "kind": "stone"}, 422, "kind"),

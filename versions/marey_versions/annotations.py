@@ -49,7 +49,7 @@ class AnnotationVersion(NamedTuple):
 
 
 class AnnotationClash(NamedTuple):
-    """Reason, in a sentence, why the changes of an annotation cannot be combined."""
+    """Reason why the changes of both sides to an annotation cannot be combined, as a sentence."""
 
     reason: str
     segments: LabelClash[LabelledRange] | None = None
@@ -214,7 +214,7 @@ class _Sets(NamedTuple, Generic[Labelled]):
 
     @property
     def removed_twice(self) -> set[Labelled]:
-        """Segments or keyframes of the base that neither side has."""
+        """Segments or keyframes of the base that both sides have removed."""
         return self.base - self.ours - self.theirs
 
     @property

@@ -50,7 +50,7 @@ class ChangeAtPath:
 
 @dataclass
 class PathComparer:
-    """Comparer of versions at one path; it counts the entries that it has read."""
+    """Comparison of versions at one path, which counts the entries that were read."""
 
     reader: ChunkReader
     path: str

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 
 class BadCommitSearch:
-    """State of a search. The suspects are the commits that can be the first bad one; each test rules out some.
+    """Search for the first bad commit. The suspects are the commits that can be this commit; tests exclude some.
 
     The search assumes that the commits after a bad commit are bad, and that the ancestors of a good commit are good. A
     test leaves one number of suspects if the tested commit is bad, and another number if it is good. The search tests
@@ -40,7 +40,7 @@ class BadCommitSearch:
 
     @property
     def suspects(self) -> tuple[str, ...]:
-        """The commits that can be the first bad one, parents first; only the last one is known to be bad."""
+        """The commits that can be the first bad commit, parents first; only the last of them is known to be bad."""
         return tuple(self._order[place] for place in _places_in(self._left))
 
     @property

@@ -20,7 +20,7 @@ class Choice(NamedTuple):
 
 
 class Choices:
-    """Resolutions that are left. Each decides one conflict only, because a person has seen no other one."""
+    """Resolutions that are left. Each decides only one conflict, because its author has seen no other conflict."""
 
     def __init__(self, resolutions: Iterable[Choice], used: set[str]) -> None:
         self._left: defaultdict[str, deque[Choice]] = defaultdict(deque)
@@ -29,7 +29,7 @@ class Choices:
         self._used = used
 
     def take(self, key: str, groups: Mapping[str, Collection[str]], sides: Container[Side]) -> Side | dict[str, Side]:
-        """Return the decision about the next conflict with this key, and use up the resolutions that make it.
+        """Return the decision about the next conflict with this key, and remove the resolutions on which it is based.
 
         The decision is a side, or the sides of single parts; parts without a resolution are missing. `groups` contains
         for each part in conflict the parts that must come from the same side, the part itself included. A resolution of

@@ -36,8 +36,9 @@ class MergeConflict(NamedTuple):
     clash: AnnotationClash | None = None
     """The reason why an annotation could not be merged segment by segment."""
     no_way_back: str | None = None
-    """Path at which the entry that gives way cannot stay, because another entry is there. Set only if a resolution has
-    decided the conflict: it remains a conflict, because the entry would be lost."""
+    """Path to which an entry would have to return, but at which another entry is. Set only if a resolution has decided
+    the conflict; the conflict remains, because the entry would be lost.
+    """
 
     @property
     def key(self) -> str:
@@ -57,13 +58,13 @@ class ChangedPart(NamedTuple):
 
 
 MergeParts = Callable[[Sequence[ChangedPart]], Sequence[str | AnnotationClash | None]]
-"""Function that merges the documents of parts. For each part, it returns the content digest of the merged document, the
-reason why the changes exclude each other, or None if parts of this kind are not merged.
+"""Function that merges the documents of parts. For each part, it returns one of three values: the content digest of the
+merged document, the reason why the changes exclude each other, or None if parts of this kind are not merged.
 """
 
 
 class CombinedEntry(NamedTuple):
-    """Entry whose parts come from several versions, so that none of them has a revision with its content."""
+    """Entry whose parts come from several versions, so that no version has a revision with the content of the entry."""
 
     entry: DatasetEntry
     sides: tuple[DatasetEntry, ...]
@@ -100,8 +101,8 @@ def merge_entries(
     Parameters
     ----------
     ours, theirs : the entries that differ between the base and each side
-    resolutions : decisions about conflicts. Each decides one conflict, or one part of it; of several conflicts with the
-        same key, the first resolutions with this key decide the first, and so on
+    resolutions : decisions about conflicts. Each decides one conflict, or one part of a conflict. If several conflicts
+        have the same key, the first resolutions with this key decide the first of these conflicts, and so on
     merge_parts : merges the parts that both sides have changed; None: such parts are in conflict
 
     Returns
@@ -197,7 +198,7 @@ class _Sides:
 
     @property
     def by_name(self) -> dict[Side, DatasetEntry | None]:
-        """The entry by the name of the version; without the base if the base does not have it."""
+        """The entry by the name of the version; `base` is missing if the base does not have the entry."""
         found = {Side.OURS: self.ours, Side.THEIRS: self.theirs}
         return found if self.base is None else {**found, Side.BASE: self.base}
 
@@ -286,11 +287,11 @@ def _gets_place_of_theirs(one: _Decided) -> bool:
 
 
 def _collide(one: _Decided, held: dict[str, _Decided], choices: Choices) -> MergeConflict | None:
-    """Decide which of two entries gets a key; the other one goes back to its own place.
+    """Decide which of two entries gets a key; the other entry returns to its earlier path.
 
-    `held` contains entries by key; one of them has the key that `one` should get. The other entry is dropped if it has
-    no earlier path, because a side has added it. The result is a conflict if there is no resolution, or if the earlier
-    path is taken.
+    `held` contains entries by key; one of them has the key that `one` should get. If a side has added the entry that
+    does not get the key, this entry has no earlier path and is dropped. The result is a conflict if there is no
+    resolution, or if the earlier path is taken.
     """
     key = one.result.key
     other = held[key]
@@ -371,5 +372,5 @@ def _merged_tags(base: DatasetEntry | None, ours: DatasetEntry, theirs: DatasetE
 
 
 def _newer(part: str, of_base: Mapping[str, str], ours: DatasetEntry, theirs: DatasetEntry) -> str | None:
-    """Return a part as the side that has changed it has it."""
+    """Return a part in the version of the side that has changed it."""
     return (theirs if ours.parts.get(part) == of_base.get(part) else ours).parts.get(part)

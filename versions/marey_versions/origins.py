@@ -19,9 +19,9 @@ PATH = "path"
 TAGS = "tags"
 """Name of the origin of an entry's tags."""
 MOST_CHANGES = 100_000
-"""Number of changed entries up to which moved entries are searched for in a commit.
+"""Greatest number of changed entries of a commit among which a moved entry is searched for.
 
-The search continues in other commits until it has read more entries than this in total.
+When a search has read more changed entries than this in total, it searches no further commits for moved entries.
 """
 
 
@@ -46,7 +46,7 @@ class _OriginSearch:
     sought: dict[tuple[str, str], set[str]] = field(default_factory=dict)
     """For each commit and key: names of the parts whose origin is this commit or an earlier one."""
     ended: set[str] = field(default_factory=set)
-    """Commits in which moved entries were not searched for, because they or the commits before changed too many."""
+    """Commits in which moved entries were not searched for, because too many changed entries had been read."""
     compared: int = 0
     """Number of changed entries that were read to search for moved entries."""
 
@@ -60,7 +60,7 @@ class _OriginSearch:
         return None if value is None else entry_of(key, value)
 
     def before(self, parent: str, commit: str, key: str) -> DatasetEntry | None:
-        """Return the entry in a parent of the commit, perhaps under another key; None if it is not found there."""
+        """Return the entry in a parent of the commit, perhaps under another key; None if the parent lacks it."""
         trees = [self.commit_of(one).tree for one in (parent, commit)]
         same, present = self.entry(parent, key), self.entry(commit, key)
         if trees[0] == trees[1] or (same and present and same.parts.items() & present.parts.items()):
@@ -132,5 +132,5 @@ def _pass_to_parents(search: _OriginSearch, commit: str, key: str, names: set[st
 
 
 def _named(entry: DatasetEntry) -> Mapping[str, Any]:
-    """Return everything in an entry that a commit can change, by name: the parts, the path and the tags."""
+    """Return all values of an entry that a commit can change, by name: the parts, the path and the tags."""
     return {**entry.parts, PATH: entry.path, TAGS: entry.tags}

@@ -208,10 +208,10 @@ class CommitRecord:
             record = cls(*(document[name] for name in ("tree", "parents", "author", "message", "at")))
             record = replace(record, parents=tuple(record.parents))
         except (KeyError, TypeError) as error:
-            raise ValueError("the document is not that of a commit") from error
+            raise ValueError("the document is not the record of a commit") from error
         texts = (record.tree, *record.parents, record.author, record.message, record.at)
         if not all(isinstance(one, str) for one in texts) or record.document != document:
-            raise ValueError("the document is not that of a commit")
+            raise ValueError("the document is not the record of a commit")
         return record
 
     @property

@@ -79,12 +79,12 @@ log = logging.getLogger(__name__)
 WATCH_EVERY_S = 0.1
 LOG_EVERY_S = 2.0
 STOPPING_S = 2.0
-"""Longest time in seconds between the SIGTERM that ended a child and the one that stops its worker."""
+"""Longest time in seconds between the SIGTERM that ended a child process and the SIGTERM that stops the worker."""
 ANSWER_LIMIT_BYTES = 32 * MIB
 MOST_BLOB_BYTES = 1 << 30
-"""Greatest size of a blob that a job may read, because this process, whose memory has no limit, holds it in memory."""
+"""Greatest size in bytes of a blob that a job may read; this process, which has no memory limit, holds the blob."""
 _REFUSED = (Conflict, Forbidden, Invalid, NotFound, TooLarge)
-"""Answers of the server that say why results cannot be published."""
+"""Error answers of the server after which results cannot be published."""
 MEMORY_PER_BLOB = 4
 """Least ratio of a job's memory limit to the size of a blob; the child needs several times the size of a file."""
 TRANSFERS_AT_ONCE = 4
@@ -211,9 +211,9 @@ class RunningAttempt:
                 return stop
 
     def _check(self, child: ChildProcess | None) -> Stop | None:
-        """Send new output in a thread of its own every `LOG_EVERY_S` seconds; return the reason to stop now, or None.
+        """Send new output every `LOG_EVERY_S` seconds in a separate thread; return the reason to stop now, or None.
 
-        While the server is away, one upload of the log waits for it, and delays neither inputs nor results.
+        If the server does not answer, only the thread that sends the log waits; inputs and results are not delayed.
         """
         sent = self._log_sending is None or self._log_sending.done()
         if sent and time.monotonic() > self._log_due:
@@ -368,7 +368,7 @@ class RunningAttempt:
         )
 
     def _try_to_send_log(self) -> None:
-        """Send new output; if this fails, log the failure only, so that no result is lost because of it."""
+        """Send new output. A failure is only logged, so that no result is lost because of it."""
         try:
             self._job_log.send()
         except LeaseLost:
@@ -378,7 +378,7 @@ class RunningAttempt:
 
 
 def _not_stored(staging: Future[ChildReply | None]) -> bool:
-    """Return whether results are not yet stored, or could not be stored."""
+    """Return whether staged results are not stored yet, or could not be stored."""
     reply = staging.result() if staging.done() else None
     return reply is None or reply.refusal is not None
 

@@ -62,7 +62,7 @@ class AttemptTrace:
 
     @contextmanager
     def transfer(self, request: Request) -> Iterator[None]:
-        """Record a request of the child process while the `with` block runs, in any thread."""
+        """Record a request of the child process while the `with` block runs. Any thread may call this."""
         computing = self._computing
         if computing is None:
             yield

@@ -151,7 +151,9 @@ def _known_kinds(names: tuple[str, ...]) -> tuple[str, ...]:
     except (UnknownKindError, ValueError) as error:
         raise MareyError(str(error)) from error
     if SCRIPT in found and SCRIPT not in runnable:
-        raise MareyError(f"a worker runs scripts only if {REPOSITORIES_VARIABLE} lists the repositories it may use")
+        raise MareyError(
+            f"this worker cannot run scripts: set {REPOSITORIES_VARIABLE} to the repositories that scripts may use"
+        )
     return found or runnable
 
 

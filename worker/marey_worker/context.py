@@ -120,7 +120,7 @@ class Context:
     def document(self, kind: Kind, item: str, revision: int, part: str, *, required: bool = True) -> Any:
         """Return a part of a revision, with arrays as numpy arrays.
 
-        If the part does not exist, raises `NoSuchThing`, or returns None if the part is not required.
+        If the part does not exist, returns None if `required` is false; otherwise raises `NoSuchThing`.
         """
         ((_, document),) = self._read_ahead([(None, PartPlace(kind=kind, item=item, revision=revision, part=part))])
         if document is None and required:
@@ -133,8 +133,8 @@ class Context:
     ) -> Iterator[tuple[PinnedInput, Any]]:
         """Yield each input with its part named `part`.
 
-        If the part does not exist, and it is not `required`, None is yielded in place of the part. While the caller
-        uses one input, the parts of the next inputs are read.
+        If the part does not exist, None is yielded in its place if `required` is false; otherwise, `NoSuchThing` is
+        raised. While the caller uses one input, the parts of the next inputs are read.
         """
         for pin, (document,) in self.documents_of_each(pins, part):
             if document is None and required:
@@ -169,9 +169,9 @@ class Context:
         return [Item.model_validate(item) for item in found]
 
     def judgements(self, study: PinnedInput) -> list[JudgingParticipant]:
-        """Return what the participants who saw the revision of a study answered, under pseudonyms.
+        """Return the answers of the participants who saw a revision of a study; participants have pseudonyms.
 
-        Raises `Unreadable` if the author of the job may not read this.
+        Raises `Unreadable` if the user who submitted the job may not read the answers.
         """
         asked = self._send(lambda request: ReadJudgements(request, study.item, study.revision))
         return [JudgingParticipant.model_validate(one) for one in self._value(asked, "no-study")]

@@ -30,7 +30,7 @@ Jobs that end sooner send no heartbeat.
 
 TICK_S = 0.25
 JITTER = 0.2
-"""Largest part of an interval that is subtracted at random, so that attempts do not send at the same time."""
+"""Largest share of an interval that is subtracted at random, so that attempts send heartbeats at different times."""
 
 
 class LeaseKeeper:

@@ -108,7 +108,7 @@ class ReadResults:
 
 @dataclass(frozen=True)
 class ReadJudgements:
-    """Request for what the participants of a revision of a study answered; the answer contains one tree for each."""
+    """Request for the answers of the participants of a revision of a study; the reply has one tree for each."""
 
     request: int
     item: str

@@ -1,8 +1,8 @@
 """Worker that runs one job, in a pod that was started for this job.
 
-The pod may be one of several, because a cluster may start a pod twice. While another worker holds the job, this one
-waits. When the lease of the other one has expired, it claims the job with a newer fence. It ends when the job has
-ended, no matter who ended it.
+A cluster may start several pods for one job. While another worker holds the job, this worker waits. If the lease of the
+other worker expires, this worker claims the job with a newer fence. It ends when the job has ended, whichever worker
+ran the job.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ STAND_BY_S = 5.0
 
 @dataclass(frozen=True)
 class NamedJob:
-    """Job that a worker was started for: a job, or the task with a position among the tasks of a job."""
+    """Job that a worker was started for: the job `id`, or the task with the position `task` of this job."""
 
     id: str
     task: int | None = None
@@ -63,8 +63,8 @@ class OneJobWorker:
     def run(self) -> int:
         """Run the job, or wait until another worker has ended it; return the exit status.
 
-        0: the job has ended, or an attempt has succeeded; 1: the attempt has failed, and the queue decides what
-        follows; `INTERRUPTED_STATUS`: the worker was stopped, whether it held the job or not, because the pod must not
+        0: the job has ended, or an attempt has succeeded; 1: the attempt has failed, and the queue decides about a
+        retry; `INTERRUPTED_STATUS`: the worker was stopped, whether it held the job or not, because the pod must not
         count as a success; `REFUSED_STATUS`: the server refuses this worker, and will refuse the next one.
         """
         log.info("%s works on %s for %s", self._options.name, self._wanted.id, self._transport.url)

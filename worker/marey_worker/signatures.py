@@ -13,11 +13,11 @@ NAME_CHARACTERS = 200
 """Greatest number of characters of the name of an exception class; the digest concerns the whole name."""
 
 STAGING = "staging"
-"""Signature of the failure that the server did not store results."""
+"""Signature of failures in which the server did not store the results."""
 
 
 def of_exception(error: BaseException) -> str:
-    """Return the signature of an exception: its type, and a digest of its type and traceback, but not of its text."""
+    """Return the signature of an exception: its type, and a digest of type and traceback. The text is not included."""
     frames = traceback.extract_tb(error.__traceback__)
     places = [f"{frame.filename.rpartition('/')[2]}:{frame.name}:{frame.lineno}" for frame in frames]
     digest = hashlib.sha256("\n".join([type(error).__qualname__, *places]).encode()).hexdigest()

@@ -182,7 +182,7 @@ class Supervisor:
     def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
         """Run a job; return a future that ends when the results are stored and the end of the job is reported.
 
-        After a success, this method returns before the future ends, so that the child can run the next job meanwhile.
+        After a success, this method returns before the future ends, so that the child can already run the next job.
         """
         place = (lease.job, lease.fence)  # a lost job may run again before its former attempt has ended
         self._running.add(place)
@@ -214,8 +214,8 @@ class Supervisor:
 class _OpenClaim:
     """Claim that is repeated with the same token and the same id until it is answered.
 
-    The server repeats an answer only for the token with which the claim was sent first. So this token is used even if
-    it was replaced in the meantime.
+    The server repeats its answer only for the token with which the claim was first sent. So a repeated claim uses this
+    token, even if the worker has a newer token by then.
     """
 
     transport: Transport
@@ -223,7 +223,7 @@ class _OpenClaim:
 
 
 class _SlotChild:
-    """Child process of a slot; it is replaced after it has died, and after a certain number of jobs."""
+    """Child process of a slot, which is replaced after it has died and after a certain number of jobs."""
 
     def __init__(self, options: WorkerOptions) -> None:
         self._options = options

@@ -1,10 +1,10 @@
-"""Texts in the requests of a worker, in a form that the server accepts."""
+"""Conversion of texts in the requests of a worker to a form that the server accepts."""
 
 from __future__ import annotations
 
 
 def storable(text: str, most: int) -> str:
-    """Return a text without characters that no database stores, shortened to at most `most` characters.
+    """Return a text that every database can store, shortened to at most `most` characters.
 
     NUL and lone surrogates, which occur in names of files that are not valid UTF-8, are written as escape sequences.
     """

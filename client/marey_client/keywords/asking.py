@@ -18,8 +18,8 @@ class ImportKeywords(TypedDict, total=False):
     collection: str
     """Folder of the project that receives the clips."""
     skeleton: str | None
-    """Item id of the skeleton that the clips must use; `marey upload` and Python also take its path. Absent: an equal
-    skeleton of the project, or a new one."""
+    """Item id of the skeleton that the clips must use; `marey upload` and Python also accept the path of the item.
+    Absent: an equal skeleton of the project is used, or a new skeleton is created."""
     unit: Literal["mm", "cm", "inch", "cmu", "dm", "ft", "m"] | None
     """Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."""
     unit_scale_m: float | None
@@ -33,15 +33,15 @@ class ImportKeywords(TypedDict, total=False):
     frame_rate_hz: float | None
     """Frame rate of the clips, in hertz. Absent: the rate in the files."""
     trust_options: bool
-    """Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise such files are
-    refused."""
+    """Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise, files with a
+    contradiction are refused."""
     end_index: Literal["inclusive", "exclusive"] | None
     """Whether a section of an annotation in a file of Marey's predecessor includes its frame `end_idx`, as in the
     predecessor's editor, or ends before this frame, as in its time warping. Absent: exclusive if sections would overlap
     otherwise, else inclusive."""
     replace_skeleton: bool
-    """Make a new revision of a clip or model of the same name, even if the file has another skeleton; otherwise such
-    files are refused."""
+    """Make a new revision of a clip or model of the same name, even if the file has another skeleton; otherwise, a file
+    with another skeleton is refused."""
     trim_rest_pose: bool
     """Remove rest poses at the beginning and at the end of each clip."""
     tags: list[str] | tuple[str, ...]
@@ -67,7 +67,8 @@ class LineageKeywords(TypedDict, total=False):
     """Fields of `LineageOptions`."""
 
     direction: Literal["inputs", "results", "both"]
-    """`inputs`: what the revision was made from; `results`: what was made from it; `both`."""
+    """`inputs`: the revisions from which the revision was made; `results`: the revisions that were made from it;
+    `both`: inputs and results."""
     depth: int
     """Greatest number of jobs between the start of the graph and any of its revisions."""
 
@@ -80,7 +81,7 @@ class EditPreviewKeywords(TypedDict, total=False):
     piece: int
     """Index of the result to return, if the commands split the clip."""
     fields: Sequence[Literal["motion", "positions", "findings"]]
-    """Content of the answer in addition to the counts."""
+    """Content of the answer, in addition to the numbers of clips and frames."""
 
 
 class SearchKeywords(TypedDict, total=False):
@@ -97,7 +98,8 @@ class SearchKeywords(TypedDict, total=False):
     candidates: int
     """Number of nodes of the tree that the search follows at each level."""
     passes: int
-    """Number of passes; 1: only the tree's samples; each further pass searches near the best samples so far."""
+    """Number of passes. The first pass searches the samples of the tree; each further pass searches near the best
+    samples so far."""
     refine: bool
     """Improve the result of the tree by numerical optimisation."""
     transition_tolerance_m: float
@@ -134,7 +136,8 @@ class PurgeKeywords(TypedDict, total=False):
     path: str | None
     """Path, made of folder and name, that deleted items had."""
     collection: str | None
-    """Folder: the deleted items in it and below it; empty: those of the whole project."""
+    """Folder whose deleted items are purged, including those in folders below it; empty: the deleted items of the whole
+    project."""
     kind: Kind | str | None
     """Kind of the items; absent: all kinds."""
     query: str | None

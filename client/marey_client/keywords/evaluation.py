@@ -39,7 +39,8 @@ class DatabaseKeywords(TypedDict, total=False):
     """Fields of `DatabaseOptions`."""
 
     mirroring: Literal["none", "add", "only"]
-    """add: every clip and its mirrored copy; only: the mirrored copies alone."""
+    """Mirrored copies of the clips. none: the clips alone; add: every clip and its mirrored copy; only: the mirrored
+    copies alone."""
     end_policy: Literal["clamp", "trim", "loop"]
     """Trajectory features near a clip's end. clamp: the last frame is repeated, and the last 1/3 s is not selected;
     trim: the last second is not selected; loop: the clip's beginning follows, for clips marked as loops."""
@@ -91,32 +92,33 @@ class VerdictLimitsKeywords(TypedDict, total=False):
     """Fields of `VerdictLimits`."""
 
     lag_s: float
-    """Greatest mean distance from the desired position, as the time in seconds to cover it."""
+    """Greatest mean distance from the desired position, given as the time in seconds to cover the distance at the mean
+    speed of the trial."""
     speed_share: float
-    """Greatest error of the mean speed, as a share of the desired speed; for each speed of a switching trial, away from
-    the switches."""
+    """Greatest error of the mean speed, as a share of the desired speed. In a switching trial, each speed is measured
+    separately, away from the switches."""
     turn_deg_s: float
     """Greatest error of the mean turn rate, in degrees per second."""
     heading_deg: float
     """Greatest root mean square error of the heading, in degrees; the baseline reaches 12."""
     speed_wobble_share: float
-    """Greatest standard deviation of the speed, as a share of the desired speed; in a switching trial away from the
-    switches, as a share of the faster speed, because the character catches up after a switch. The baseline reaches
-    0.19."""
+    """Greatest standard deviation of the speed, as a share of the desired speed. In a switching trial, it is measured
+    away from the switches, as a share of the faster speed, because the character catches up after a switch. The
+    baseline reaches 0.19."""
     turn_wobble_deg_s: float
     """Greatest standard deviation of the turn rate, in degrees per second; the sway of the steps of the baseline
     reaches 21."""
     response_s: float
-    """Greatest median time to answer a switch of the speed, in seconds; switches without an answer count as longer than
-    all others."""
+    """Greatest median time in which the character responds to a switch of the speed, in seconds. Switches without a
+    response count as longer than all others."""
     skate_m_s: float
-    """Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more; by default the
-    speed up to which a foot counts as standing."""
+    """Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more. The default is
+    the greatest speed of a foot that counts as standing."""
     skate_ratio: float
-    """Greatest ratio of this speed to that of the clips shown."""
+    """Greatest ratio of the mean speed of feet in contact to the same speed in the clips shown."""
     sinking_m: float
-    """Depth below the floor of the clips shown that the feet keep within for 95 % of the time, in metres; the baseline
-    sinks by 0.006."""
+    """Greatest depth of the feet below the floor of the clips shown, in metres, of which the deepest 5 % of the time
+    are left out; the baseline reaches 0.006."""
     step_ratio: float
     """Greatest ratio between the contacts per metre of the trial and of the clips shown, in either direction; the ratio
     of the baseline is between 0.97 and 1.05."""
@@ -153,11 +155,11 @@ class EvaluateKeywords(TypedDict, total=False):
     switch_every_s: float
     """Seconds that each speed of a switching trial lasts."""
     replicates: int
-    """Number of replicates: each trial runs so often, each time with another phase of the stride at the start, and with
-    an approach that is up to one second longer. Results are means with 95 % intervals. 1: only the trial itself, as
+    """Number of replicates of each trial. Each replicate has a different phase of the stride at the start, and an
+    approach that is up to one second longer. Results are means with 95 % intervals. 1: only the trial itself, as
     published, without intervals."""
     seed: int
-    """Number from which the replicates are drawn."""
+    """Seed of the random differences between the replicates of a trial."""
     window: Literal["circle", "all"]
     """Part of a trial that is measured. circle: the circle only; all: also the approach."""
     coverage_least_s: float
@@ -205,7 +207,8 @@ class ObjectiveKeywords(TypedDict, total=False):
     pose_cost: float
     """Metres that a pose cost of 1 m adds to the objective."""
     seconds: float
-    """Metres that each second of data adds to the objective; a clip that lowers the other terms by less is removed."""
+    """Metres that each second of data adds to the objective. A clip is removed if it lowers the other terms by less
+    than its duration adds."""
 
 
 class SuggestKeywords(TypedDict, total=False):
@@ -214,22 +217,24 @@ class SuggestKeywords(TypedDict, total=False):
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
     estimation_replicates: int
-    """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
-    the evaluation. Confirmations begin after the last replicate of both."""
+    """Number of replicates of each trial in which effects are estimated, in order to choose among them. They are
+    numbered from 0, like the replicates of the evaluation. Confirmations use replicates with higher numbers than
+    both."""
     confirmation_replicates: int
-    """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
-    intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose effect
-    is equal in all replicates, unless it changes no trial."""
+    """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
+    with intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose
+    effect is equal in all replicates, unless the step changes no trial."""
     confirmation_seed: int
-    """Seed of these other replicates: with another seed, the same choices are confirmed again."""
+    """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
+    replicates."""
     removals: int
     """Number of clips whose removal is planned, in addition to the unused clips; 0: none."""
     simulated_additions: int
-    """Number of clips to add whose effect on the trials is simulated, in the order of the additions; each takes as long
-    as an evaluation with `confirmation_replicates`."""
+    """Number of suggested additions whose effect on the trials is simulated, in their order. Each simulation takes as
+    long as an evaluation with `confirmation_replicates`."""
     consider: int | None
-    """Number of clips whose removal is tried, one at a time, beginning with the clips that the fewest trials use; null:
-    all."""
+    """Number of clips whose removal is tried, one clip at a time, beginning with the clips that the fewest trials use;
+    null: all clips."""
     duplicate_cm: float
     """Greatest distance per frame between near-duplicates, in centimetres."""
     blendable_m: float | None
@@ -249,17 +254,19 @@ class OptimiseKeywords(TypedDict, total=False):
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
     estimation_replicates: int
-    """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
-    the evaluation. Confirmations begin after the last replicate of both."""
+    """Number of replicates of each trial in which effects are estimated, in order to choose among them. They are
+    numbered from 0, like the replicates of the evaluation. Confirmations use replicates with higher numbers than
+    both."""
     confirmation_replicates: int
-    """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
-    intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose effect
-    is equal in all replicates, unless it changes no trial."""
+    """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
+    with intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose
+    effect is equal in all replicates, unless the step changes no trial."""
     confirmation_seed: int
-    """Seed of these other replicates: with another seed, the same choices are confirmed again."""
+    """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
+    replicates."""
     least_gain: float
-    """Least decrease of the objective of a step, in metres, in addition to its confirmation. Chance needs no allowance
-    here, because only steps that are confirmed are made."""
+    """Least decrease of the objective that a step must achieve, in metres. The value 0 is enough to exclude effects of
+    chance, because every step must also be confirmed."""
     max_steps: int
     """Greatest number of steps."""
     max_evaluations: int | None
@@ -267,7 +274,7 @@ class OptimiseKeywords(TypedDict, total=False):
     max_data_s: float | None
     """Greatest duration of the set in seconds; no clip is added that would exceed this duration; null: no limit."""
     consider: int | None
-    """Number of removals and number of additions to try in each step; null: all."""
+    """Number of removals, and number of additions, to try in each step; null: all."""
 
 
 class SweepKeywords(TypedDict, total=False):
@@ -276,14 +283,16 @@ class SweepKeywords(TypedDict, total=False):
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
     estimation_replicates: int
-    """Number of replicates of each trial in which effects are estimated, to choose among them; the first are those of
-    the evaluation. Confirmations begin after the last replicate of both."""
+    """Number of replicates of each trial in which effects are estimated, in order to choose among them. They are
+    numbered from 0, like the replicates of the evaluation. Confirmations use replicates with higher numbers than
+    both."""
     confirmation_replicates: int
-    """Number of other replicates in which the chosen effects are measured again: the effects that are reported, with
-    intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose effect
-    is equal in all replicates, unless it changes no trial."""
+    """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
+    with intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose
+    effect is equal in all replicates, unless the step changes no trial."""
     confirmation_seed: int
-    """Seed of these other replicates: with another seed, the same choices are confirmed again."""
+    """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
+    replicates."""
     factors: Sequence[float]
     """Factors to try. Each setting multiplies the weight of one group of features by one factor and leaves all other
     weights unchanged."""

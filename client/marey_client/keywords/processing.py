@@ -31,9 +31,9 @@ class CutKeywords(TypedDict, total=False):
     labels: list[str] | tuple[str, ...]
     """Labels of the segments to cut out; empty: all labels."""
     margin_before_s: float
-    """Seconds before each segment that are included, as far as the clip has them."""
+    """Seconds before each segment that are also cut out, as far as the clip contains them."""
     margin_after_s: float
-    """Seconds after each segment that are included, as far as the clip has them."""
+    """Seconds after each segment that are also cut out, as far as the clip contains them."""
     shortest_s: float
     """Shortest segment to cut out, in seconds."""
     longest_s: float | None
@@ -67,13 +67,13 @@ class AlignKeywords(TypedDict, total=False):
     reference: str
     """Clip whose time is the canonical time. medoid: the clip nearest to all others (of more than 200 clips, the clip
     of a random sample of 200 that is nearest to all others of the sample); nearest_mean_length: the clip whose length
-    is nearest to the mean; or the id of a clip, of which commands and Python also take the path."""
+    is nearest to the mean; or the id of a clip; commands and Python also accept the path of the clip."""
     rate_hz: float | None
     """Rate of the canonical frames, in hertz; absent: the frame rate of the reference if a clip is given as reference,
     else the most common frame rate of the clips."""
     slope_limit: int | None
-    """Greatest number of consecutive steps that advance only one of the clips; so one frame is matched with at most
-    this number of frames plus one. null: no limit."""
+    """Greatest number of consecutive steps of the path that advance only one of the two clips. With the limit n, a
+    frame is matched with at most n + 1 frames. null: no limit."""
     weights: Mapping[str, float]
     """Weight of each joint in the cost, by its own or its standard name; default 1, and 0 for joints that move no part
     of the body."""
@@ -84,7 +84,8 @@ class AlignKeywords(TypedDict, total=False):
     labels: list[str] | tuple[str, ...]
     """Labels whose segments and keyframes cut the clips; empty: all labels."""
     mirroring: Literal["none", "add"]
-    """add: use each clip and its mirrored copy."""
+    """Mirrored copies of the clips. none: only the clips themselves are aligned; add: each clip and its mirrored
+    copy."""
 
 
 class EditKeywords(TypedDict, total=False):
@@ -119,9 +120,9 @@ class QualityKeywords(TypedDict, total=False):
     """Frame rate in hertz at which clips are measured. Clips of a higher rate are resampled; clips of a lower rate are
     refused."""
     floor: Literal["planted", "zero"]
-    """Height from which the heights of feet are counted. planted: the height of the same joint while it stands on the
-    floor, which is the 5th percentile of its heights in the clip; zero: height 0, as published. Penetration is always
-    counted from height 0."""
+    """Reference from which the heights of feet are measured. planted: the height of the joint while the foot stands on
+    the floor, which is the 5th percentile of the heights of the joint in the clip; zero: height 0, as published.
+    Penetration is always measured from height 0."""
     weighted_height_m: float
     """Height in metres at which the weight of the weighted foot skate has fallen to 0."""
     near_height_m: float

@@ -19,15 +19,15 @@ UNITS = {
     "m": "m", "cm": "cm", "mm": "mm", "km": "km", "s": "s", "ms": "ms", "min": "min", "h": "h", "hz": "Hz", "kg": "kg",
     "deg": "°", "rad": "rad", "percent": "%", "mb": "MB", "gb": "GB", "bytes": "bytes", "mps": "m/s", "fps": "frames/s",
 }  # fmt: skip
-"""Units that the last part of a name can be, such as `path_m`."""
+"""Symbols of units, by the last part of a field's name, such as `m` in `path_m`."""
 
 
 _REACH = 0.4
-"""Share of an axis by which intervals lengthen it at most."""
+"""Greatest extension of an axis at either end in order to show intervals, as a share of the length of the axis."""
 
 
 def add_chart(figure: Figure, place: Place, *, title: str, x: str, y: str = "") -> Axes:
-    """Add a panel like `add_panel`; names in its texts are written literally."""
+    """Add a panel like `add_panel`, but write the names in its texts literally, without mathematical notation."""
     panel = add_panel(figure, place, title=title, x=plain(x), y=plain(y))
     for axis in (panel.xaxis, panel.yaxis):
         axis.label.set_parse_math(False)
@@ -65,17 +65,17 @@ def spread(low: float, high: float, *, log: bool) -> tuple[float, float]:
 
 
 def widened(low: float, high: float, summaries: Sequence[FieldSummary]) -> tuple[float, float]:
-    """Widen the ends of an axis so that it contains the intervals of means, but not so far that runs look alike."""
+    """Extend the ends of an axis to contain the intervals of means, but only so far that runs stay distinct."""
     ends = [end for one in summaries for end in (one.low, one.high) if end is not None]
     reach = _REACH * (high - low)
     return max(min([low, *ends]), low - reach), min(max([high, *ends]), high + reach)
 
 
 def beside(axes: Axes, transform: Transform, inches: float) -> Transform:
-    """Return a transform of places on axes that moves them to the right by a distance in inches."""
+    """Return `transform` followed by a shift of `inches` to the right on the page."""
     from matplotlib.transforms import ScaledTranslation
 
     figure = axes.get_figure(root=True)
     if figure is None:
-        raise ValueError("the axes are on no page")
+        raise ValueError("the axes do not belong to a figure")
     return transform + ScaledTranslation(inches, 0.0, figure.dpi_scale_trans)

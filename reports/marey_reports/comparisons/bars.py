@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 
 MOST_BARS_DRAWN = 30
 NARROW = 0.7
-"""Share of the greatest value from which all values are so near to each other that bars from 0 would look equal."""
+"""Ratio of the least to the greatest value above which bars that start at 0 would look equally long."""
 _ROW, _ABOVE, _UNDER, _RIGHT, _PAGE = 0.27, 0.62, 0.6, 1.65, 9.6
 _SIGN = 0.068
 """Width of a character in inches."""
 
 
 def draw_bars(subject: ComparedSubject, column: ComparedColumn) -> Sketch | None:
-    """Draw the mean of a field for each setting; return None if no setting has one.
+    """Draw the mean of a field for each setting; return None if no setting has a mean.
 
-    Without a zero on the axis (a logarithmic axis, or values that are close together), dots replace the bars, because
-    lengths of bars would mislead.
+    If the axis does not contain zero (it is logarithmic, or the values are close together), dots replace the bars,
+    because the lengths of bars would be misleading.
     """
     points = subject.points(column.name)
     if not points:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MOST_OTHERS = 40
 """Greatest number of runs that are drawn in grey, behind the settings with colours."""
 MOST_BEYOND = 0.1
-"""Share of the range of the runs by which intervals extend the axis at most."""
+"""Greatest extension of the axis at either end in order to show intervals, as a share of the range of the runs."""
 
 
 class _MeanCurve(NamedTuple):
@@ -44,10 +44,10 @@ class _MeanCurve(NamedTuple):
 
 
 def draw_curves(subject: ComparedSubject, field: str) -> Sketch | None:
-    """Draw a field over steps; return None if no run logged it over steps.
+    """Draw a field over steps; return None if no run logged the field over steps.
 
     The first settings have colours, and the others are grey. A mean is drawn only at steps where all its runs have a
-    number, because the mean of those that are left would say too much.
+    number, because a mean of some of the runs would be misleading.
     """
     groups = _groups(subject, field)
     if not groups:
@@ -137,7 +137,7 @@ def _mark_break(panel: Axes, curve: Curve) -> None:
 
 
 def _limits(numbers: Floats, means: list[_MeanCurve], *, log: bool) -> tuple[float, float]:
-    """Return the limits of the vertical axis: all runs, and intervals as far as they do not dwarf the runs."""
+    """Return the limits of the vertical axis. They contain all runs; wide intervals may be cut off."""
     low, high = float(numbers.min()), float(numbers.max())
     reach = MOST_BEYOND * (high - low)
     ends = np.concatenate([np.concatenate((mean.low, mean.high)) for mean in means])

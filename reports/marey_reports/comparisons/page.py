@@ -40,13 +40,13 @@ def draw_comparison(
     parameter: str | None = None,
     log: bool = False,
 ) -> bytes:
-    """Draw runs: a page with all charts and tables as HTML, or one chart of one field as SVG or PNG.
+    """Draw a comparison of runs: an HTML page with all charts and tables, or one chart of one field as SVG or PNG.
 
     Parameters
     ----------
     comparison : with curves, if lines are to be drawn
-    plot : chart of a picture, or the only kind of chart of a page; None: the first kind that the runs have values for
-    parameter : name of the parameter on the horizontal axis; None: those that differ
+    plot : kind of the charts; None: all kinds on a page, in a picture the first kind for which the runs have values
+    parameter : name of the parameter on the horizontal axis; None: each parameter that differs
     log : whether axes of fields with positive values are logarithmic
 
     Returns
@@ -68,7 +68,7 @@ def draw_comparison(
 
 
 def _write_caption(figure: DrawnFigure) -> None:
-    """Write the caption below the chart, which is not on a page that shows it."""
+    """Write the caption below the chart, in a picture that is not part of an HTML page."""
     drawing = figure.sketch.figure
     lines = textwrap.wrap(plain(figure.caption), _CAPTION_SIGNS)
     width, before = drawing.get_size_inches()
@@ -152,7 +152,7 @@ def render_page(subject: ComparedSubject, plot: Plot | None, parameter: str | No
 
 
 def _verdict(subject: ComparedSubject) -> str:
-    """Name the best setting of the first field with a goal, and whether its interval is apart from all others."""
+    """Describe the best setting for the first field with a goal; mention an overlap with other intervals."""
     column = next((one for one in subject.fields if one.goal is not None and one.best_mean is not None), None)
     if column is None:
         return f"{counted(len(subject.comparison.runs), 'run')} are compared."

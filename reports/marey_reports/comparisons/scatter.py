@@ -28,11 +28,11 @@ WIDE = 100.0
 MOST_NAMES = 12
 """Greatest number of different texts on the horizontal axis."""
 MOST_NUMBERED = 24
-"""Greatest number of means beside which the number of runs is written."""
+"""Greatest number of means in a chart for which the number of runs is written beside each mean."""
 _APART, _BESIDE = 0.125, 0.083
-"""Distances of groups, and of runs from their mean, in inches."""
+"""Distance between neighbouring groups, and distance of runs from their mean, in inches."""
 _MOST_SIGNS = 60
-"""Number of characters from which texts along the axis are turned."""
+"""Greatest number of characters of all texts along the axis together; above this number, the texts are turned."""
 
 
 class _Across(NamedTuple):
@@ -51,8 +51,8 @@ class _Across(NamedTuple):
 def draw_scatter(subject: ComparedSubject, column: ComparedColumn, parameter: ComparedColumn) -> Sketch | None:
     """Draw a field over a parameter; return None if there are no numbers, or too many different texts.
 
-    Means are not joined by lines, because nothing is known of the values between them. If one further setting differs,
-    it has colours.
+    Means are not joined by lines, because nothing is known about values between them. If exactly one further parameter
+    differs, its values have different colours.
     """
     across = _across(subject, parameter)
     points = [one for one in subject.points(column.name) if across is not None and one.setting in across.places]
@@ -114,7 +114,11 @@ def _set_across(panel: Axes, across: _Across) -> None:
 
 
 def _further(subject: ComparedSubject, parameter: ComparedColumn, points: Sequence[Point]) -> dict[str, list[Point]]:
-    """Return the settings by the one further value that differs; all in one group if there are none, or several."""
+    """Group settings by their value in the only other column that differs.
+
+    All settings are in one group if no other column differs, if several differ, or if the column has too many
+    values.
+    """
     others = [column for column in subject.varied if column != parameter]
     groups: dict[str, list[Point]] = {}
     if len(others) == 1:

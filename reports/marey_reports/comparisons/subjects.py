@@ -16,9 +16,11 @@ from marey_schemas.queue.comparisons import ComparedColumn, ComparedRun, FieldSu
 LONGEST_LABEL, LONGEST_VALUE = 46, 24
 COMMIT_SIGNS = 8
 MOST_MISSING = 4
-"""Greatest number of settings without a mean that a caption names."""
+"""Greatest number of settings without a mean that a caption lists by name."""
 LARGEST, SMALLEST = 1e150, 1e-150
-"""Greatest magnitude of a number that is drawn, and the least one on a logarithmic axis: lengths of axes are floats."""
+"""Greatest magnitude of a drawn number, and least number on a logarithmic axis. With these bounds, differences and
+ratios stay finite.
+"""
 
 
 class Point(NamedTuple):
@@ -36,7 +38,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ComparedSubject:
-    """Comparison with what charts need to know of it.
+    """Comparison of runs, with the names and numbers that charts show.
 
     Parameters
     ----------

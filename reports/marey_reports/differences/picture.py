@@ -50,7 +50,7 @@ BEFORE, AFTER = REFERENCE, COLOURS[0]
 REMOVED, INSERTED = COLOURS[1], COLOURS[2]
 MATCHED = "#c9ced8"
 MOST_LABELS = 60
-"""Greatest number of segments in a row for which labels are written."""
+"""Greatest number of segments, or of keyframes, of an annotation whose labels are written in the picture."""
 
 UNKNOWN = "#c4e3dc"
 """Background colour of frames that correspond to no frame of the other revision."""
@@ -61,7 +61,7 @@ MOST_SIGNS = 16
 _WIDTH, _LEFT, _TIMES, _PATHS = 12.8, 1.7, 6.2, 2.5
 _ROW, _HIGHEST_ROW, _LEAST_ROWS, _ABOVE, _BELOW = 0.21, 0.36, 2.0, 2.35, 0.6
 _UPPER, _LOWER = (0.74, 0.74, 1.0, 1.0), (0.0, 0.0, 0.26, 0.26)
-"""Heights of the corners of the upper bar and of the lower bar."""
+"""Heights of the four corners of the upper bar, and of the lower bar, as shares of the height of the panel."""
 _THINNEST, _NAME_WIDTH = 0.004, 0.16
 """Least width of a bar, and width of a text such as `12 removed`, as shares of the duration of the longer motion."""
 
@@ -148,7 +148,7 @@ def _draw_runs(panel: Axes, motion: MotionDifference) -> None:
 
 
 def _name_runs(panel: Axes, motion: MotionDifference) -> None:
-    """Write the numbers of removed and inserted frames above and below the bars, where they do not overlap."""
+    """Write the numbers of removed frames above the bars and of inserted frames below, unless they would overlap."""
     width = _NAME_WIDTH * max(motion.duration_s)
     free = {"removed": 0.0, "inserted": 0.0}
     for run in motion.runs:

@@ -131,7 +131,7 @@ def _staged(take: TakePair, moments: int) -> _SheetRow:
 
 @dataclass(frozen=True)
 class _SheetCell:
-    """The place of one figure on the page.
+    """Place of one figure on a contact sheet.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def _draw_header(axes: Axes, top: float, heading: str, takes: str) -> None:
 
 
 def _draw_row(axes: Axes, row: _SheetRow, top: float, cell: float) -> None:
-    """Draw a title, then one cell with the figures of source and result for each time. `top` is in inches."""
+    """Draw the row of a take: its title, and for each time a cell with source and result. `top` is in inches."""
     _draw_titles(axes, row, top)
     low, high = row.extent_m
     width = 0.5 * cell

@@ -1,4 +1,4 @@
-"""Drawn figures: as PNG and as SVG, with the numbers that they show."""
+"""Figures as PNG and as SVG, with the numbers that they show."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Sketch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DrawnFigure:
-    """A figure; the PNG and the SVG are written when they are first requested.
+    """Figure of a report. The PNG and the SVG are written when they are first requested.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class DrawnFigure:
 
     @property
     def caption(self) -> str:
-        """The description of the figure, also for people who cannot see it."""
+        """The description of the figure, which also serves people who cannot see the figure."""
         return self.sketch.caption
 
     @property

@@ -64,7 +64,7 @@ class Place(NamedTuple):
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty page with the given size in inches."""
+    """Return an empty page with the given width and height in inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER)
@@ -120,7 +120,7 @@ def add_keys(axes: Axes, **options: Any) -> None:
 
 
 def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str], others: Sequence[str] = ()) -> None:
-    """Write the names of clips along the vertical axis, then `others`, the names of further rows that are not clips."""
+    """Write names along the vertical axis: first shortened names of clips, then `others` in full."""
     labels = [plain(label) for label in (*labels_of(names), *others)]
     axes.set_yticks(list(places), labels, parse_math=False)
     axes.tick_params(axis="y", length=0, labelcolor=INK)
@@ -189,7 +189,7 @@ def shortened(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
-    """Choose the end of an axis, from `wanted` to twice `wanted`; the most extreme values may lie beyond this end."""
+    """Choose the upper end of an axis, from `wanted` to twice `wanted`; the largest values may be greater."""
     if not len(values):
         return wanted
     most = float(np.quantile(values, 0.98))
@@ -234,10 +234,10 @@ def luminance(colours: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
 
 
 def to_png(figure: Figure) -> bytes:
-    """Write a PNG: the same bytes for the same figure and versions of matplotlib and Pillow.
+    """Return the figure as PNG; the same versions of matplotlib and Pillow give the same bytes.
 
-    A page is opaque, so its PNG needs no transparency. The compression looks only for runs of equal bytes, which takes
-    half of the time of other methods; the files are of the same size.
+    A page is opaque, so its PNG needs no transparency. The compression looks only for runs of equal bytes. This takes
+    half as long as other methods, and the files are not larger.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
@@ -251,7 +251,7 @@ def to_png(figure: Figure) -> bytes:
 
 
 def to_svg(figure: Figure, title: str) -> str:
-    """Write an SVG: the same text for the same figure and version of matplotlib; text stays text, not outlines."""
+    """Return the figure as SVG, with text, not outlines; the same version of matplotlib gives the same bytes."""
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     with _svg_settings():

@@ -31,7 +31,7 @@ class Camera:
     tilt_rad: float
 
     def seen(self, points: AnyFloats) -> AnyFloats:
-        """Project points (..., 3) to (right, up, towards the viewer) in metres, shape (..., 3)."""
+        """Convert points (..., 3) to (right, up, towards the viewer) as the camera sees them, in metres, (..., 3)."""
         turn, tilt = self.direction_rad, self.tilt_rad
         right = points[..., 0] * np.cos(turn) - points[..., 2] * np.sin(turn)
         near = points[..., 0] * np.sin(turn) + points[..., 2] * np.cos(turn)
@@ -106,7 +106,7 @@ def body_of(skeleton: Skeleton) -> StickFigure:
 
 
 def runs_of(bones: Indices) -> list[Indices]:
-    """Join bones (n, 2) to as few lines as possible; each line is a sequence of points, from an outer end inwards."""
+    """Join bones (n, 2) to as few polylines as possible: sequences of indices of points, from an outer end inwards."""
     inner = {int(outer): int(inner) for outer, inner in bones}
     ends = sorted(set(inner) - set(inner.values()))
     runs, drawn = [], set()
@@ -138,7 +138,7 @@ def stances_at(clip: Clip, body: StickFigure, frames: Indices) -> Stances:
 
 
 def _tips(skeleton: Skeleton, pelvis: int, sides: dict[int, int]) -> list[tuple[int, int]]:
-    """List the last bone of each drawn chain of joints: its outer point, which is an end site, and its inner joint.
+    """List the last bone of each drawn chain of joints, as its outer point, an end site, and its inner joint.
 
     The index of an end site is counted after all joints, as in `StickFigure.bones`.
     """

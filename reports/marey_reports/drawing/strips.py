@@ -49,9 +49,9 @@ class StripRow:
 
     Parameters
     ----------
-    label, note : texts to the left of the row; the note is below the label, in small letters
+    label, note : texts to the left of the row; `note` is written below `label`, in small letters
     bodies : (m, T, P, 3) points of m motions in T frames, metres, drawn on top of each other
-    ways : (m, N, 3) paths of the root, drawn on the floor; N may be 0
+    ways : (m, N, 3) paths of the root in metres, drawn on the floor; N may be 0
     ghost : (T, P, 3) points of a motion for comparison, drawn in grey behind the bodies
     """
 
@@ -116,7 +116,7 @@ def draw_clip_strip(poses: Sequence[Clip], frames: Sequence[int], frame_rate_hz:
     Parameters
     ----------
     poses : one frame of the clip for each moment
-    frames : the numbers of these frames in the clip
+    frames : the indices of these frames in the clip
     frame_rate_hz : frames per second of the clip
     title : title of the picture, for readers who do not see it
     """
@@ -132,14 +132,14 @@ def draw_clip_strip(poses: Sequence[Clip], frames: Sequence[int], frame_rate_hz:
 
 @dataclass(frozen=True, eq=False)
 class PoseRow:
-    """Poses of one motion, in one row of a strip.
+    """Content of a row of a strip: poses of one motion.
 
     Parameters
     ----------
     label, note : texts to the left of the row
     poses : one frame of the motion for each moment
     ghost : one frame of another motion for each moment, drawn in grey behind the poses
-    headings_rad : (T,) directions about +Y, 0 for +z, into which the poses are turned; None: as they are
+    headings_rad : (T,) headings to which the poses are turned, about +Y, 0 for +z; None: the poses are not turned
     """
 
     label: str
@@ -152,11 +152,11 @@ class PoseRow:
 def draw_pose_rows(rows: Sequence[PoseRow], names: Sequence[str], labels: Sequence[str], *, ghost: str = "") -> Figure:
     """Draw motions of one skeleton at T moments, one in each row; each body is in the middle of its cell.
 
-    Ghosts keep their distance from the bodies before them.
+    A ghost (a body of another motion, drawn in grey behind) has the same offset from the body in front as in the data.
 
     Parameters
     ----------
-    names, labels : T texts each, below the columns
+    names, labels : two texts for each of the T columns, written below the column
     ghost : name of the ghosts in the legend; empty: there are none
     """
     body = body_of(rows[0].poses[0].skeleton)
@@ -201,7 +201,7 @@ def _camera_direction(points: Floats, facing: tuple[tuple[int, ...], tuple[int, 
 
 @dataclass(frozen=True)
 class _StripCell:
-    """A cell: lower left corner and size in inches, point of the motion at its centre, scale in inches per metre."""
+    """Cell of a strip: lower left corner and size in inches, (x, z) in metres at its centre, and inches per metre."""
 
     corner: tuple[float, float]
     size: tuple[float, float]
@@ -338,7 +338,7 @@ def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, l
 
 
 def _add(axes: Axes, artist: Artist, frame: Rectangle) -> None:
-    """Add an artist, and clip it to `frame` afterwards: `add_artist` replaces a clip path that is a rectangle."""
+    """Add an artist, then clip it to `frame`. This order matters: `add_artist` replaces a rectangular clip path."""
     axes.add_artist(artist).set_clip_path(frame)
 
 

@@ -53,7 +53,7 @@ def compared(before: EvaluationResult, after: EvaluationResult) -> str:
 
 
 def _direction(before: EvaluationResult, after: EvaluationResult) -> str:
-    """Describe whether the number of followed trajectories changed by more than chance, over paired replicates."""
+    """Describe whether the number of followed trajectories changed significantly, by a test of paired replicates."""
     sides = [one.replicates for one in (before, after)]
     followed = [np.count_nonzero(one.followed, axis=0) for one in sides if one is not None]
     if len(followed) < 2 or len(followed[0]) != len(followed[1]):

@@ -13,7 +13,8 @@ from marey_schemas.options.verdict import VerdictLimits
 class Metric(NamedTuple):
     """Metric over all trials in a report: name, unit, decimals and meaning.
 
-    `limited_as` is the name of a metric whose limit also holds for this one, because both measure the same.
+    `limited_as` is the name of a related metric that has a limit; if that limit is exceeded, this metric is marked,
+    too.
     """
 
     label: str

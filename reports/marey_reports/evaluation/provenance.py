@@ -13,7 +13,7 @@ DIGESTS = ("dataset", "normaliser", "options", "scenarios")
 
 
 def provenance(results: Sequence[EvaluationResult], labels: Sequence[str]) -> Html:
-    """Write digests, versions and options of one result, or of two side by side with their differences marked."""
+    """Write digests, versions and options of one result, or of two results side by side with marked differences."""
     heads = ("name", *labels)
     digests = [_row(name, [getattr(result.provenance, name) for result in results], code=True) for name in DIGESTS]
     versions = _row("version of the code", [result.provenance.code_version for result in results], code=True)

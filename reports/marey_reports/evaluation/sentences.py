@@ -1,4 +1,4 @@
-"""Verdicts in plain words: one sentence on all trials, one on each region, and phrases for the errors of trials."""
+"""Verdicts in plain words: a sentence about all trials, sentences about regions, and phrases for errors of trials."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from marey_schemas.wording import counted
 
 MOST_PROBLEMS = 3
 SIDEWAYS_M_S = 0.3
-"""Speed to the side or backwards from which a window of a clip counts as a walk in this direction."""
+"""Least speed, in metres per second, at which a window of a clip counts as sideways or backward motion."""
 
 
 class _Wording(NamedTuple):
-    """Words for an exceeded limit: `words` after "it" or "its", and the decimals of value and limit; times `scale`."""
+    """Wording of an exceeded limit: a clause with a gap for the value, and the value's decimals, unit and factor."""
 
     words: str
     digits: int
@@ -81,7 +81,7 @@ def _span(replicates: ReplicateValues) -> str:
 
 
 def interval_text(replicates: ReplicateValues, metric: str, digits: int) -> str:
-    """Describe the interval of a metric of the suite over the replicates; empty if it has none."""
+    """Describe the 95 % interval of a metric of the suite over the replicates; empty if the metric has no interval."""
     found = replicates.interval(metric)
     if found is None or found.low is None or found.high is None:
         return ""
@@ -89,7 +89,7 @@ def interval_text(replicates: ReplicateValues, metric: str, digits: int) -> str:
 
 
 def _looking_wrong(judgement: Judgement) -> str:
-    """Describe what is wrong with the trials that keep to their path but do not look right."""
+    """Describe the problems of trials in which the character keeps to its path, but the motion does not look right."""
     wrong = [each for each in judgement.trials if each.on_path and not each.followed]
     return (
         f"{counted(len(wrong), 'other trajectory')} {'is' if len(wrong) == 1 else 'are'} kept to, but the motion looks "
@@ -98,7 +98,7 @@ def _looking_wrong(judgement: Judgement) -> str:
 
 
 def region_verdicts(result: EvaluationResult) -> tuple[RegionVerdict, ...]:
-    """Judge each region of the trials, and name motion of the clips that no trial asks for."""
+    """Judge each region of the trials, and report backward and sideways motion of the clips that no trial requires."""
     trials = judge(result).trials
     regions = []
     for region in REGIONS:
@@ -129,7 +129,7 @@ def _not_asked_for(coverage: Coverage, window_s: float) -> list[RegionVerdict]:
 
 
 def _problems(trials: Sequence[TrialVerdict]) -> str:
-    """Describe the limits that most of these trials exceed, each with the median of the values beyond the limit."""
+    """Describe the limits that are exceeded most often, each with the median of the values beyond the limit."""
     beyond: dict[Measure, list[LimitCheck]] = {}
     for trial in trials:
         worst: dict[Measure, LimitCheck] = {}

@@ -59,7 +59,7 @@ def render_several(
 
 
 def _sets(results: Sequence[EvaluationResult], labels: Sequence[str]) -> Html:
-    """Write a table of what each set contains, and of how well the character follows with it."""
+    """Write a table with the contents of each set of clips, and the number of trajectories followed with the set."""
     heads = (
         "set",
         "clips",
@@ -95,7 +95,7 @@ def _sets(results: Sequence[EvaluationResult], labels: Sequence[str]) -> Html:
 
 
 def _regions(results: Sequence[EvaluationResult], labels: Sequence[str]) -> Html:
-    """Write a table of the trajectories that are followed in each region of the trials."""
+    """Write a table with the number of followed trajectories in each region of the trials."""
     regions = [{one.region: one for one in region_verdicts(each) if one.trials} for each in results]
     names = list(dict.fromkeys(name for each in regions for name in each))
     rows: list[Sequence[Cell]] = [
@@ -108,7 +108,7 @@ def _regions(results: Sequence[EvaluationResult], labels: Sequence[str]) -> Html
 def _metric_chapter(
     results: Sequence[EvaluationResult], comparisons: Sequence[Comparison], labels: Sequence[str]
 ) -> Section:
-    """Write the chapter on all metrics: the value of each set, and the verdict of its change from the first set."""
+    """Write the chapter on all metrics: the value for each set, and the verdict on the change from the first set."""
     changes = [{change.metric: change for change in one.metrics} for one in comparisons]
     rows: list[Sequence[Cell]] = []
     for name, metric in METRICS.items():

@@ -15,7 +15,7 @@ from typing import NamedTuple
 SWEEPS = 12
 """Number of times that the order of all layers is improved."""
 MOST_PASSED = 100_000
-"""Greatest number of layers that arrows may pass through, summed over all arrows."""
+"""Limit of the sum, over all arrows, of the number of layers between source and target of the arrow."""
 
 
 class Layout(NamedTuple):

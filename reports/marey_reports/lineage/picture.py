@@ -1,4 +1,4 @@
-"""Picture of a lineage graph as SVG or PNG, and its form for Graphviz."""
+"""Picture of a lineage graph as SVG or PNG, or as a document in the language of Graphviz."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SIGN, _BOLD_SIGN, _LINE, _PADDING = 0.071, 0.08, 0.16, 0.09
 """Widths of a plain and a bold character, height of a line, and space around the text of a box, in inches."""
 _BETWEEN_LAYERS, _BETWEEN_BOXES, _PASSING, _MARGIN = 1.15, 0.22, 0.1, 0.3
 _AT_LABEL = 0.35
-"""Place of an arrow's label on the first piece of its curve; 0 is the start and 1 the end."""
+"""Place of an arrow's label on the first piece of the arrow's curve: 0 is the start of the piece, 1 its end."""
 MOST_PIXELS = 60_000_000
 """Greatest number of pixels of a PNG."""
 
@@ -78,7 +78,7 @@ def draw_lineage(graph: LineageGraph, file_type: FileType) -> bytes:
 
 
 def as_dot(boxes: list[Box], arrows: list[Arrow]) -> str:
-    """Return boxes and arrows in the language of Graphviz."""
+    """Return the boxes and arrows of a graph as a document in the language of Graphviz."""
     lines = ["digraph lineage {", "  rankdir=LR;", '  node [shape=box, style="filled", fontname="sans-serif"];']
     for node, box in enumerate(boxes):
         border = WARNING if box.warning else EDGE[box.sort]

@@ -77,7 +77,7 @@ def warning_chapter(trained: TrainedPrimitive) -> Section:
 
 
 def motion_chapter(subject: ModelSubject, figures: Figures) -> Section:
-    """Write the chapter on the samples of the model, and on the space that these samples reach."""
+    """Write the chapter on samples of the model, and on the regions of space that hands and feet reach in them."""
     text = element(
         "p",
         "Left and right are the sides of the body: the left side is blue, the right side orange. All motions begin "
@@ -138,7 +138,7 @@ def _reach_row(reach: Reach) -> list[Cell]:
 
 
 def variation_chapter(subject: ModelSubject, figures: Figures) -> Section:
-    """Write the chapter on the effect of each of the first components."""
+    """Write the chapter on the effects of the first components of the model, one by one."""
     spatial, temporal = subject.primitive.spatial.count, subject.primitive.temporal.count
     if not spatial + temporal:
         text = "The model has no components: all examples are the same motion, and so are all samples."

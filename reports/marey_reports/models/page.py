@@ -1,4 +1,4 @@
-"""Reports of models for people: one HTML file each, which needs no network and no other file."""
+"""Reports of models for people. Each report is one HTML file, which needs no network and no other file."""
 
 from __future__ import annotations
 

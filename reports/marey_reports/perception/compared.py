@@ -1,4 +1,4 @@
-"""Compared clips with their distances: what is drawn, and what the metric can and cannot say about it."""
+"""Compared clips with their distances, the data for drawing them, and sentences about what the metric can show."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_schemas.documents.metrics import MetricDocument
 from marey_schemas.options.perception import DistanceOptions
 
 MOST_DRAWN_FRAMES = 1200
-"""Greatest number of rows and columns of a drawn map; maps of longer clips show every second frame, or fewer."""
+"""Greatest number of rows, and of columns, of a drawn map; of longer clips, only every n-th frame is shown."""
 _PUBLISHED_MEAN = 5 / 6
 
 
@@ -41,7 +41,7 @@ class ComparedSet:
 
     @cached_property
     def computed(self) -> PerceptualMetric:
-        """The metric as functions of motion use it."""
+        """The metric in the form that functions of `marey_motion` accept."""
         return metric_of(self.metric)
 
     def drawn_pairs(self) -> tuple[tuple[int, int], ...]:
@@ -55,19 +55,19 @@ class ComparedSet:
         return registration_curve(self.clips[pair[0]].compared, self.clips[pair[1]].compared, self.computed)
 
     def drawable(self, pair: tuple[int, int]) -> tuple[NamedClip, NamedClip]:
-        """Return the compared clips of a pair with few enough frames to draw; both have the same frame rate."""
+        """Return the compared clips of a pair at one frame rate, with frames left out if there are too many to draw."""
         clips = [self.clips[number] for number in pair]
         step = -(-max(clip.compared.frame_count for clip in clips) // MOST_DRAWN_FRAMES)
         one, other = (NamedClip(clip.name, _thinned(clip.compared, step)) for clip in clips)
         return one, other
 
     def recorded(self, number: int) -> NamedClip:
-        """Return a clip as it was recorded, with few enough frames to draw."""
+        """Return a clip as it was recorded, with frames left out if there are too many to draw."""
         clip = self.clips[number]
         return NamedClip(clip.name, _thinned(clip.recorded, -(-clip.recorded.frame_count // MOST_DRAWN_FRAMES)))
 
     def arrays(self, pair: tuple[int, int]) -> dict[str, np.ndarray]:
-        """Return maps of a pair by component and combined, their frame rate, and the curve."""
+        """Return the arrays of a pair by name: maps of components, combined map, frame rate, and registration curve."""
         one, other = self.drawable(pair)
         curve, rate = self.curve(pair), self.metric.frame_rate_hz
         maps = {
@@ -81,13 +81,13 @@ class ComparedSet:
         return found
 
     def missing_classes(self) -> tuple[str, ...]:
-        """Return the joint classes with a weight that the skeleton of the clips lacks."""
+        """Return the joint classes that the metric gives a weight above 0, but that the skeleton of the clips lacks."""
         has = self.clips[0].compared.classes
         weighted = [name for one in self.metric.components for name, weight in one.weights.items() if weight > 0]
         return tuple(dict.fromkeys(name for name in weighted if name not in has))
 
     def claims(self) -> Iterator[str]:
-        """Yield what the metric can and cannot say about these clips, one sentence or two at a time."""
+        """Yield texts of one or two sentences about what the metric can and cannot show for these clips."""
         yield from _claims_of(self.metric)
         if self.options.cycles == "whole" and not all(clip.compared.cyclic for clip in self.clips):
             yield (

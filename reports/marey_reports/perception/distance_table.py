@@ -20,7 +20,7 @@ from marey_reports.drawing.paper import (
 from marey_reports.perception.compared import ComparedSet
 
 MOST_WRITTEN = 24
-"""Greatest number of clips for which each cell contains its number."""
+"""Greatest number of clips for which the distances are written in the cells as numbers."""
 MOST_NAMED = 60
 _CELL, _SMALL_CELL, _SIGN, _BAR = 0.34, 0.13, 0.075, 0.14
 _DARK_FROM = 0.43

@@ -38,7 +38,7 @@ _LONGEST = 22
 
 
 class NamedClip(NamedTuple):
-    """A measured clip, with its name for people."""
+    """Measured clip, with the name that readers see."""
 
     name: str
     clip: MeasuredClip
@@ -56,8 +56,9 @@ def draw_registration(
 ) -> Sketch:
     """Draw a clip against itself with its period, and two clips with their registration curve (figure 1).
 
-    `recorded` is the clip in which the period was found, by default `one`. Without a period, only the second map is
-    drawn. `rate_hz` is the frame rate of period and curve, by default that of `one`; the clips may have fewer frames.
+    `recorded` is the clip in which the period was found, by default the clip `one`. Without a period, only the second
+    map is drawn. `rate_hz` is the frame rate of period and curve, by default the frame rate of the clip `one`; the
+    clips may have lower frame rates.
     """
     rate = rate_hz or one.clip.rate_hz
     pairs = [(one, other)] if period is None else [(recorded or one, recorded or one), (one, other)]
@@ -119,7 +120,7 @@ def draw_components(one: NamedClip, other: NamedClip, metric: PerceptualMetric) 
 def _panels(
     maps: list[Floats], clips: list[tuple[NamedClip, NamedClip]], titles: list[str]
 ) -> tuple[Figure, list[Axes], list[AxesImage]]:
-    """Draw maps side by side on one scale; the first clip runs to the right, the second upwards."""
+    """Draw maps side by side on one scale; time of the first clip runs to the right, time of the second one upwards."""
     ceiling = max(float(np.quantile(each, _HIGHEST)) for each in maps) or 1.0
     figure = new_figure(_LEFT + len(maps) * (SIDE + _GAP) + 0.45, _BOTTOM + SIDE + 0.5)
     panels, images = [], []
@@ -143,6 +144,6 @@ def _bar(figure: Figure, image: AxesImage, last: int) -> None:
 
 
 def _line(panel: Axes, x: Floats | list[float], y: Floats | list[float], colour: str, label: str) -> None:
-    """Draw a line that is visible on light and dark ground."""
+    """Draw a line that is visible on light and dark backgrounds."""
     panel.plot(x, y, color=LIGHT, lw=3.4, solid_capstyle="round")
     panel.plot(x, y, color=colour, lw=1.7, solid_capstyle="round", label=label or None)

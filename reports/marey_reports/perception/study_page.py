@@ -45,7 +45,7 @@ def render_study_report(
     ----------
     analysis : the analysis
     names : name of each motion, for people: its label in the study, or the name of the clip
-    refusals : further reasons why something could not be computed
+    refusals : further reasons why a part of the analysis could not be computed
     title : heading of the page
     """
     figures: dict[str, DrawnFigure] = {}
@@ -128,7 +128,7 @@ def draw_table(analysis: StudyAnalysis, names: Sequence[str]) -> Sketch:
 
 
 def _boundary(order: MotionOrder) -> float | None:
-    """Return the place between the groups along the order, or None if they are mixed along it."""
+    """Return the position in the order that separates the two groups, or None if no position separates them."""
     along = order.groups[order.order]
     changes = np.flatnonzero(np.diff(along))
     return float(changes[0]) + 0.5 if len(changes) == 1 else None

@@ -44,7 +44,7 @@ DRAWN_MEASURES = {
     "jitter_m_s3": 50.0,
     "limit_excess_deg": 2.0,
 }
-"""Drawn measures, each with the least value at which its axis ends, so that bars of tiny values stay short."""
+"""Drawn measures, each with the least upper end of its axis. The bound keeps the bars of tiny values short."""
 _WIDTH, _ROW, _ABOVE, _UNDER, _GAP, _LETTER = 9.6, 0.24, 0.78, 0.42, 0.16, 0.068
 _TITLE_LETTERS = 18
 _GROUND_TRUTH = "reference (ground truth)"

@@ -1,4 +1,4 @@
-"""Report of the quality of clips: one HTML file, which needs no network and no other file; and the table as CSV."""
+"""Report of the quality of clips as one HTML file, which loads no other file, and as a CSV table."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def render_quality(document: QualityDocument, figures: Mapping[str, DrawnFigure]
 
 
 def quality_csv(document: QualityDocument) -> str:
-    """Write one row for each clip, with the clips of the reference after the others, as CSV."""
+    """Return a CSV table with one row for each clip; the clips of the reference follow the measured clips."""
     sets = [("clip", document.measured), *([("reference", document.reference)] if document.reference else [])]
     rows = [(role, clip) for role, one in sets for clip in one.clips]
     columns = {
@@ -144,7 +144,7 @@ def _ends(one: QualityTotal | QualityChange | None, digits: int) -> str:
 
 
 def is_worse(name: str, change: QualityChange) -> bool:
-    """Return whether a difference from the reference is worse, and its interval does not contain 0."""
+    """Return whether the measured total is worse than the reference, and the interval of the difference excludes 0."""
     if change.low is None or change.high is None:
         return False
     better = MEASURES[name].better

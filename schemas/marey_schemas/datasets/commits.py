@@ -105,7 +105,9 @@ class Entry(Answer):
 
     path: str
     kind: Kind
-    parts: dict[str, str] = Field(description="Content digest of each part; it is the same on every server.")
+    parts: dict[str, str] = Field(
+        description="Content digest of each part. Equal parts have the same digest on every server."
+    )
     tags: tuple[str, ...]
     item: str | None = Field(description="Item of this project that has a revision with this content.")
     revision: int | None
@@ -117,7 +119,8 @@ class Origin(Answer):
     commit: Commit
     path: str = Field(description="Path of the entry in that commit; a later commit may have moved the entry.")
     certain: bool = Field(
-        description="Whether this commit certainly made the change; false: this commit or an earlier one made it."
+        description="Whether this commit is known to have made the change; false: this commit or an earlier one made "
+        "the change."
     )
 
 

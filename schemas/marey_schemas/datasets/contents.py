@@ -40,7 +40,7 @@ class PartOfContent(Request):
 
 
 class RequestedDocument(PartOfContent):
-    """Address of a document, and the revision with an earlier version of it that the reader has."""
+    """Address of a document, and optionally a revision with an earlier version of this document that the client has."""
 
     base: Digest | None = Field(
         None,
@@ -72,7 +72,7 @@ class ExportPermission(Answer):
     """Permission to export revisions."""
 
     ended: tuple[str, ...] = Field(
-        description="Ids of the items whose consent has ended, and whose export the request allows."
+        description="Ids of the items whose consent has ended, but whose export the request allows."
     )
 
 
@@ -98,12 +98,12 @@ class ReceivedRevision(Request):
         default_factory=dict,
         max_length=MOST_RECEIVED_FACETS,
         description="Numbers that jobs have published about the revision. They are added to all revisions with this "
-        "content; numbers that the project has already stay.",
+        "content, but do not replace numbers that the project already has.",
     )
 
 
 class ReceivedRevisions(Request):
-    """Revisions from an archive or another server. The project must already have all revisions to which these refer."""
+    """Revisions from an archive or another server. The project must already have the revisions that they refer to."""
 
     revisions: tuple[ReceivedRevision, ...] = Field(min_length=1, max_length=MOST_CONTENTS)
 
@@ -137,5 +137,5 @@ class ReceivedCommit(Request):
     )
     changes: tuple[ReceivedChange, ...] = Field(max_length=MOST_RECEIVED_CHANGES)
     begins: RefName | None = Field(
-        None, description="Branch without commits that is set to this commit; null: no branch is changed."
+        None, description="Branch that is set to this commit; it must have no commits yet. Null: no branch is changed."
     )

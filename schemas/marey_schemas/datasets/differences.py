@@ -11,7 +11,7 @@ from marey_schemas.datasets.commits import Commit, Entry
 from marey_schemas.kinds import Kind
 
 ChangeKind = Literal["added", "removed", "moved", "changed"]
-"""Kind of change of an entry, or of a part of an entry, between two versions; only entries are moved."""
+"""Kind of change of an entry, or of a part of an entry, between two versions; parts are never moved by themselves."""
 
 
 class ListedCommit(Commit):
@@ -58,8 +58,8 @@ class DatasetDifference(Answer):
     counts: dict[ChangeKind, int] = Field(description="Number of differing entries by kind of change.")
     folders: dict[str, dict[ChangeKind, int]] = Field(
         default_factory=dict,
-        description="Number of differing entries directly in each folder, by kind of change. A removed entry counts in "
-        "the folder that it was in. The limit of the list of entries also limits the number of folders.",
+        description="Number of differing entries directly in each folder, by kind of change. A removed entry counts "
+        "in the folder that contained it. The limit of the list of entries also limits the number of folders.",
     )
     entries: tuple[EntryDifference, ...]
     complete: bool = Field(description="Whether all differing entries are listed and counted.")

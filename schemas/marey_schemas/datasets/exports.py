@@ -53,9 +53,13 @@ class ExportedClip(Answer):
     """Clip of an exported version."""
 
     path: str = Field(description="Path of the entry in the version.")
-    content: str = Field(description="Content digest of the revision; it is the same on every server.")
+    content: str = Field(
+        description="Content digest of the revision. Equal revisions have the same digest on every server."
+    )
     file: str | None = Field(
-        None, description="Path of the clip's file in the folder; null: the clip's frames are in an episode."
+        None,
+        description="Path of the clip's file in the exported folder; null: an episode of the dataset contains "
+        "the clip's frames.",
     )
     digest: str | None = Field(None, description="Digest of the bytes of `file`.")
     episode: int | None = Field(None, description="Index of the clip's episode.")

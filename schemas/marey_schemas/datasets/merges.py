@@ -30,14 +30,15 @@ class Side(StrEnum):
 
 
 class Resolution(Request):
-    """Decision about a conflict: the side whose version of an entry is kept.
+    """Decision about a conflict: the side whose version of an entry the merge uses.
 
-    If two entries want one path, the other entry goes back to its own path on the branch or in the base. An entry that
-    one side has added has no such path, and is dropped. Several conflicts can have the same path and kind. The first
-    resolution decides the first of them, the second resolution the second one, and so on.
+    If two different entries would have the same path, `take` selects the entry that gets the path. The other entry
+    returns to the path that it has on the branch or in the base. If one side has added that entry, it has no earlier
+    path and is dropped. Several conflicts can have the same path and kind. The first resolution decides the first of
+    these conflicts, the second resolution the second conflict, and so on.
 
-    If a conflict has several parts, each part can be decided by a resolution of its own. Then the resolutions of one
-    conflict follow each other, and the conflict remains until all of its parts are decided.
+    If a conflict has several parts, each part can be decided by a separate resolution. In this case, the resolutions of
+    one conflict follow each other in the list, and the conflict remains until all its parts are decided.
     """
 
     path: EntryPath
@@ -45,8 +46,9 @@ class Resolution(Request):
     take: Side
     part: PartName | None = Field(
         None,
-        description="Part of the conflict that this decides, such as `motion`, `path` or `tags`; null: all parts. A "
-        "part that was computed from another one, as the sample tree of a model, is decided together with that one.",
+        description="Part of the conflict that this resolution decides, such as `motion`, `path` or `tags`; null: "
+        "all parts. A part that was computed from another part, such as the sample tree from the model, is "
+        "decided together with the other part.",
     )
 
 
@@ -74,13 +76,13 @@ class MergeRequest(CombineRequest):
 
 
 class PickRequest(CombineRequest):
-    """Request to apply the changes of one commit to a branch (cherry-pick), or to undo these changes there (revert)."""
+    """Request to apply the changes of one commit to a branch (cherry-pick), or to undo them on a branch (revert)."""
 
     version: Version = Field(description="Commit whose changes are applied or undone.")
     parent: Literal[1, 2] | None = Field(
         None,
-        description="Parent with which the commit is compared to find its changes; required if the commit is a merge. "
-        "1: the branch that the merge changed; 2: the version that was merged.",
+        description="Number of the parent with which the commit is compared to find its changes; required if the "
+        "commit is a merge. 1: the newest commit of the branch before the merge; 2: the version that was merged.",
     )
 
 
@@ -121,7 +123,9 @@ class EntryConflict(Answer):
         "applied; empty for other conflicts.",
     )
     segments: ConflictingSegments | None = Field(
-        None, description="Segments of an annotation that exclude each other; null if the reason is another one."
+        None,
+        description="Segments of an annotation that exclude each other; null if the conflict does not concern "
+        "segments.",
     )
 
 
@@ -132,7 +136,8 @@ class MergeAnswer(Answer):
         description="New commit of the branch; null for a preview, and if conflicts are unresolved."
     )
     base: str | None = Field(
-        description="Digest of the commit with which both sides are compared; null if there is none."
+        description="Digest of the base, the commit with which both sides are compared; null if the sides have no "
+        "common commit."
     )
     ours: str = Field(description="Digest of the newest commit of the branch.")
     theirs: str | None = Field(

@@ -22,7 +22,7 @@ RefName = Annotated[str, StringConstraints(pattern=REF)]
 Version = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}(?:~[0-9]{1,4})?$")]
 """Name of a version: a branch, a tag, or the digest of a commit (the first 8 digits are enough).
 
-With `~n` at the end, the name stands for the version n commits earlier.
+With `~n` at the end, the name refers to the version n commits earlier.
 """
 
 
@@ -37,7 +37,7 @@ class DatasetCreate(Request):
 
 
 class CheckedOut(Answer):
-    """Version that the folder of a dataset has, apart from later changes, and the selection of a part of it."""
+    """Version that was last committed or checked out in the folder of a dataset, and the selection of its entries."""
 
     commit: str
     query: str | None = Field(description="Query that selected the entries; null: none.")
@@ -50,7 +50,9 @@ class Dataset(Answer):
     id: str
     name: str
     description: str
-    collection: str | None = Field(description="Folder whose content commits record; null: commits list their changes.")
+    collection: str | None = Field(
+        description="Folder whose content the commits record; null: commits list their changes explicitly."
+    )
     checked_out: CheckedOut | None = Field(
         None, description="Version in the folder; null if no version was committed or checked out there."
     )

@@ -81,7 +81,9 @@ class CheckReport(Request):
     name: CheckName
     state: CheckState
     commit: Version | None = Field(
-        None, description="Commit that was checked; null: the newest one. If it is no longer the newest, it is refused."
+        None,
+        description="Commit that was checked; null: the newest one. A report on any other commit than the "
+        "newest is refused.",
     )
     job: ItemId | None = Field(
         None,
@@ -129,12 +131,12 @@ class Proposal(Answer):
     source: str = Field(description="Version whose changes are proposed, as the author named it.")
     target: str = Field(description="Branch that gets the changes.")
     head: str = Field(
-        description="Digest of the newest proposed commit; after the end of the proposal, of the commit that was the "
-        "newest at the end."
+        description="Digest of the newest proposed commit. After the end of the proposal: the commit that was the "
+        "newest at that time."
     )
     target_commit: str | None = Field(
-        description="Digest of the newest commit of the target; after the end of the proposal, of the commit that was "
-        "the newest just before the end."
+        description="Digest of the newest commit of the target branch. After the end of the proposal: the commit "
+        "that was the newest just before the end."
     )
     merged: str | None = Field(
         description="Digest of the commit that the merge made; null if the proposal is not merged."
@@ -171,7 +173,10 @@ class Review(Answer):
     verdict: Verdict
     text: str
     commit: str = Field(description="Digest of the commit that was reviewed.")
-    stale: bool = Field(description="Whether the proposal has a later commit, for which an approval does not count.")
+    stale: bool = Field(
+        description="Whether the proposal has a later commit than the reviewed one; if so, an "
+        "approval in this review does not count."
+    )
     at: datetime
 
 
@@ -196,21 +201,21 @@ class Missing(Answer):
 
 
 class Mergeability(Answer):
-    """Result that a merge of the proposal would have now."""
+    """Result of a merge of the proposal, if it were merged now."""
 
     missing: tuple[Missing, ...] = Field(
         description="Reasons why the proposal cannot be merged yet; empty: it can be merged."
     )
     changes: int | None = Field(
-        description="Number of entries that the merge would change; null: not computed, because a side has changed too "
-        "many entries, or because the merge is impossible."
+        description="Number of entries that the merge would change. Null: the number was not computed, because a "
+        "side has changed too many entries, or because the merge is impossible."
     )
     conflict_count: int | None = Field(description="Number of conflicts; null: it was not computed.")
     conflicts: tuple[EntryConflict, ...] = Field(description="The first conflicts, by path.")
 
 
 class ProposalDetail(Proposal):
-    """A proposal with its reviews and checks, and with the result that its merge would have now."""
+    """A proposal with its reviews and checks, and with the expected result of a merge."""
 
     comments: int = Field(description="Number of comments.")
     reviews: tuple[Review, ...] = Field(description="The newest approval or request for changes of each reviewer.")

@@ -10,7 +10,7 @@ from marey_schemas.access import Role
 from marey_schemas.base import Request
 
 MOST_REQUIRED = 20
-"""Greatest number of approvals, and of checks, that a rule can require."""
+"""Greatest number of approvals that a rule can require, and greatest number of checks."""
 
 CheckName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$")]
 """Name of a check of a proposal, such as `evaluation`."""
@@ -25,8 +25,8 @@ class ProtectionRule(Request):
     role: Role = Field(Role.CONTRIBUTOR, description="Lowest role of a user who may move the branch.")
     direct_commits: bool = Field(
         False,
-        description="Allow commits and merges without a proposal; cannot be combined with `approvals`, `checks` or "
-        "`up_to_date`.",
+        description="Whether commits and merges without a proposal are allowed; cannot be combined with `approvals`, "
+        "`checks` or `up_to_date`.",
     )
     approvals: int = Field(
         0, ge=0, le=MOST_REQUIRED, description="Number of users, other than the author, who must approve a proposal."

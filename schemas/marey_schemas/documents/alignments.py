@@ -27,7 +27,7 @@ class ExampleRef(Request):
 
 
 class AlignedPlacement(Request):
-    """Position and heading of the body in the first frame of the source clip.
+    """Placement of an aligned clip: position and heading of the body in the first frame of the source clip.
 
     A point p of the aligned clip is at R(heading_rad)·p + (x, y, z) in the source, where R turns about +Y.
     """
@@ -36,20 +36,22 @@ class AlignedPlacement(Request):
     x: Metres = 0.0
     y: Metres = Field(0.0, allow_inf_nan=False, description="Height that was subtracted from the clip, in metres.")
     z: Metres = 0.0
-    joint: JointName | None = Field(None, description="The joint whose position is given; default: the root.")
+    joint: JointName | None = Field(
+        None, description="The joint whose position `x`, `y` and `z` state; default: the root."
+    )
 
 
 class PredecessorAlignedOrigin(Request):
     """Files of Marey's predecessor that an aligned clip was imported from."""
 
     motion: StoredOriginal | None = Field(
-        None, description="The file of the motion; absent for files in other formats."
+        None, description="The file of the motion; absent if the file does not have the predecessor's format."
     )
     alignment: StoredOriginal
 
 
 class AlignmentInfo(Request):
-    """Part `info` of an aligned clip: the set of examples it belongs to, and the mapping to its source clip.
+    """Part `info` of an aligned clip: its set of examples, and the mapping of its time to the source clip.
 
     The part `motion` contains the frames of the aligned clip.
     """
@@ -66,9 +68,14 @@ class AlignmentInfo(Request):
     subject: str | None = Field(None, description="Performer, under a pseudonym.")
     reference: ExampleRef | None = Field(
         None,
-        description="The reference example: the time of all other examples is mapped to its time, the canonical time.",
+        description="The reference example. Its time is the canonical time, to which the time of all other examples "
+        "is mapped.",
     )
-    set: Digest | None = Field(None, description="Digest of all clips that were aligned together and of the options.")
+    set: Digest | None = Field(
+        None,
+        description="Digest of the options and of all clips that were aligned together; "
+        "it identifies the set of examples.",
+    )
     frame_rate_hz: float = Field(
         gt=0, allow_inf_nan=False, description="Rate of the canonical frames and of `source_frames`, in hertz."
     )
@@ -84,10 +91,13 @@ class AlignmentInfo(Request):
         0.0,
         ge=0,
         allow_inf_nan=False,
-        description="Mean cost per frame of the alignment, in square metres; with a perceptual metric, without unit.",
+        description="Mean cost of the alignment per frame, in square metres; without a unit if the cost is a "
+        "perceptual metric.",
     )
     metric: MetricIdentity | None = Field(
-        None, description="Perceptual metric whose distance of poses was the cost; costs of other metrics differ."
+        None,
+        description="Perceptual metric whose distance of poses was the cost of the alignment. Costs under "
+        "different metrics are not comparable.",
     )
     options: AlignParams | None = Field(None, description="Options of the alignment; absent if unknown.")
     predecessor: PredecessorAlignedOrigin | None = None

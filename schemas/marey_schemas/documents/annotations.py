@@ -52,7 +52,7 @@ class Annotation(Request):
         for index, (before, after) in enumerate(pairwise(self.segments), start=1):
             if after.start < before.end:
                 place = f"segments[{index}] ({after.label!r} {after.start}:{after.end})"
-                raise ValueError(f"{place} must start at {before.end} or later, where {before.label!r} ends")
+                raise ValueError(f"{place} must start at frame {before.end} or later, where {before.label!r} ends")
         for index, (earlier, later) in enumerate(pairwise(self.keyframes), start=1):
             if (later.frame, later.label) <= (earlier.frame, earlier.label):
                 place = f"keyframes[{index}] ({later.label!r} at frame {later.frame})"

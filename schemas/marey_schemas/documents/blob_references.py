@@ -28,8 +28,8 @@ def pointer_to(pointer: str, key: object) -> str:
 def members_of(tree: Any) -> list[tuple[str, Any]]:
     """List JSON Pointers and values of the nodes of a document; objects and lists precede the values in them.
 
-    Scalars that are elements of lists are left out. They cannot be references: only the value of a named member can be
-    the digest of a file.
+    Scalars in lists are left out, because they cannot be references: only the value of a named member can be the digest
+    of a file.
     """
     found: list[tuple[str, Any]] = []
 

@@ -24,10 +24,10 @@ from marey_schemas.names import Digest, JointName, Tag
 
 MAX_FRAME_RATE_HZ = 100_000.0
 MIN_FRAME_RATE_HZ = 1e-6
-"""Lowest frame rate of a clip; at much lower ones, the duration of a clip would be no finite number."""
+"""Lowest frame rate of a clip, in hertz. At much lower rates, the duration of a clip would not be a finite number."""
 
 UNIT_TOLERANCE = 1e-3
-"""A quaternion is a rotation if its length differs from 1 by at most this."""
+"""Greatest difference from 1 of the length of a quaternion that is accepted as a rotation."""
 
 
 class MotionDocument(Request):
@@ -101,8 +101,8 @@ class ClipSource(Request):
     companion_name: str | None = None
     content: Digest | None = Field(
         None,
-        description="Digest of what the motion took from a file of Marey's predecessor; absent if the import changed "
-        "the motion.",
+        description="Content digest of the part `motion` as it was read from a file of Marey's predecessor; absent "
+        "for files in other formats, and if the import changed the motion.",
     )
     format: str | None = None
     details: dict[str, Any] = Field(
@@ -178,11 +178,11 @@ class ClipInfo(RecordingFacts):
     checks: tuple[Check, ...] = ()
 
     def with_consent_of(self, others: Iterable[ClipInfo]) -> Self:
-        """Return this description with a consent that is at least as strict as its own and those of `others`.
+        """Return a copy of this description whose consent is at least as strict as its own and those of `others`.
 
-        `others` describe clips whose motion this clip also contains. The last day of the consent is the earliest of the
-        last days of all clips. The purposes of the consent are those that all clips have in common; clips without
-        recorded purposes are ignored.
+        `others` are the descriptions of clips from which this clip contains motion. The last day of the consent is the
+        earliest of the last days of all these clips. The purposes are those that all clips have in common; clips
+        without recorded purposes are ignored.
         """
         infos: tuple[ClipInfo, ...] = (self, *others)
         days = [one.consent_until for one in infos if one.consent_until is not None]

@@ -48,11 +48,14 @@ class DifferenceRequest(DifferenceOptions):
         alias="from",
         ge=1,
         lt=2**31,
-        description="Revision before the change. Absent: the revision before `to`; with `to_item`, the newest.",
+        description="Revision before the change. Absent: the revision before `to`, or the newest revision if "
+        "`to_item` is given.",
     )
     to: int | None = Field(None, ge=1, lt=2**31, description="Revision after the change. Absent: the newest.")
     to_item: str | None = Field(
-        None, max_length=64, description="Another item of the same kind in the project, whose revision is `to`."
+        None,
+        max_length=64,
+        description="Id of another item of the same kind in the project. If given, `to` is a revision of this item.",
     )
     plot: bool = Field(False, description="Include the values that a drawing of the difference needs.")
 
@@ -76,7 +79,7 @@ class FrameRun(Answer):
 class Exceeding(Answer):
     """Size of a change over the matched frames, and the times at which the change exceeds the threshold."""
 
-    mean: float = Field(description="Mean over all matched frames.")
+    mean: float = Field(description="Mean size of the change over all matched frames.")
     largest: float
     largest_at: int = Field(description="Frame of the revision `after` with the largest change.")
     spans: tuple[Range, ...] = Field(
@@ -99,7 +102,7 @@ class PathMove(Answer):
     turn_deg: float = Field(description="Turn about the vertical axis, left positive.")
     shift_cm: Vector3
     remaining_cm: float = Field(
-        description="Largest distance between the paths that remains once this movement is applied."
+        description="Largest distance between the paths that remains after this movement is applied."
     )
 
 
@@ -111,8 +114,8 @@ class PathChange(Exceeding):
     )
     moved: PathMove | None = Field(
         None,
-        description="Movement of the whole path that explains at least nine tenths of the change; absent if there is "
-        "none. Changes of the root's rotation do not include the turn of this movement.",
+        description="Movement of the whole path, if a movement explains at least nine tenths of the change; "
+        "otherwise absent. The turn of this movement is not reported among the changes of the root's rotation.",
     )
 
 
@@ -151,8 +154,8 @@ class MotionDifference(Answer):
     runs: tuple[FrameRun, ...] = Field(description="All frames of both revisions, in order.")
     frames_per_frame: float = Field(
         1.0,
-        description="Number of frames in the revision `after` for each matched frame in `before`; 1 unless the motion "
-        "was resampled.",
+        description="Number of frames in the revision `after` that correspond to one matched frame in `before`; 1 "
+        "unless the motion was resampled.",
     )
     duration_ratio: float = Field(
         1.0,
@@ -163,13 +166,13 @@ class MotionDifference(Answer):
     path: PathChange | None = Field(None, description="Change of the path of the body; absent if there is none.")
     translations: tuple[JointChange, ...] = Field(
         (),
-        description="Changed translations in centimetres, largest first, of all joints other than the one whose path "
+        description="Changed translations in centimetres, largest first, of all joints except the joint whose path "
         "is compared.",
     )
     translated_joints: tuple[tuple[str, ...], tuple[str, ...]] = Field(
         ((), ()),
-        description="Joints other than the root whose translations are stored: those in `before`, and those in "
-        "`after`.",
+        description="Joints, other than the root, whose translations are stored: the joints in `before`, and the "
+        "joints in `after`.",
     )
 
 
@@ -218,12 +221,13 @@ class ModelDifference(Answer):
     examples_added: tuple[str, ...] = ()
     examples_removed: tuple[str, ...] = ()
     mean_log_likelihood: tuple[float | None, float | None] = Field(
-        (None, None), description="Mean log-likelihood of each model's own examples; null if it is not stored."
+        (None, None),
+        description="Mean log-likelihood of the training examples under each model; null if it is not stored.",
     )
 
 
 class FieldChange(Answer):
-    """Change of a value in a document; only changes that no other member of the difference describes are listed."""
+    """Change of a value in a document. Changes that other members of the difference describe are not listed."""
 
     part: str
     pointer: str = Field(description="JSON pointer of the value in the document of the part.")
@@ -233,12 +237,13 @@ class FieldChange(Answer):
 
 
 class DifferencePlot(Answer):
-    """Values to draw: the change of rotations over time, and the paths of the body."""
+    """Values of a difference for a drawing: the change of rotations over time, and the paths of the body."""
 
     joints: tuple[str, ...] = Field(description="Joints in the order of the columns of `rotation_deg`.")
     frame_rate_hz: float = Field(description="Frame rate of the revision `after`.")
     frames: tuple[int, ...] = Field(
-        description="First frame of each row of `rotation_deg`, then the frame after the last frame of the last row."
+        description="First frame of each row of `rotation_deg`; the last element is the frame after the end of the "
+        "last row."
     )
     rotation_deg: MatchedFloats = Field(
         description="[rows, joints]: largest change of rotation within the row's frames, in degrees; -1: no frame is "

@@ -12,14 +12,14 @@ from pydantic import ConfigDict, Field
 from marey_schemas.base import Request
 
 COSTS = ("match_cost", "continuing_cost", "pose_cost")
-"""Costs that the part `records` contains for each tick."""
+"""Names of the costs that the part `records` contains for each tick of a trial."""
 
 CONFIDENCE = 0.95
-"""Confidence level of intervals: of changes between two evaluations, and of means of replicates."""
+"""Confidence level of the intervals for changes between two evaluations, and for means of replicates."""
 
 
 MOST_EVALUATIONS_COMPARED = 8
-"""Greatest number of evaluations in one comparison: more do not fit beside each other in a table."""
+"""Greatest number of evaluations in one comparison; more evaluations do not fit side by side in a table."""
 
 
 def trial_name(family: str, speed_m_s: float, turn_rate_rad_s: float) -> str:
@@ -80,14 +80,14 @@ class RegionVerdict(Request):
 
     region: str = Field(max_length=64, description="Name of the region.")
     followed: int = Field(ge=0, description="Number of followed trials.")
-    trials: int = Field(ge=0, description="Number of trials; 0 if no trial asks for such motion.")
+    trials: int = Field(ge=0, description="Number of trials; 0 if no trial requires motion of this region.")
     sentence: str = Field(max_length=2000, description="The verdict in one sentence.")
 
 
 class EvaluationDocument(Request):
     """Part `evaluation`: options, provenance, metrics of every trial, usage, coverage, baseline.
 
-    Its members are those of `marey_motion.evaluation.result.EvaluationResult`, with arrays as leaves. This class
+    The document has the members of `marey_motion.evaluation.result.EvaluationResult`, with arrays as leaves. This class
     declares only the members that are shown in lists and summaries.
     """
 

@@ -25,7 +25,7 @@ JointClass = Literal["head", "clavicle", "upper_arm", "forearm", "hand", "thigh"
 MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)
 JOINT_CLASS_NAMES: tuple[JointClass, ...] = get_args(JointClass)
 WITHOUT_ANGLES: tuple[JointClass, ...] = ("hand", "toe")
-"""Classes for which the paper has no angles."""
+"""Joint classes for which the paper gives no weights of angles."""
 METRIC_RATE_HZ = 60.0
 """Frame rate at which the built-in metrics measure clips; clips of other rates are resampled."""
 METRIC_CODE = "perceptual-metric@1"
@@ -53,7 +53,7 @@ PUBLISHED: Mapping[Measurement, Mapping[Shaping, tuple[float | None, ...]]] = {
         "sigmoid": (21.993, 0.189, 36.532, 0.000, 0.000, 0.000, 0.000, 0.564, 0.000, 0.306, 0.157),
     },
 }
-"""Figure 5 of the paper as printed: difference, c, N, and the weights in the order of `JOINT_CLASS_NAMES`."""
+"""Figure 5 of the paper, by measurement and function: difference, c, N, and weights of `JOINT_CLASS_NAMES`."""
 
 _TEXT_AND_TABLE = (
     "The text of the paper says that velocities use hands, thighs and calves; its table has hand, calf and toe, and no "
@@ -61,10 +61,10 @@ _TEXT_AND_TABLE = (
 )
 _NO_SHARES = "The paper prints no shares of angles, positions and velocities; each has a third."
 _MOST_ROUNDING = 0.0025
-"""Greatest deviation from the sum 1 that the rounding of printed weights explains."""
+"""Greatest deviation of the sum of printed weights from 1 that their rounding explains."""
 
 PUBLISHED_ERROR = 0.05
-"""Standard error of a published perceived difference: 1,827 trials show each of 210 pairs 52 times."""
+"""Standard error of a published perceived difference: in 1,827 trials, each of the 210 pairs was shown 52 times."""
 
 _BUILT_IN_PATTERN = r"^(published|uniform)/(?:(angles|positions|velocities)-)?(euclid|manhattan|sigmoid)$"
 
@@ -90,13 +90,15 @@ class MetricComponent(Request):
 
     measurement: Measurement
     shaping: Shaping = Field(
-        description="F: euclid x², manhattan x, sigmoid x / (x + 1), power x^exponent; x is the difference of a class."
+        description="The function F of x, the difference of a joint class. euclid: x²; manhattan: x; sigmoid: x / (x "
+        "+ 1); power: x^exponent."
     )
     exponent: float = Field(1.0, gt=0, le=10, allow_inf_nan=False, description="Exponent of the shaping `power`.")
-    constant: _Amount = Field(description="c, which is added for poses that differ.")
-    norm: _Amount = Field(description="N, by which the weighted mean of F is multiplied.")
+    constant: _Amount = Field(description="The constant c, which is added to the distance of poses that differ.")
+    norm: _Amount = Field(description="The factor N, by which the weighted mean of F is multiplied.")
     weights: dict[JointClass, _Amount] = Field(
-        min_length=1, description="Weight of each joint class, with any sum; they are divided by their sum."
+        min_length=1,
+        description="Weight of each joint class. The weights can have any sum, because they are divided by their sum.",
     )
     share: _Share = Field(description="Share of the component in the metric; the shares have the sum 1.")
     intervals: dict[JointClass, tuple[_Number, _Number]] = Field(
@@ -125,10 +127,13 @@ class MetricFit(Request):
     r2: _Number | None = Field(None, description="Share of the variance that the fit explains.")
     spearman: _Number | None = Field(None, description="Rank correlation of fitted and perceived differences.")
     noise_ceiling: _Amount | None = Field(
-        None, description="Standard error of the perceived differences; a fit that is closer describes noise."
+        None,
+        description="Standard error of the perceived differences. A fit with a smaller error than this "
+        "describes noise.",
     )
     left_out_rmse: _Amount | None = Field(
-        None, description="Root mean square error for motions that were left out of the fit, one at a time."
+        None,
+        description="Root mean square error of the fit for motions that were left out of it, one motion at a time.",
     )
 
 
@@ -152,25 +157,32 @@ class MetricDocument(Request):
         "log_norm: norm of the logarithm of the rotation, equal to half_angle.",
     )
     side_reduce: Literal["mean", "sum"] = Field(
-        "mean", description="Whether the difference of a class is the mean or the sum of both sides."
+        "mean",
+        description="Whether the difference of a joint class is the mean or the sum of the differences of "
+        "the left and right joints.",
     )
     identity: Literal["zero", "constant"] = Field(
-        "zero", description="Distance of equal poses. zero: 0; constant: the constants of the components."
+        "zero", description="Distance of equal poses. zero: 0; constant: c, the constant that each component adds."
     )
     root_alignment: Literal["mean_heading", "kovar2d"] = Field(
         "mean_heading",
-        description="How place and heading are removed. mean_heading: the hips are at the origin, without the mean "
-        "heading of one second; kovar2d: each pair of poses is superposed.",
+        description="Method by which position and heading are removed. mean_heading: the hips are moved to the "
+        "origin, and the mean heading of one second is removed; kovar2d: the two poses of each pair are "
+        "superposed.",
     )
     length_unit_m: _Positive = Field(1.0, description="Metres in one unit of length.")
-    velocity_interval_s: _Positive = Field(1.0 / 30.0, description="Seconds in which velocities count displacement.")
+    velocity_interval_s: _Positive = Field(
+        1.0 / 30.0, description="Seconds in one unit of time: velocities are displacements within this time."
+    )
     frame_rate_hz: float = Field(
         METRIC_RATE_HZ, ge=1, le=1000, allow_inf_nan=False, description="Frame rate at which clips are measured."
     )
     code_version: str = Field(METRIC_CODE, max_length=64, description="Version of the computation of distances.")
-    fit: MetricFit | None = Field(None, description="Agreement with the judgements; null unless fitted.")
+    fit: MetricFit | None = Field(
+        None, description="Agreement with the judgements; null if the metric was not fitted to judgements."
+    )
     notes: tuple[Annotated[str, Field(max_length=1000)], ...] = Field(
-        (), max_length=32, description="What people should know before they use the metric."
+        (), max_length=32, description="Remarks that people should know before they use the metric."
     )
 
     @model_validator(mode="after")
@@ -221,12 +233,12 @@ def built_in_names() -> tuple[str, ...]:
 
 
 def is_built_in(name: str) -> bool:
-    """Return whether a metric that needs no item has this name."""
+    """Return whether there is a built-in metric (which needs no item) with this name."""
     return re.fullmatch(_BUILT_IN_PATTERN, name) is not None
 
 
 def built_in_metric(name: str) -> MetricDocument:
-    """Return a metric that needs no item. Raises `KeyError` if none has this name."""
+    """Return the built-in metric with this name. Raises `KeyError` if there is none."""
     found = re.fullmatch(_BUILT_IN_PATTERN, name)
     if found is None:
         raise KeyError(name)

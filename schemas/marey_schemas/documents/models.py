@@ -35,7 +35,8 @@ class FunctionalComponentsDocument(Request):
     mean: Matrix = Field(description="[n, D] coefficients of the mean.")
     directions: Stack = Field(description="[k, n, D] change of the coefficients per unit of each score.")
     projections: Stack = Field(
-        description="k matrices [n, D]; each score is the inner product of one with the centred coefficients."
+        description="[k, n, D]: each score is the inner product of one matrix [n, D] with the coefficients after "
+        "subtraction of their mean."
     )
     variances: Vector = Field(description="[k] variances of the examples' scores.")
     energy: Vector = Field(description="[k] share of the variance that the first 1, 2, ... components explain.")
@@ -246,7 +247,8 @@ def _without_time(provenance: Any) -> Any:
 def predecessor_time(model: Mapping[str, Any]) -> PredecessorTimeDocument | None:
     """Return the time function of a model as it was imported from Marey's predecessor.
 
-    Return None if it is not recorded, or if the time function of the part `model` was changed since.
+    Return None if no time function was recorded, or if the time function of the part `model` was changed since the
+    import.
     """
     try:
         origin = ModelProvenance.model_validate(model.get("provenance", {})).predecessor

@@ -15,7 +15,7 @@ MOST_SHARDS = 2000
 _MOST_NUMBER = 2**31 - 1
 _Number = Annotated[int, Field(ge=0, le=_MOST_NUMBER)]
 INDEX_VERSION = 1
-"""Number of the form of shards; a server searches only indexes with this number."""
+"""Version of the format of shards; a server searches only indexes with this version."""
 
 
 class IndexShard(Request):
@@ -25,15 +25,17 @@ class IndexShard(Request):
     poses: StoredFile = Field(description="Features of the poses of these clips.")
     rows: int = Field(ge=1, description="Number of poses.")
     dropped: tuple[_Number, ...] = Field(
-        (), max_length=100_000, description="Numbers of clips in the list that no longer belong to the index."
+        (),
+        max_length=100_000,
+        description="Positions, in the list of clips, of the clips that no longer belong to the index.",
     )
 
 
 class MotionIndexDocument(Request):
-    """Part `index` of an index: its shards, and how many clips they contain."""
+    """Part `index` of an index: the shards of the index, and the numbers of clips and poses in them."""
 
     schema_: Literal["marey/motion-index@1"] = Field("marey/motion-index@1", alias="schema")
-    version: int = Field(INDEX_VERSION, ge=1, description="Number of the form of the shards.")
+    version: int = Field(INDEX_VERSION, ge=1, description="Version of the format of the shards.")
     clips: int = Field(ge=0, description="Number of clips in the index.")
     rows: int = Field(ge=0, description="Number of poses of these clips, 30 per second.")
     left_out: int = Field(0, ge=0, description="Number of clips whose poses cannot be compared; the log names them.")
@@ -46,7 +48,7 @@ class ShardClips(Request):
     items: tuple[ItemId, ...] = Field(description="Ids of the clips.")
     revisions: tuple[_Number, ...] = Field(description="Revisions of the clips.")
     rows: tuple[_Number, ...] = Field(description="Number of poses of each clip, 30 per second.")
-    joints: tuple[_Number, ...] = Field(description="Which of the compared joints each clip has, as bits.")
+    joints: tuple[_Number, ...] = Field(description="Compared joints that each clip has, as a bit mask.")
     frames: tuple[_Number, ...] = Field(description="Number of frames of each clip.")
     rates_hz: tuple[Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)], ...] = Field(
         description="Frames per second of each clip."
@@ -55,5 +57,5 @@ class ShardClips(Request):
     @model_validator(mode="after")
     def _check_lengths(self) -> Self:
         if len({len(getattr(self, name)) for name in type(self).model_fields}) != 1:
-            raise ValueError("the lists must have equal lengths")
+            raise ValueError("the lists must have equal lengths, with one value for each clip")
         return self

@@ -27,7 +27,7 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Measure(NamedTuple):
-    """Number about the quality of a clip.
+    """Measure of the quality of a clip, such as its foot skate.
 
     `better` says which values are better: "less", "more", or "neither" for facts that are no defects.
     """
@@ -137,9 +137,9 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         ),
     }
 )  # fmt: skip
-"""Measures by name, each also a facet (published number) of the measured clips; its values end with a unit if any."""
+"""Measures by name; a name ends with its unit, if it has one. Each is also a facet (published number) of clips."""
 MAIN_MEASURE = "skate_weighted_m_s"
-"""Measure by which clips are sorted: a foot skate that every clip has."""
+"""Measure by which clips are sorted: the measure of foot skate that has a value for every clip."""
 QUALITY_FACETS: Mapping[str, str] = MappingProxyType(
     {name: f"{measure.meaning} By the newest job of the kind `quality`." for name, measure in MEASURES.items()}
 )
@@ -155,19 +155,23 @@ class QualityConditions(Request):
         "detected", description="Origin of the contact labels: detected by speed, or annotations of the clips."
     )
     grouping: Literal["take"] = Field(
-        "take", description="What is drawn for intervals: takes; a clip without a recorded take is a take of its own."
+        "take",
+        description="Unit that is drawn at random to compute intervals. take: the clips of a take together; "
+        "a clip without a recorded take counts as a separate take.",
     )
     draws: int = Field(ge=0, description="Number of draws for intervals.")
     seed: int = Field(ge=0, description="Seed of the draws.")
 
 
 class QualityRow(Request):
-    """Clip with its numbers."""
+    """Row of the table of clips: a clip with the values of its measures."""
 
     item: str
     revision: int
     name: str = Field(description="Path of the clip.")
-    take: str = Field(description="Clips with the same value belong together; they are drawn together.")
+    take: str = Field(
+        description="Take of the clip. Clips of the same take are drawn together when intervals are computed."
+    )
     seconds: _Finite
     frames: int = Field(description="Number of measured frames.")
     frame_rate_hz: _Finite = Field(description="Frame rate of the clip before it was resampled.")
@@ -193,12 +197,16 @@ class MeasuredSet(Request):
 
     clips: tuple[QualityRow, ...]
     totals: dict[str, QualityTotal]
-    speed_seconds: tuple[_Finite, ...] = Field(description="Windows of one second, by bins of `speed_edges_m_s`.")
-    turn_seconds: tuple[_Finite, ...] = Field(description="Windows of one second, by bins of `turn_edges_deg_s`.")
+    speed_seconds: tuple[_Finite, ...] = Field(
+        description="Number of windows of one second in each bin of `speed_edges_m_s`."
+    )
+    turn_seconds: tuple[_Finite, ...] = Field(
+        description="Number of windows of one second in each bin of `turn_edges_deg_s`."
+    )
 
 
 class QualityChange(Request):
-    """Difference of the total of a measure from that of other clips, with its 95 % interval."""
+    """Total of a measure minus the total of the reference clips, with the 95 % interval of the difference."""
 
     value: _Finite
     low: _Finite | None
@@ -215,9 +223,11 @@ class QualityDocument(Request):
     speed_edges_m_s: tuple[float, ...] = SPEED_EDGES_M_S
     turn_edges_deg_s: tuple[float, ...] = TURN_EDGES_DEG_S
     measured: MeasuredSet
-    reference: MeasuredSet | None = Field(None, description="The same for the clips of the ground truth.")
+    reference: MeasuredSet | None = Field(
+        None, description="Measurements of the reference clips (ground truth); null if no reference was given."
+    )
     changes: dict[str, QualityChange] = Field(
-        default_factory=dict, description="Totals minus those of the reference, by measure."
+        default_factory=dict, description="Total of the clips minus the total of the reference, by measure."
     )
     refused: tuple[dict[str, str], ...] = Field((), description="Clips that could not be measured, with the reasons.")
 

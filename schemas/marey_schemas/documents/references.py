@@ -17,7 +17,7 @@ class RevisionRef(Request):
 
 
 class OutputRef(Request):
-    """Reference to another output of the same request; the store replaces this reference by one to the stored item."""
+    """Reference to another output of the same request. The store replaces it by a reference to the stored item."""
 
     output: str
 

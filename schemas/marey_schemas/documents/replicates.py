@@ -1,7 +1,7 @@
 """Means of replicates, which are measurements that differ only by chance, with confidence intervals.
 
-The server, the reports, and the load tests of the client use it, so it belongs to what all components share. It uses no
-arrays, because replicates are few.
+The server, the reports, and the load tests of the client use this module. It does not use numpy, because a mean has few
+replicates.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 from marey_schemas.documents.evaluations import CONFIDENCE
 
 LEAST_REPLICATES = 3
-"""Least number of measurements for an interval; that of two would be 12.7 times as wide as their distance."""
+"""Least number of measurements for an interval. The interval of two would be 12.7 times as wide as their difference."""
 
 
 class MeanInterval(NamedTuple):

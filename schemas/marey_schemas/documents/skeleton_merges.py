@@ -12,7 +12,7 @@ SKELETON_MERGE = "skeleton_merge"
 MOST_MOVED = 5_000
 """Greatest number of items that one merge moves to another skeleton."""
 MOST_RIGS_COMPARED = 500
-"""Greatest number of skeletons that a merge compares with each other, and an import with each new skeleton."""
+"""Greatest number of skeletons that a merge compares with each other, or that an import compares with a new one."""
 
 
 class SkeletonMergeRequest(Request):
@@ -25,8 +25,8 @@ class SkeletonMergeRequest(Request):
     )
     kept: ItemId | None = Field(
         None,
-        description="Id of the skeleton that remains. Absent: of each rig the one with a joint map made by hand, or "
-        "else the one that most items use.",
+        description="Id of the skeleton that remains. Absent: for each rig, the skeleton with a joint mapping made "
+        "by hand, or else the skeleton that most items use.",
     )
     dry_run: bool = Field(False, description="Show what would be merged, and change nothing.")
 
@@ -43,12 +43,12 @@ class MergedSkeleton(NamedSkeleton):
 
     moved: dict[str, int] = Field(
         default_factory=dict,
-        description="Numbers of the items that got a new revision with the kept skeleton, by kind.",
+        description="Number of items that got a new revision with the remaining skeleton, by kind of item.",
     )
 
 
 class MergedRig(Answer):
-    """Skeletons of one rig: the one that is kept, and those that are merged into it."""
+    """Skeletons of one rig: the skeleton that remains, and the skeletons that are merged into it."""
 
     kept: NamedSkeleton
     merged: tuple[MergedSkeleton, ...]

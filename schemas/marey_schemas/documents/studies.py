@@ -41,7 +41,7 @@ class StudyDocument(Request):
         description="Text to which participants consent before the first trial."
     )
     motions: tuple[StudyMotion, ...] = Field(
-        min_length=SHOWN, max_length=MOST_MOTIONS, description="The motions, each a revision of another clip."
+        min_length=SHOWN, max_length=MOST_MOTIONS, description="The motions, each a revision of a different clip."
     )
     trials: int = Field(63, ge=1, le=MOST_TRIALS, description="Number of answered trials of each participant.")
     shown: Literal[4] = Field(SHOWN, description="Number of motions that a trial shows.")
@@ -53,5 +53,5 @@ class StudyDocument(Request):
         items = [one.clip.item for one in self.motions if isinstance(one.clip, RevisionRef)]
         if len(set(items)) != len(items):
             twice = next(item for item in items if items.count(item) > 1)
-            raise ValueError(f"motions: the clip {twice} occurs twice; each motion must be another clip")
+            raise ValueError(f"motions: the clip {twice} occurs twice; each motion must be a different clip")
         return self

@@ -122,14 +122,16 @@ class AnnotationChange(Request):
 
 
 class AnnotationImport(Request):
-    """Request to import an annotation of a clip from a document of Marey's predecessor, or from the file of one.
+    """Request to import an annotation of a clip from a document of Marey's predecessor, or a file with this document.
 
-    The document has one of the forms `sections` and `semantic_annotation`. A file is given back byte for byte when the
-    annotation is exported, unless the annotation was changed.
+    The document has one of the forms `sections` and `semantic_annotation`. An export of the annotation returns the file
+    byte for byte, unless the annotation was changed.
     """
 
     document: dict[str, Any] | None = Field(
-        None, description="The predecessor's document, as it stores or exports it. Give either this or `file`."
+        None,
+        description="Document in the form in which the predecessor stores or exports it. Give either "
+        "`document` or `file`.",
     )
     file: ImportFile | None = Field(
         None, description="File with the document, as JSON, BSON or compressed BSON; the server already has its bytes."
@@ -146,7 +148,8 @@ class AnnotationImport(Request):
     labels: tuple[Label, ...] | None = Field(
         None,
         max_length=1000,
-        description="Labels to import; absent: all of them. Import labels whose segments overlap into separate layers.",
+        description="Labels to import; absent: all labels. Labels whose segments overlap must be imported into "
+        "separate layers.",
     )
     message: Message = ""
 

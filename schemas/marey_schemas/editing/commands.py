@@ -1,8 +1,8 @@
 """The commands of an edit: one model each, discriminated by `command`.
 
-Frames count from 0 and ranges are half-open; a stop of null is the end. Lengths are in metres and times in seconds.
-Angles are in degrees if the name of the field ends in `_deg`. Directions and positions are those of the world:
-right-handed, Y up.
+Frames count from 0. Ranges are half open; the stop null means the end of the clip. Lengths are in metres and times in
+seconds. Angles are in degrees if the name of the field ends in `_deg`. Directions and positions are in the world, which
+is right-handed with Y up.
 """
 
 from __future__ import annotations
@@ -124,8 +124,8 @@ class Concatenate(NamedCommand):
     blend_s: Seconds = Field(0.3, description="Duration of the blend in seconds; 0: a hard cut.")
     keep_feet: bool = Field(
         True,
-        description="Keep feet that stand on both sides of the seam in place, and all feet above their floors; false: "
-        "only rotations and the path of the root are blended.",
+        description="Keep a foot in place if it is in contact before and after the seam, and keep all feet above their "
+        "floors. false: only rotations and the path of the root are blended.",
     )
 
 
@@ -167,7 +167,7 @@ class CloseLoop(NamedCommand):
 class CutLoop(NamedCommand):
     """Find a cycle of a periodic motion, and blend two successive cycles into a loop without a seam.
 
-    The loop begins at the origin and faces +z. Its frames are those of the clip, so it has its frame rate.
+    The loop begins at the origin and faces +z. It has the frame rate of the clip.
     """
 
     examples: ClassVar[Examples] = ({}, {"metric": "published/sigmoid"})
@@ -337,15 +337,16 @@ class Smooth(NamedCommand):
         gt=0,
         le=60,
         allow_inf_nan=False,
-        description="Width of the filter, in seconds: each frame becomes a weighted mean over it.",
+        description="Width of the filter, in seconds: each frame becomes a weighted mean of the frames within this "
+        "width.",
     )
     order: int = Field(3, ge=0, le=9, description="Degree of the polynomials of the filter savitzky_golay.")
     joints: Joints | None = Field(None, description="Joints to smooth; absent: all.")
     root_translation: bool = Field(True, description="Also smooth the path of the root.")
     keep_feet: bool = Field(
         True,
-        description="Smooth the paths of the feet, so that contacts are kept and no foot sinks into its floor; false: "
-        "feet go where the smoothed rotations lead them.",
+        description="Smooth the paths of the feet separately, so that contacts are kept and no foot sinks into its "
+        "floor. false: the positions of the feet follow from the smoothed rotations.",
     )
     frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
     border_s: Seconds = Field(
@@ -359,7 +360,9 @@ class RotateJoint(NamedCommand):
     examples: ClassVar[Examples] = ({"joint": "LeftArm", "angle_deg": 20.0, "axis": [0.0, 1.0, 0.0], "space": "world"},)
     command: Literal["rotate_joint"] = "rotate_joint"
     joint: JointName = Field(description="Name of the joint.")
-    angle_deg: Degrees = Field(description="Angle of the turn, in degrees; less in the frames that are blended.")
+    angle_deg: Degrees = Field(
+        description="Angle of the rotation, in degrees; smaller in the frames in which the change is blended in or out."
+    )
     axis: Axis = Field(description="Direction of the rotation axis.")
     space: Literal["joint", "parent", "world"] = Field(
         "joint", description="Frame of reference of `axis`: the joint's own, its parent's, or the world's."
@@ -378,7 +381,7 @@ class Paste(NamedCommand):
     )
     command: Literal["paste"] = "paste"
     source: ItemId = Field(description="The clip to copy from.")
-    joints: Joints = Field(description="Joints to copy; both skeletons have them, with the same axes.")
+    joints: Joints = Field(description="Joints to copy. Both skeletons must have these joints, with the same axes.")
     source_frames: Frames | None = Field(None, description="Half-open range of frames to copy; absent: the whole clip.")
     frames: Frames | None = Field(None, description="Half-open range of frames to replace; absent: the whole motion.")
     border_s: Seconds = Field(

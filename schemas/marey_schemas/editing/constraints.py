@@ -92,7 +92,8 @@ class PositionConstraint(_Constraint):
     def _check_place(self) -> Self:
         if self.point_m is not None and self.shift_m is not None:
             raise ValueError(
-                "give point_m or shift_m, not both; without them the joint stays where it is in the first frame"
+                "give point_m or shift_m, not both; if neither is given, the joint keeps its position in the first "
+                "frame"
             )
         return self
 
@@ -132,8 +133,9 @@ class HingeLimit(_Limit):
     kind: Literal["hinge"] = "hinge"
     joint: JointName
     angle_deg: AngleRange = Field(
-        description="Least and greatest angle in degrees: for knees and elbows the bend, which is 0 in a straight limb "
-        "and positive in its natural direction on every skeleton; for other joints the angle from the rest pose."
+        description="Least and greatest angle in degrees. For knees and elbows, the angle is the bend: 0 in a "
+        "straight limb, positive in the natural direction on every skeleton. For other joints, it is the angle "
+        "from the rest pose."
     )
 
 
@@ -203,8 +205,8 @@ class PlantOptions(Options):
     blend_s: Seconds = Field(
         0.15,
         description="Seconds before and after a contact in which the motion of the foot is blended. If a leg is too "
-        "short, the body is also lowered a little; this begins and ends at most three times as many seconds before and "
-        "after the contact.",
+        "short, the body is also lowered a little, beginning up to three times this time before the contact, and "
+        "ending up to three times this time after it.",
     )
     knee_damping_deg: float = Field(
         10.0,

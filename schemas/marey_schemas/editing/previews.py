@@ -31,7 +31,9 @@ class EditPreviewRequest(Request):
     )
     piece: int = Field(0, ge=0, lt=10_000, description="Index of the result to return, if the commands split the clip.")
     fields: tuple[Literal["motion", "positions", "findings"], ...] = Field(
-        ("motion", "findings"), max_length=3, description="Content of the answer in addition to the counts."
+        ("motion", "findings"),
+        max_length=3,
+        description="Content of the answer, in addition to the numbers of clips and frames.",
     )
 
     @model_validator(mode="after")
@@ -44,7 +46,7 @@ class EditPreviewRequest(Request):
 class EditPreview(Answer):
     """Frames of the result of an edit."""
 
-    pieces: int = Field(description="Number of clips that the edit makes from the clip.")
+    pieces: int = Field(description="Number of clips that result from the edit of the clip.")
     frame_count: int = Field(description="Number of frames of the whole result.")
     frame_rate_hz: float
     frames: tuple[int, int] = Field(description="Half-open range of the frames in this answer.")

@@ -1,4 +1,4 @@
-"""Differences between arrays: an array is sent as the frames in which it differs from one that the receiver has.
+"""Differences between arrays: of an array, only the frames that differ from an array of the receiver are sent.
 
 In a document, such an *array difference* is an object in place of the array. It names the other array, its *base*, by
 the content digest of a revision and a JSON Pointer into the same part of this revision. The other members are `dtype`
@@ -25,13 +25,13 @@ from marey_schemas.encoding.tiles import from_integers, to_integers
 INDEX = "<u4"
 """Type of the indices of frames."""
 MOST_CHANGED = 1 / 2
-"""Share of the frames above which an array is sent whole, because its difference would hardly be smaller."""
+"""Share of changed frames above which the whole array is sent, because the array difference would hardly be smaller."""
 _MEMBERS = frozenset({"base", "pointer", "dtype", "shape", "digest", "frames", "difference"})
 
 
 @dataclass(frozen=True, slots=True)
 class ArrayDifference:
-    """Array as a document describes it: by a base, and by the frames in which it differs from the base."""
+    """Description of an array in a document: a base, and the frames in which the array differs from the base."""
 
     base: str
     """Content digest of the revision that has the base."""
@@ -47,7 +47,7 @@ class ArrayDifference:
 
     @classmethod
     def of(cls, value: Any) -> ArrayDifference | None:
-        """Return the array difference that a value of a document describes; None if it describes none.
+        """Return the array difference in a document; None if `value` is not an array difference.
 
         Raises `ArrayError` if dtype or shape are malformed.
         """
@@ -60,7 +60,7 @@ class ArrayDifference:
     def between(
         cls, array: EncodedArray, base: EncodedArray, content: str, pointer: str, digest: str
     ) -> ArrayDifference | None:
-        """Return an array as its difference from a base; None if this would not be smaller.
+        """Return the difference of an array from a base; None if the difference would not be smaller than the array.
 
         `content` and `pointer` name the base; `digest` is the content digest of the array. At most half of the array is
         held in memory, decoded.
@@ -94,7 +94,7 @@ class ArrayDifference:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The object that stands for the array in a document."""
+        """The object that represents the array in a document."""
         return {
             "base": self.base, "pointer": self.pointer, "dtype": self.dtype, "shape": list(self.shape),
             "digest": self.digest, "frames": self.frames, "difference": self.difference,
@@ -107,7 +107,9 @@ class ArrayDifference:
         """
         spec = ArraySpec(self.dtype, self.shape)
         if spec != ArraySpec(base.dtype, base.shape) or not spec.shape:
-            raise ArrayError("bad-array", f"the difference is of an array {spec}, but its base has another size")
+            raise ArrayError(
+                "bad-array", f"the array difference describes an array {spec}, but its base has another dtype or shape"
+            )
         frames, difference = self._checked(spec)
         dtype = np.dtype(spec.dtype)
 
@@ -121,7 +123,9 @@ class ArrayDifference:
         leaf = {"dtype": spec.dtype, "shape": spec.shape, "encoding": "blocks", "data": data}
         array = array_from_leaf(leaf)
         if array_digest(array) != self.digest:
-            raise ArrayError("bad-array", "base and difference give an array with another digest than was sent")
+            raise ArrayError(
+                "bad-array", "the array that results from base and difference does not have the digest that was sent"
+            )
         return with_blocks(leaf, array)
 
     def _checked(self, spec: ArraySpec) -> tuple[NDArray[np.intp], NDArray[Any]]:
@@ -158,7 +162,7 @@ def _length(frames: Any) -> int:
 
 
 def _is_worthwhile(count: int, spec: ArraySpec) -> bool:
-    """Return whether the difference of `count` frames has fewer bytes than the array, both decoded."""
+    """Return whether a difference with `count` frames has fewer bytes than the array, if both are decoded."""
     itemsize = np.dtype(spec.dtype).itemsize
     return count <= spec.shape[0] and count * (np.dtype(INDEX).itemsize + _columns(spec) * itemsize) <= spec.nbytes
 

@@ -41,7 +41,7 @@ _ELEMENT_TYPES: dict[str, set[type]] = {"f": {int, float}, "i": {int}, "u": {int
 
 @dataclass(frozen=True, slots=True)
 class EncodedArray:
-    """Block-encoded array that can be passed on without being decoded."""
+    """Block-encoded array, which can be stored or sent without being decoded."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -105,7 +105,9 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
 
 
 def with_blocks(leaf: Mapping[str, Any], array: NDArray[Any]) -> NDArray[Any] | EncodedArray:
-    """Return a leaf's bytes as an `EncodedArray` if they can be stored unchanged, else `array`, the decoded leaf."""
+    """Return the bytes of `leaf` as an `EncodedArray` if they can be stored unchanged, else `array`, its decoded
+    form.
+    """
     if "encoding" in leaf and blocks.is_well_packed(leaf["data"]):
         return EncodedArray(array.dtype.str, array.shape, leaf["data"], array)
     return array

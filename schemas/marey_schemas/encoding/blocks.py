@@ -81,8 +81,8 @@ class _Layout:
 def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
     """Encode an array of any shape and allowed dtype; the same array always gives the same bytes.
 
-    Without `predict`, tiles are hardly compressed: this takes little more time than copying, and is meant for bytes
-    that are read once. Raises `ArrayError` for a dtype or shape that is not allowed.
+    Without `predict`, tiles are hardly compressed. This takes little more time than a copy, and is meant for bytes that
+    are read only once. Raises `ArrayError` for a dtype or shape that is not allowed.
     """
     array = little_endian(array)
     layout = _layout_of(ArraySpec.of(array))

@@ -29,7 +29,7 @@ MAX_LIST = 1 << 20
 MAX_VALUES = 1 << 21
 """Greatest number of values in a document that is decoded; the elements of arrays do not count."""
 FREE_LISTS = 1 << 17
-"""Number of objects and lists that every document may contain; a large document may contain more of them."""
+"""Number of objects and lists that a document of any size may contain; large documents may contain more."""
 BYTES_PER_LIST = 6
 """Least number of bytes per object or list in a document with more than `FREE_LISTS` objects and lists.
 
@@ -232,7 +232,7 @@ def _too_many_values(pointer: str) -> CodecError:
 
 def _parse_bson(data: bytes) -> Any:
     if int.from_bytes(data[:4], "little", signed=True) != len(data):
-        raise ValueError(f"the header of the BSON document declares another size than its {len(data)} bytes")
+        raise ValueError(f"the document has {len(data)} bytes, but the header of the BSON declares another size")
     if _REFERENCE_KEY in data:  # which would become a database reference, unless each object is read when it is used
         if data.count(_BSON_OBJECT) > FREE_LISTS:
             raise CodecError(

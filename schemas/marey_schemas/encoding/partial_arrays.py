@@ -24,7 +24,7 @@ _SENT = -1
 _MEMBERS = frozenset({"base", "pointer", "dtype", "shape", "tiles", "sizes", "bytes"})
 _DIGEST_CHARACTERS = 32
 _MOST_OVERHEAD = 64
-"""Bytes by which a tile may exceed twice its values; the bound keeps repeated tiles from filling the memory."""
+"""Bytes by which a tile may exceed twice the size of its values. The limit bounds the memory for tiles that repeat."""
 
 
 def tile_digests(array: EncodedArray) -> list[str]:
@@ -38,7 +38,7 @@ def is_partial(value: Any) -> bool:
 
 
 def partial_array(array: EncodedArray, base: str, pointer: str, held: Sequence[str]) -> dict[str, Any] | None:
-    """Return an array without the tiles whose digests are in `held`; None if the base has none of its tiles.
+    """Return an array without the tiles whose digests are in `held`; None if no tile of the array is in the base.
 
     `base` and `pointer` name the base, as described above, and `held` lists the digests of the base's tiles.
     """
@@ -62,7 +62,7 @@ def partial_array(array: EncodedArray, base: str, pointer: str, held: Sequence[s
 def completed(partial: Mapping[str, Any], held: Sequence[bytes]) -> NDArray[Any] | EncodedArray:
     """Return the array that a partial array describes, checked as if it had been sent whole.
 
-    `held` are the tiles of the base, as `blocks.split` returns them: many partial arrays can have one base.
+    `held` contains the tiles of the base, as `blocks.split` returns them, because many partial arrays can share a base.
     Raises `ArrayError` if the members of the partial array do not match each other or the base.
     """
     spec = ArraySpec.parse(partial["dtype"], partial["shape"])

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 ORIGINAL = "original"
-"""Export format that stands for the imported file itself, whatever the format of this file is."""
+"""Name of the export format that selects the imported file itself, in any format."""
 OCTETS = "application/octet-stream"
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The earliest time that a ZIP archive can store. Every file gets this time, so that equal content gives equal bytes.
-"""
+"""The earliest time that a ZIP archive can store. All files get this time, so that equal content gives equal bytes."""
 
 MOST_UNPACKED_BYTES = 1 << 29
 """Greatest unpacked size in bytes of a compressed file; readers stop unpacking there."""
@@ -55,9 +54,10 @@ class FileFormat:
     endings : endings of file names in lower case; written files get the first one, and a search of a folder for files
         to import uses all of them
     media_type : media type of written files
-    reads, writes : contents that the reader understands, and contents that can be written
+    reads, writes : kinds of content that can be read from files of the format, and that can be written to them
     units : units of length in which files can be written; if there are several, the caller chooses one
-    begins : pattern that only the beginning of such a file matches; None if the name alone identifies the format
+    begins : pattern that the beginning of a file matches only if the file has the format; None if only its
+        name identifies a file of the format
     other_endings : endings that also identify the format of a named file, but are ignored in a search of a folder
     euler : whether rotations are Euler angles; an export keeps the rotation orders of the imported file
     archives : endings of files that are ZIP archives; the reader unpacks them
@@ -167,7 +167,7 @@ def format_named(name: str) -> FileFormat:
 IMPORTED = tuple(one for one in FORMATS if one.reads or one.unread)
 """Formats that imports recognise."""
 IMPORTED_ENDINGS = tuple(sorted(ending for one in IMPORTED for ending in one.endings))
-"""Endings of the files that the upload of a folder includes."""
+"""File name endings by which the upload of a folder selects files."""
 MOTION_FORMATS = tuple(one.name for one in FORMATS if "motion" in one.writes)
 """Formats that a clip can be written in."""
 WHOLE_FORMATS = tuple(
@@ -176,9 +176,9 @@ WHOLE_FORMATS = tuple(
 """Formats whose files contain the skeleton of the motion, so that each file can be imported on its own."""
 SAMPLE_FORMATS = (*MOTION_FORMATS, "json")
 EXPORT_FORMATS = (ORIGINAL, *SAMPLE_FORMATS)
-"""Choices of an export."""
+"""Formats that an export can have, including `original` for the imported file."""
 WRITTEN_UNITS = tuple(dict.fromkeys(unit for one in FORMATS if len(one.units) > 1 for unit in one.units))
-"""Units among which the caller chooses if the format does not fix the unit."""
+"""Units of length that callers can choose for formats without a fixed unit."""
 DEFAULT_FORMAT = "bvh"
 """Default format of written motion files."""
 DEFAULT_UNIT = "cm"

@@ -28,16 +28,16 @@ _SKELETON_MODEL = "skeleton_model"
 
 @dataclass(frozen=True)
 class Pairing:
-    """A file that needs a companion, or that may have one, or notes.
+    """File that needs or may have a companion or notes, with the files that were found for it.
 
     Parameters
     ----------
     file : name of the file
     companion : name of its companion; None if there is none
-    beside : names of the files that an import must contain besides `file`, so that it pairs the file in this way
+    beside : names of the files that an import must contain besides `file` in order to pair `file` in this way
     notes : name of the file with its annotation or alignment; None if there is none
     shared : whether the companion is also imported on its own
-    code, reason : why the file is refused without a companion; empty if it has one or can do without
+    code, reason : why the file is refused without a companion; empty if the file has a companion or does not need one
     """
 
     file: str
@@ -62,10 +62,11 @@ def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
     only one possible companion, this file is chosen.
 
     The name of a skeleton of the predecessor ends in `skeleton` (walk_skeleton.json, walk.skeleton), and its stem is
-    the text before this word; without such a text (skeleton.json), it matches every file. A tree has the name of its
-    model with another ending (walk_cluster_tree.json for walk_mm.json), a skeleton model that of its skeleton
-    (walk_skeleton_model.json for walk_skeleton.json or walk.skeleton), and notes that of their motion
-    (walk_sections.json or walk_alignment.json for walk.bson.bz2 or walk.bvh).
+    the text before this word. If there is no text before it (skeleton.json), the skeleton matches every file. Three
+    kinds of files have the name of another file with a different ending: a tree the name of its model
+    (walk_cluster_tree.json for walk_mm.json), a skeleton model the name of its skeleton (walk_skeleton_model.json for
+    walk_skeleton.json or walk.skeleton), and notes the name of their motion (walk_sections.json or walk_alignment.json
+    for walk.bson.bz2 or walk.bvh).
     """
     folders: defaultdict[str, dict[str, str]] = defaultdict(dict)
     for name in sorted(names):
@@ -146,8 +147,8 @@ def _pairings(row: FileFormat, files: _Files) -> Iterator[Pairing]:
 def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
     """Pair the models of a folder with their trees, and its clips with their skeletons.
 
-    By its name, a clip differs only from files that are called models, trees or skeletons. So other files, such as
-    graphs, get a skeleton, too, which their import ignores.
+    Every file that is not named like a model, tree or skeleton is taken for a clip. So other files, such as graphs, are
+    also paired with a skeleton; their import ignores it.
     """
     known = [(stem_of(name), path) for name, path in files if _PREDECESSOR.names(name)]
     skeletons = {_skeleton_stem(stem).lower(): path for stem, path in known if is_skeleton_name(path)}
@@ -184,10 +185,10 @@ def _skeleton_stem(stem: str) -> str:
 
 
 def _best(stem: str, companions: Mapping[str, str]) -> tuple[str | None, tuple[str, ...]]:
-    """Return the best match for a stem, or None, and the files that show that it is the best.
+    """Return the best match for a stem, or None, and the files that an import needs to find the same result.
 
-    `companions` maps the stems of possible companions, in lower case, to their paths. Two of them show that there is
-    no match: of one, it would be the match.
+    `companions` maps the stems of possible companions, in lower case, to their paths. Without a match, the second value
+    contains two companions, because a single companion would be the match.
     """
     stem = stem.lower()
     ends = [len(stem), *(end for end in range(len(stem) - 1, 0, -1) if not stem[end].isalnum()), 0]

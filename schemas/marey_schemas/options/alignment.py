@@ -13,7 +13,7 @@ CostMethod = Literal["turned", "plain"]
 
 MEDOID = "medoid"
 NEAREST_MEAN_LENGTH = "nearest_mean_length"
-"""Choice of the reference: the clip whose length is nearest to the mean length; `MEDOID` is the other choice."""
+"""Value of `reference` that selects the clip with the length nearest to the mean; `MEDOID` is the other value."""
 
 _Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 
@@ -49,8 +49,8 @@ class AlignOptions(CostOptions):
         MEDOID,
         description="Clip whose time is the canonical time. medoid: the clip nearest to all others (of more than 200 "
         "clips, the clip of a random sample of 200 that is nearest to all others of the sample); "
-        "nearest_mean_length: the clip whose length is nearest to the mean; or the id of a clip, of which commands and "
-        "Python also take the path.",
+        "nearest_mean_length: the clip whose length is nearest to the mean; or the id of a clip; commands and Python "
+        "also accept the path of the clip.",
     )
     rate_hz: float | None = Field(
         None,
@@ -64,8 +64,8 @@ class AlignOptions(CostOptions):
         3,
         ge=0,
         le=60,
-        description="Greatest number of consecutive steps that advance only one of the clips; so one frame is matched "
-        "with at most this number of frames plus one. null: no limit.",
+        description="Greatest number of consecutive steps of the path that advance only one of the two clips. With "
+        "the limit n, a frame is matched with at most n + 1 frames. null: no limit.",
     )
     weights: dict[JointName, _Weight] = Field(
         default_factory=dict,

@@ -15,7 +15,7 @@ Degrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 
 
 OUT_OF_REST = 0.25
-"""Distance from the rest position, as a share of the farthest reach, above which a hand counts as reaching."""
+"""Distance of a hand from its rest position, as a share of its farthest distance, above which the hand is reaching."""
 
 
 class ContactOptions(Options):
@@ -112,7 +112,7 @@ class WristContactProposal(_Proposal):
         "wrist_contact", description="Name of the method that proposes segments and keyframes."
     )
     hand: Literal["left", "right", "either"] = Field(
-        "either", description="Hand that reaches; either: the one that reaches farther."
+        "either", description="Hand that reaches; either: the hand that reaches farther."
     )
     least_reach_m: float = Field(
         0.2, gt=0, le=10, allow_inf_nan=False, description="Least distance of a reach, in metres."
@@ -125,7 +125,9 @@ class WristContactProposal(_Proposal):
         description="Share of the farthest distance from rest at which a hand has arrived.",
     )
     release: bool = Field(
-        False, description="Also add a keyframe `release` at the last frame in which the hand is at its far place."
+        False,
+        description="Also add a keyframe `release` at the last frame in which the hand is still far from its "
+        "rest position.",
     )
 
 

@@ -80,11 +80,13 @@ class EvaluationOptions(Grid):
         8,
         ge=1,
         le=64,
-        description="Number of replicates: each trial runs so often, each time with another phase of the stride at the "
-        "start, and with an approach that is up to one second longer. Results are means with 95 % intervals. 1: only "
+        description="Number of replicates of each trial. Each replicate has a different phase of the stride at the "
+        "start, and an approach that is up to one second longer. Results are means with 95 % intervals. 1: only "
         "the trial itself, as published, without intervals.",
     )
-    seed: int = Field(0, ge=0, lt=2**63, description="Number from which the replicates are drawn.")
+    seed: int = Field(
+        0, ge=0, lt=2**63, description="Seed of the random differences between the replicates of a trial."
+    )
     window: Literal["circle", "all"] = Field(
         "circle", description="Part of a trial that is measured. circle: the circle only; all: also the approach."
     )

@@ -11,7 +11,7 @@ from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_FORMATS, 
 
 
 class MotionFileOptions(Options):
-    """Format of written motion files, and what the format leaves open."""
+    """Format of written motion files, with options that depend on the format."""
 
     format: ExportFormat = Field(DEFAULT_FORMAT, description="Format of the files.")
     unit: WrittenUnit = Field(
@@ -19,8 +19,9 @@ class MotionFileOptions(Options):
     )
     fold_positions: bool = Field(
         False,
-        description="In BVH files, give positions to the root alone, for programs that ignore those of other joints: "
-        "the path of the joint that carries the body moves to the root, and other joints get their median offsets.",
+        description="In BVH files, write positions only for the root, for programs that ignore positions of other "
+        "joints. The path of the joint that carries the body is transferred to the root, and other joints get "
+        "their median offsets.",
     )
 
     @model_validator(mode="after")

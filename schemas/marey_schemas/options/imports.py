@@ -31,8 +31,8 @@ class ImportOptions(Options):
     collection: CollectionPath = Field("", description="Folder of the project that receives the clips.")
     skeleton: str | None = Field(
         None,
-        description="Item id of the skeleton that the clips must use; `marey upload` and Python also take its path. "
-        "Absent: an equal skeleton of the project, or a new one.",
+        description="Item id of the skeleton that the clips must use; `marey upload` and Python also accept the path "
+        "of the item. Absent: an equal skeleton of the project is used, or a new skeleton is created.",
     )
     unit: LengthUnit | None = Field(
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."
@@ -52,8 +52,8 @@ class ImportOptions(Options):
     )
     trust_options: bool = Field(
         False,
-        description="Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise such "
-        "files are refused.",
+        description="Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise, "
+        "files with a contradiction are refused.",
     )
     end_index: EndIndex | None = Field(
         None,
@@ -64,7 +64,7 @@ class ImportOptions(Options):
     replace_skeleton: bool = Field(
         False,
         description="Make a new revision of a clip or model of the same name, even if the file has another skeleton; "
-        "otherwise such files are refused.",
+        "otherwise, a file with another skeleton is refused.",
     )
     trim_rest_pose: bool = Field(False, description="Remove rest poses at the beginning and at the end of each clip.")
     tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS, description="Tags that every clip gets.")
@@ -75,9 +75,12 @@ class ImportOptions(Options):
     @field_validator("collection")
     @classmethod
     def _names_folders(cls, path: str) -> str:
-        """Refuse parts of a path that stand for other folders in a file system, but would be names here."""
+        """Refuse . and .. in a path. They would refer to other folders in a file system, but would be names here."""
         if {".", ".."} & set(path.split("/")):
-            raise ValueError("a path of folders begins at the project and has no . or .. in it; name the folders")
+            raise ValueError(
+                "the path of a folder must not contain . or ..; write the names of the folders, "
+                "beginning at the top of the project"
+            )
         return path
 
     @property

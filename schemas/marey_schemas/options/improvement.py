@@ -24,8 +24,8 @@ class ObjectiveOptions(Options):
     pose_cost: _Price = Field(0.5, description="Metres that a pose cost of 1 m adds to the objective.")
     seconds: _Price = Field(
         0.0001,
-        description="Metres that each second of data adds to the objective; a clip that lowers the other terms by less "
-        "is removed.",
+        description="Metres that each second of data adds to the objective. A clip is removed if it lowers the other "
+        "terms by less than its duration adds.",
     )
 
 
@@ -38,29 +38,31 @@ class ObjectiveChoice(Options):
 
 
 class ConfirmedEffects(ObjectiveChoice):
-    """Replicates of the trials on which effects are estimated, and others on which the chosen ones are confirmed."""
+    """Replicates in which effects are estimated, and further replicates in which the chosen effects are confirmed."""
 
     estimation_replicates: int = Field(
         4,
         ge=1,
         le=64,
-        description="Number of replicates of each trial in which effects are estimated, to choose among them; the "
-        "first are those of the evaluation. Confirmations begin after the last replicate of both.",
+        description="Number of replicates of each trial in which effects are estimated, in order to choose among "
+        "them. They are numbered from 0, like the replicates of the evaluation. Confirmations use replicates "
+        "with higher numbers than both.",
     )
     confirmation_replicates: int = Field(
         8,
         ge=0,
         le=64,
-        description="Number of other replicates in which the chosen effects are measured again: the effects that are "
-        f"reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed. With "
-        f"{LEAST_REPLICATES} to 6, an optimisation confirms no step whose effect is equal in all replicates, unless it "
-        "changes no trial.",
+        description="Number of further replicates in which the chosen effects are measured again; these measurements "
+        f"are reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed. With "
+        f"{LEAST_REPLICATES} to 6, an optimisation confirms no step whose effect is equal in all replicates, unless "
+        "the step changes no trial.",
     )
     confirmation_seed: int = Field(
         0,
         ge=0,
         lt=2**63,
-        description="Seed of these other replicates: with another seed, the same choices are confirmed again.",
+        description="Seed of the replicates for confirmation. With another seed, the same choices are confirmed in "
+        "different replicates.",
     )
 
     @field_validator("confirmation_replicates")
@@ -87,15 +89,15 @@ class SuggestionOptions(ConfirmedEffects):
         3,
         ge=0,
         le=100,
-        description="Number of clips to add whose effect on the trials is simulated, in the order of the additions; "
-        "each takes as long as an evaluation with `confirmation_replicates`.",
+        description="Number of suggested additions whose effect on the trials is simulated, in their order. Each "
+        "simulation takes as long as an evaluation with `confirmation_replicates`.",
     )
     consider: int | None = Field(
         50,
         ge=0,
         le=100_000,
-        description="Number of clips whose removal is tried, one at a time, beginning with the clips that the fewest "
-        "trials use; null: all.",
+        description="Number of clips whose removal is tried, one clip at a time, beginning with the clips that the "
+        "fewest trials use; null: all clips.",
     )
     duplicate_cm: float = Field(
         3.0,
@@ -135,8 +137,8 @@ class OptimisationOptions(ConfirmedEffects):
         ge=0,
         le=1000,
         allow_inf_nan=False,
-        description="Least decrease of the objective of a step, in metres, in addition to its confirmation. Chance "
-        "needs no allowance here, because only steps that are confirmed are made.",
+        description="Least decrease of the objective that a step must achieve, in metres. The value 0 is enough to "
+        "exclude effects of chance, because every step must also be confirmed.",
     )
     max_steps: int = Field(50, ge=1, le=10_000, description="Greatest number of steps.")
     max_evaluations: int | None = Field(
@@ -154,7 +156,7 @@ class OptimisationOptions(ConfirmedEffects):
         20,
         ge=1,
         le=100_000,
-        description="Number of removals and number of additions to try in each step; null: all.",
+        description="Number of removals, and number of additions, to try in each step; null: all.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Options of motion matching: the database of clips, and the controller that plays clips from it."""
+"""Options of motion matching: the database of clips, and the controller that plays clips from the database."""
 
 from __future__ import annotations
 
@@ -42,7 +42,9 @@ class DatabaseOptions(Options):
     """Options of the conversion of clips to a database for motion matching."""
 
     mirroring: Mirroring = Field(
-        "none", description="add: every clip and its mirrored copy; only: the mirrored copies alone."
+        "none",
+        description="Mirrored copies of the clips. none: the clips alone; add: every clip and its mirrored "
+        "copy; only: the mirrored copies alone.",
     )
     end_policy: EndPolicy = Field(
         "clamp",

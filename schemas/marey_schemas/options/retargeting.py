@@ -12,7 +12,7 @@ HandsFrom = Literal["shoulders", "world"]
 
 
 class RetargetOptions(Options):
-    """Parts of a motion that are kept beside its poses."""
+    """Features of the source motion that are kept in addition to its poses."""
 
     keep_feet: bool = Field(
         False,
@@ -24,9 +24,10 @@ class RetargetOptions(Options):
     )
     hands_from: HandsFrom = Field(
         "shoulders",
-        description="Point from which keep_hands scales. shoulders: the middle of the shoulders, by the length of the "
-        "arms, which is within reach; world: the origin, by the scale of the root's path, for hands on objects or on "
-        "the floor. An arm that is too short is stretched.",
+        description="Centre and factor by which keep_hands scales the positions of the hands. shoulders: from the "
+        "middle of the shoulders, by the ratio of the arm lengths or less, so that all positions are within "
+        "reach; world: from the origin, by the scale of the root's path, for hands on objects or on the floor. "
+        "An arm that is too short is stretched.",
     )
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Limits of the verdict on an evaluation: how far a followed trial may be from what was asked for, and how it may look.
+"""Limits of the verdict on an evaluation: greatest deviations from the desired motion, and limits of looks.
 
 Limits of looks are derived from two sources: the clips that the trial shows, and the baseline of generated clips, whose
 feet do not slide. The figures of the baseline in the descriptions are those of the 162 default trials.
@@ -21,12 +21,14 @@ class VerdictLimits(Options):
     """Limits of a trial. A trial counts as followed if it exceeds none of them."""
 
     lag_s: _Limit = Field(
-        0.5, description="Greatest mean distance from the desired position, as the time in seconds to cover it."
+        0.5,
+        description="Greatest mean distance from the desired position, given as the time in seconds to cover "
+        "the distance at the mean speed of the trial.",
     )
     speed_share: _Limit = Field(
         0.15,
-        description="Greatest error of the mean speed, as a share of the desired speed; for each speed of a switching "
-        "trial, away from the switches.",
+        description="Greatest error of the mean speed, as a share of the desired speed. In a switching trial, each "
+        "speed is measured separately, away from the switches.",
     )
     turn_deg_s: _Limit = Field(10.0, description="Greatest error of the mean turn rate, in degrees per second.")
     heading_deg: _Limit = Field(
@@ -34,9 +36,9 @@ class VerdictLimits(Options):
     )
     speed_wobble_share: _Limit = Field(
         0.2,
-        description="Greatest standard deviation of the speed, as a share of the desired speed; in a switching trial "
-        "away from the switches, as a share of the faster speed, because the character catches up after a switch. The "
-        "baseline reaches 0.19.",
+        description="Greatest standard deviation of the speed, as a share of the desired speed. In a switching "
+        "trial, it is measured away from the switches, as a share of the faster speed, because the character "
+        "catches up after a switch. The baseline reaches 0.19.",
     )
     turn_wobble_deg_s: _Limit = Field(
         25.0,
@@ -45,19 +47,21 @@ class VerdictLimits(Options):
     )
     response_s: _Limit = Field(
         2.0,
-        description="Greatest median time to answer a switch of the speed, in seconds; switches without an answer "
-        "count as longer than all others.",
+        description="Greatest median time in which the character responds to a switch of the speed, in seconds. "
+        "Switches without a response count as longer than all others.",
     )
     skate_m_s: _Limit = Field(
         TOE_SPEED_M_S,
-        description="Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more; "
-        "by default the speed up to which a foot counts as standing.",
+        description="Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more. "
+        "The default is the greatest speed of a foot that counts as standing.",
     )
-    skate_ratio: _Limit = Field(2.0, description="Greatest ratio of this speed to that of the clips shown.")
+    skate_ratio: _Limit = Field(
+        2.0, description="Greatest ratio of the mean speed of feet in contact to the same speed in the clips shown."
+    )
     sinking_m: _Limit = Field(
         0.03,
-        description="Depth below the floor of the clips shown that the feet keep within for 95 % of the time, in "
-        "metres; the baseline sinks by 0.006.",
+        description="Greatest depth of the feet below the floor of the clips shown, in metres, of which the deepest "
+        "5 % of the time are left out; the baseline reaches 0.006.",
     )
     step_ratio: _Limit = Field(
         1.5,

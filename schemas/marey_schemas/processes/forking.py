@@ -1,4 +1,4 @@
-"""Fork server: a process that loads modules once, and then forks children that have them already.
+"""Fork server: a process that loads modules once, and then forks children in which the modules are already loaded.
 
 Loading numeric modules and compiled kernels takes two seconds of processor time and 200 MB for each process. A forked
 child is ready in milliseconds and shares this memory. The fork server has only one thread, since locks that other
@@ -47,7 +47,7 @@ STARTED = 1 << 16
 LOST = 1 << 17
 """Value in place of the exit status of a child whose fork server has ended."""
 THREADS_END_S = 2.0
-"""Longest wait in seconds for the end of other threads of a fork server, which work while modules are loaded.
+"""Longest wait in seconds for the end of the threads that a fork server uses while it loads modules.
 
 `Thread.join` returns a moment before the system has removed the thread.
 """
@@ -115,7 +115,7 @@ class ForkServer:
         return child
 
     def status_of(self, pid: int, timeout_s: float | None = None) -> int | None:
-        """Return the exit status of a child, or None if it still runs after `timeout_s`; without a timeout, wait."""
+        """Return the exit status of a child, or None if it still runs after `timeout_s`; without a timeout, wait on."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or pid in self._statuses, timeout_s)
             return self._statuses.get(pid, LOST if self._ended else None)
@@ -231,7 +231,7 @@ class ForkedChild(ConnectedChild):
 
 
 def require_one_thread() -> None:
-    """Wait until other threads of this process have ended; raises `RuntimeError` if that takes too long."""
+    """Wait until all other threads of this process have ended. Raises `RuntimeError` after `THREADS_END_S`."""
     deadline = time.monotonic() + THREADS_END_S
     while (threads := len(os.listdir("/proc/self/task"))) > 1:
         if time.monotonic() > deadline:

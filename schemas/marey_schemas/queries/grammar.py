@@ -27,7 +27,7 @@ MOST_COMPARED_VALUES = 200
 MOST_LIKENESSES = 3
 """Greatest number of conditions `like(...)` in a query; each of them searches an index of motions."""
 MOST_ALIKE = 10_000
-"""Greatest number of clips that may meet one condition `like(...)`; the statement of the list contains their ids."""
+"""Greatest number of clips that may meet a condition `like(...)`, because the SQL statement contains their ids."""
 DEEPEST = 30
 """Greatest depth of nested brackets and negations."""
 
@@ -68,7 +68,7 @@ class QueryError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """Comparison of a field with values, at least one of which must match; the operator `has` takes no values.
+    """Comparison of a field with one or more values; it is true if at least one value matches. `has` takes no values.
 
     Values are numbers for fields of the type `number`, and texts for the type `text`. For the type `date`, they are
     dates, or times with a time zone.
@@ -85,7 +85,8 @@ class Condition:
 class Likeness:
     """Condition that a clip has a moment that looks like some frames of a clip: `like("walks/a:30-90") < 0.2`.
 
-    The database cannot evaluate it: an index of motions is searched before, and `with_clips` adds the clips found.
+    The database cannot evaluate this condition. So an index of motions is searched first, and `with_clips` adds the
+    clips that were found to the condition.
     """
 
     moment: Moment
@@ -93,7 +94,7 @@ class Likeness:
     """Name of a built-in metric, or path of a stored one; None: the default."""
     distance: float
     below: bool
-    """Whether the distance itself is excluded (`<`), or included (`<=`)."""
+    """Whether clips at exactly the given distance are excluded (`<`), or included (`<=`)."""
     source: str
     column: int
     clips: frozenset[str] | None = None
@@ -171,7 +172,7 @@ def _leaves(query: Query) -> Iterator[Query]:
 
 
 def with_clips(query: Query, found: Mapping[str, frozenset[str]]) -> Query:
-    """Return a query whose conditions `like(...)` have the clips that were found for them, by their source."""
+    """Return a copy of a query with the found clips in each condition `like(...)`; `found` maps sources to clips."""
     if isinstance(query, Likeness):
         return replace(query, clips=found.get(query.source))
     if isinstance(query, Negation):
@@ -296,7 +297,7 @@ def _likeness(tree: Any, source: str) -> Likeness:
         raise QueryError(str(error), _column(moment)) from None
     distance = _number(_text(limit), _column(limit))
     if distance < 0:
-        raise QueryError("a distance is at least 0", _column(limit))
+        raise QueryError("the distance must not be negative", _column(limit))
     named = _text(metric[0]) if metric else None
     if named == "":
         raise QueryError("name a metric, or leave it out for the default one", _column(metric[0]))

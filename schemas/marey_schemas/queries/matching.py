@@ -83,7 +83,7 @@ def _number(value: object, condition: Condition) -> bool:
 
 
 def _day(value: object, condition: Condition) -> bool:
-    """Compare a stored day with the days of the condition; a time in the condition counts as its day."""
+    """Compare a stored day with the days of the condition; a time in the condition is treated as its day."""
     if value is None or condition.operator == "has":
         return value is not None
     days = [str(one)[: len("2026-11-23")] for one in condition.values]

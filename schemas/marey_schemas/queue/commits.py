@@ -12,7 +12,7 @@ from marey_schemas.datasets.naming import MAIN, DatasetName, RefName
 from marey_schemas.names import CollectionPath, Message
 
 MOST_COMMITTED = 200_000
-"""Greatest number of entries that the commit of one job adds, changes or removes; this bounds the memory needed."""
+"""Greatest number of entries that the commit of a job adds, changes or removes; the limit bounds the memory used."""
 MOST_COMMITTED_AT_ONCE = 10_000
 """Greatest number of outputs whose commit is computed in the transaction that publishes them.
 
@@ -25,21 +25,21 @@ _PLACE = re.compile(r"([^/@]+)(?:@([^/@]+))?(/.*)?")
 
 
 class OutputsCommit(Request):
-    """Commit of the outputs of a job to a branch of a dataset, in the transaction that publishes these outputs."""
+    """Request to commit the outputs of a job to a branch of a dataset, in the transaction that publishes them."""
 
     dataset: DatasetName
     branch: RefName = MAIN
     folder: CollectionPath | None = Field(
         None,
-        description="Folder of the dataset that receives the outputs; the paths of the outputs below this folder are "
-        "their paths below `into`. Null: the outputs get the paths that they have in the project; for outputs in the "
-        "dataset's folder, the paths relative to that folder.",
+        description="Folder of the dataset that receives the outputs; an output gets the same path below this folder "
+        "as below `into`. Null: outputs in the project folder of the dataset get their paths relative to this "
+        "folder, other outputs their paths in the project.",
     )
     message: Message = Field("", description="Message of the commit; empty: the kind and the id of the job.")
     replace: bool = Field(
         False,
-        description="Also remove earlier entries of the folder that this job does not make again; only entries of the "
-        "kinds that the job makes are removed.",
+        description="Also remove earlier entries of the folder that the job did not produce this time. Only entries "
+        "of the kinds that the job makes are removed.",
     )
 
     @classmethod
@@ -67,11 +67,11 @@ class CommitOptions(Options):
         None, description="Message of the commit; absent: the kind and the id of the job."
     )
     commit_replace: bool = Field(
-        False, description="Remove the entries of the folder that the job does not make again, in the same commit."
+        False, description="In the same commit, remove entries of the folder that the job did not produce this time."
     )
 
     def commit(self) -> OutputsCommit | None:
-        """Return the commit that the options ask for, or None. Raises `ValueError`."""
+        """Return the requested commit, or None if the options name no branch. Raises `ValueError`."""
         if self.commit_to is not None:
             return OutputsCommit.at(self.commit_to, message=self.commit_message or "", replace=self.commit_replace)
         if self.commit_message is not None or self.commit_replace:
@@ -100,8 +100,8 @@ class JobCommit(Answer):
     message: str
     replace: bool
     base: str | None = Field(
-        description="Newest commit of the branch when the inputs of the job were fixed; changes that others make later "
-        "are not overwritten."
+        description="Newest commit of the branch at the time when the inputs of the job were fixed. Later changes by "
+        "others are not overwritten."
     )
     digest: str | None = Field(
         None, description="Commit that has the outputs; null before the end of the job, and if no entry changed."

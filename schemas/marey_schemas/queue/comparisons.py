@@ -23,7 +23,7 @@ MOST_POINTS = 256
 MOST_CURVE_BYTES = 512 * KIB
 """Greatest size of the file with the curves of a run."""
 LAST_STEP = 2**53
-"""Greatest step, because JSON numbers of other programs are exact up to here."""
+"""Greatest step. Programs that read JSON numbers as double-precision floats represent integers up to this exactly."""
 MOST_DRAWN = 6
 """Greatest number of fields whose curves a comparison contains."""
 
@@ -44,15 +44,15 @@ class Curve(Answer):
     logged: int = Field(
         ge=0,
         le=LAST_STEP,
-        description="Number of values that the script logged; the curve contains some of them.",
+        description="Number of values that the script logged; a long curve contains only some of them.",
     )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if len(self.steps) != len(self.values):
-            raise ValueError("a curve has one value for each step")
+            raise ValueError("a curve must have one value for each step")
         if any(one >= following for one, following in pairwise(self.steps)):
-            raise ValueError("the steps of a curve ascend")
+            raise ValueError("the steps of a curve must be in ascending order, each only once")
         return self
 
 
@@ -69,9 +69,11 @@ class ComparedColumn(Answer):
     of: Source
     differs: bool = Field(description="Whether the runs have different values.")
     numeric: bool = Field(description="Whether all values are numbers.")
-    goal: Goal | None = Field(None, description="Which value of the field is the best; absent: not known.")
-    best: float | None = Field(None, description="Best value of a run.")
-    best_mean: float | None = Field(None, description="Best mean of a setting.")
+    goal: Goal | None = Field(
+        None, description="Whether the highest or the lowest value of the field is the best; absent: not known."
+    )
+    best: float | None = Field(None, description="Best value of the field in a single run.")
+    best_mean: float | None = Field(None, description="Best mean of the field over the runs of a setting.")
 
 
 class ComparedRun(Answer):
@@ -81,13 +83,15 @@ class ComparedRun(Answer):
     commit: str
     seed: int
     created_at: datetime
-    inputs: dict[str, str] = Field(description="Name and revision of each input, or the number of its items.")
+    inputs: dict[str, str] = Field(
+        description="Name and revision of the item of each input, or the number of items if the input has several."
+    )
     values: dict[str, Value] = Field(description="Values of the parameters.")
     fields: dict[str, Value] = Field(description="Logged fields.")
     setting: int = Field(description="Index of the setting in `settings`.")
     counted: bool = Field(
-        description="Whether the means of the setting contain the run. They contain one run for each seed, the newest, "
-        "because a repetition with the same seed is no further sample."
+        description="Whether the means of the setting include this run. Of several runs with the same seed, the "
+        "means include only the newest, because a repetition with the same seed is no further sample."
     )
     curves: dict[str, Curve] = Field({}, description="Curves of the requested fields.")
 
@@ -117,7 +121,7 @@ class ComparedSetting(Answer):
     """Runs with the same command, inputs and parameters, which differ only by their seeds."""
 
     runs: tuple[int, ...] = Field(description="Indices in `runs` of the counted runs.")
-    repeats: int = Field(description="Number of further runs, with the seed of a counted run.")
+    repeats: int = Field(description="Number of further runs, which have the same seed as a counted run.")
     fields: dict[str, FieldSummary] = Field(description="Summary of each numeric field that a counted run logged.")
 
 

@@ -140,14 +140,16 @@ CUT = KindDeclaration(
     version=3,
     inputs={
         "annotations": InputSpec(
-            kind=Kind.ANNOTATION, many=True, description="The annotations; each refers to a clip and its revision."
+            kind=Kind.ANNOTATION,
+            many=True,
+            description="The annotations; each annotation refers to a revision of a clip.",
         ),
         "clips": InputSpec(
             kind=Kind.CLIP,
             many=True,
             required=False,
-            description="The annotated clips, at the revisions to which the annotations refer. If they are given, the "
-            "history of the pieces lists them.",
+            description="The annotated clips, at the revisions to which the annotations refer. If the clips are "
+            "given, they are recorded as inputs of the pieces.",
         ),
     },
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
@@ -212,14 +214,15 @@ TREE = KindDeclaration(
 
 
 def _reads_answers(_params: Mapping[str, Any]) -> bool:
-    """Return that answers of participants, which are read while the job runs, may change between two jobs."""
+    """Return True: the job reads answers of participants while it runs, and these may change between two jobs."""
     return True
 
 
 ANALYSE_STUDY = KindDeclaration(
     name="analyse_study",
-    description="Computes the differences that the participants of a study perceived, the order and the groups of its "
-    "motions, and metrics that are fitted to these differences. Only maintainers may submit it.",
+    description="Analyses a study: computes the differences that its participants perceived, the order and the "
+    "groups of its motions, and metrics that are fitted to these differences. Only maintainers may submit such "
+    "jobs.",
     params=job_params.AnalyseStudyParams,
     implementation="marey_worker.kinds.analyse_study:run",
     version=1,
@@ -242,7 +245,8 @@ INDEX = KindDeclaration(
         "index": InputSpec(
             kind=Kind.INDEX,
             required=False,
-            description="The index to update: the poses of clips that it contains at the same revision are kept.",
+            description="The index to update. Poses of clips that this index contains at the same revision are not "
+            "computed again.",
         ),
     },
     outputs={"index": Kind.INDEX},
@@ -300,8 +304,8 @@ def job_kinds() -> Mapping[str, KindDeclaration]:
             raise TypeError(f"the entry point {entry.value} in the group {ENTRY_POINT_GROUP} must be a KindDeclaration")
         if kind.name in kinds:
             raise ValueError(
-                f"the entry point {entry.value} declares the job kind {kind.name!r}, but another one "
-                "has this name already"
+                f"the entry point {entry.value} declares the job kind {kind.name!r}, but another job kind has this "
+                "name already"
             )
         kinds[kind.name] = kind
     return MappingProxyType(kinds)

@@ -56,7 +56,11 @@ class AlignParams(AlignOptions, MetricChoice, SuffixedResults):
     labels: tuple[Label, ...] = Field(
         (), max_length=1000, description="Labels whose segments and keyframes cut the clips; empty: all labels."
     )
-    mirroring: Literal["none", "add"] = Field("none", description="add: use each clip and its mirrored copy.")
+    mirroring: Literal["none", "add"] = Field(
+        "none",
+        description="Mirrored copies of the clips. none: only the "
+        "clips themselves are aligned; add: each clip and its mirrored copy.",
+    )
 
 
 _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
@@ -77,10 +81,10 @@ class CutParams(TaggedResults):
         (), max_length=1000, description="Labels of the segments to cut out; empty: all labels."
     )
     margin_before_s: Seconds = Field(
-        0.0, description="Seconds before each segment that are included, as far as the clip has them."
+        0.0, description="Seconds before each segment that are also cut out, as far as the clip contains them."
     )
     margin_after_s: Seconds = Field(
-        0.0, description="Seconds after each segment that are included, as far as the clip has them."
+        0.0, description="Seconds after each segment that are also cut out, as far as the clip contains them."
     )
     shortest_s: Seconds = Field(0.0, description="Shortest segment to cut out, in seconds.")
     longest_s: Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)] | None = Field(
@@ -130,7 +134,7 @@ class CutParams(TaggedResults):
 
 MOST_TRIALS = 2000
 MOST_SIMULATED_S = 100_000.0
-"""Greatest total duration of all trials, in seconds; with default options it is 5,346 s."""
+"""Greatest total duration of all trials, in seconds. With default options, the trials take 5,346 s together."""
 MOST_REPLICATED_S = 800_000.0
 """Greatest total duration of all replicates of all trials, in seconds: some minutes of a processor."""
 TRIALS_PER_TASK = 8
@@ -185,7 +189,7 @@ class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
 
 
 def count_evaluation_tasks(params: EvaluateParams) -> int:
-    """Return the number of tasks for the trials; a task runs few trials, so that little work is lost if it fails."""
+    """Return the number of tasks for the trials. A task runs few trials, so that a failure loses little work."""
     per_task = max(TRIALS_PER_TASK, -(-params.trial_count // MOST_EVALUATION_TASKS))
     return -(-params.trial_count // per_task)
 

@@ -34,7 +34,7 @@ class JobState(StrEnum):
 
 
 class FailureReason(StrEnum):
-    """Reason why a job has failed and is not tried again."""
+    """Reason why a job has failed and is not retried."""
 
     ERROR = "error"
     TIMEOUT = "timeout"
@@ -48,9 +48,10 @@ NOTHING_DONE = "nothing-done"
 
 
 def nothing_done(result: Mapping[str, Any]) -> bool:
-    """Return whether the result of a job lists refused inputs, but neither outputs nor inputs without a finding.
+    """Return whether a job has refused inputs and made nothing: it has no outputs, and lists no inputs as `empty`.
 
-    `outputs` is the number of outputs; `empty` lists inputs that the job could use, and in which it found nothing.
+    In `result`, `outputs` is the number of outputs, and `empty` lists inputs that the job could use, but in which it
+    found nothing.
     """
     return bool(result.get("refused")) and not result.get("outputs") and not result.get("empty")
 
@@ -93,7 +94,7 @@ class JobKind(Answer):
 
 
 class ItemInput(Request):
-    """Item as an input, at the given revision, or else at its newest revision at the time of submission."""
+    """Item as an input, at the given revision; without a revision, at the newest one when the job is submitted."""
 
     item: str
     revision: int | None = Field(None, ge=1)
@@ -135,7 +136,7 @@ JobInput = ExistingInput | JobOutputsInput
 
 
 class Resources(Request):
-    """Limits of time and memory of one attempt to run a job, and what else it needs."""
+    """Limits of time and memory of one attempt to run a job, and other resources that the attempt needs."""
 
     time_limit_s: int = Field(3600, ge=1, le=7 * 86400)
     memory_limit_mb: int = Field(4096, ge=64, le=1_048_576)
@@ -155,7 +156,7 @@ class Resources(Request):
 
 
 CacheMode = Literal["use", "refresh", "off"]
-"""Use of the results of identical jobs."""
+"""Whether the results of identical jobs are reused."""
 
 
 class JobCreate(Request):
@@ -172,12 +173,14 @@ class JobCreate(Request):
         description="Final state of this job if a job in `after` does not succeed. fail: failed; skip: cancelled.",
     )
     concurrency_key: str | None = Field(
-        None, max_length=255, description="Key of a lock: one job per project and key runs at a time."
+        None,
+        max_length=255,
+        description="Key of a lock: of the jobs of a project with the same key, only one runs at a time.",
     )
     cache: CacheMode = Field(
         "use",
-        description="use: reuse the result of an identical job; refresh: compute it again and store it for "
-        "later jobs; off: compute it again for this job only.",
+        description="use: reuse the result of an identical job; refresh: compute the result again and store it for "
+        "later jobs; off: compute the result again, for this job only.",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed of all random numbers; the same seed gives the same result.")
     max_attempts: int = Field(3, ge=1, le=20)
@@ -216,7 +219,7 @@ class JobOutput(Answer):
     item: str
     kind: Kind
     revision: int
-    created: bool = Field(description="False if the item had the same content before.")
+    created: bool = Field(description="Whether a revision was created. False: the item had the same content before.")
     skeleton_changed: bool = Field(
         False, description="Whether the new revision has another skeleton than the revision before."
     )
@@ -269,7 +272,7 @@ class Job(Answer):
     size: int | None = Field(None, description="Number of tasks that the job is split into.")
     children: dict[str, int] = Field(default_factory=dict, description="Number of tasks in each state.")
     retry_of: str | None = None
-    cached_from: str | None = Field(None, description="The job whose cached result this one reuses.")
+    cached_from: str | None = Field(None, description="Id of the job whose cached result this job reuses.")
     progress: Progress | None = None
     failure: JobFailure | None = None
     result: dict[str, Any] | None = None
@@ -277,7 +280,9 @@ class Job(Answer):
     publish_conflict: CommitConflict | None = Field(
         None, description="Reason why the outputs are not on the branch to which the job was to commit them."
     )
-    commit: JobCommit | None = Field(None, description="Commit of the outputs; null if the submission asks for none.")
+    commit: JobCommit | None = Field(
+        None, description="Commit of the outputs; null if the submission requested no commit."
+    )
     author: str | None
     created_at: datetime
     run_at: datetime

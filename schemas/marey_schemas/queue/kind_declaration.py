@@ -12,7 +12,7 @@ from marey_schemas.queue.facets import require_facet_names
 from marey_schemas.queue.jobs import InputSpec, JobKind
 
 EVERY_INPUT = "*"
-"""Value of `exports` that stands for all inputs."""
+"""Value of `exports` that means all inputs of the job."""
 
 
 @dataclass(frozen=True)

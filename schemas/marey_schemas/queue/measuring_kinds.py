@@ -53,8 +53,8 @@ EVALUATE = KindDeclaration(
 
 COMPARE = KindDeclaration(
     name="compare",
-    description="Compares two evaluations trial by trial, with confidence intervals of the changes, or several sets of "
-    "clips with the first one.",
+    description="Compares two evaluations trial by trial, with confidence intervals of the changes. Further "
+    "evaluations are compared with the first one.",
     params=job_params.CompareParams,
     implementation="marey_worker.kinds.compare:run",
     version=4,
@@ -122,13 +122,13 @@ QUALITY = KindDeclaration(
 )
 
 _EVALUATED = InputSpec(
-    kind=Kind.EVALUATION, description="The evaluation; its clips are read at the revisions that it used."
+    kind=Kind.EVALUATION, description="The evaluation. Its clips are read at the revisions that the evaluation used."
 )
 _CANDIDATES = InputSpec(
     kind=Kind.CLIP,
     many=True,
     required=False,
-    description="Clips that may be added; those of the evaluated set are ignored.",
+    description="Clips that may be added; clips that the evaluated set already has are ignored.",
 )
 
 SUGGEST = KindDeclaration(

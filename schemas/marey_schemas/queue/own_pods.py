@@ -1,4 +1,4 @@
-"""Pods of a job's own: the labels of jobs that need one, and the images that scripts name."""
+"""Pods that run a single job: labels of the jobs that need such a pod, and images that scripts name."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ GPUS_LABEL = "marey/gpus"
 MOST_GPUS = 64
 
 REFUSED_STATUS = 42
-"""Exit status of a worker in a pod for a single job that the server refuses; to start it again would not help."""
+"""Exit status of a worker in a pod for a single job if the server refuses the worker; a restart would not help."""
 
 IMAGE_VARIABLE = "MAREY_SCRIPT_IMAGE"
-"""Environment variable with the image in which a worker runs; the launcher sets it for scripts with an own image."""
+"""Environment variable with the image in which a worker runs; the launcher sets it if a script names an image."""
 
 
 def with_digest(image: str) -> str:

@@ -41,8 +41,8 @@ TimeZoneName = Annotated[
 Overlapping = Annotated[
     bool,
     Field(
-        description="Whether a job is submitted even if the previous job of the schedule has not ended. If false, such "
-        "times are skipped."
+        description="Whether a job is submitted even if the previous job of the schedule has not ended. If false, "
+        "the time is skipped in this case."
     ),
 ]
 
@@ -50,7 +50,7 @@ Overlapping = Annotated[
 class ScheduleCreate(Request):
     """Request to create a schedule.
 
-    The server submits its jobs as the user who created it, with the scopes of the token that was used.
+    The server submits the jobs as the user who created the schedule, with the scopes of the token of this request.
     """
 
     name: ScheduleName
@@ -67,7 +67,8 @@ class ScheduleCreate(Request):
 class ScheduleChange(Request):
     """Request to change a schedule; absent fields stay as they are.
 
-    After any change but a pause or a new description, the server submits jobs as the user who made the change.
+    After a change, the server submits jobs as the user who made the change, unless only the pause or the description
+    was changed.
     """
 
     cron: Cron | None = None
@@ -89,7 +90,7 @@ class Schedule(Answer):
     overlapping: bool
     paused: bool
     description: str
-    author: str | None = Field(description="Name of the user as whom the server submits the jobs.")
+    author: str | None = Field(description="Name of the user on whose behalf the server submits the jobs.")
     created_at: datetime
     updated_at: datetime
     next_at: datetime | None = Field(

@@ -41,7 +41,7 @@ LONGEST_NAME = 63
 """Greatest number of characters in the name of a parameter or a field."""
 
 WORKER_S, WORKER_MB = 1800, 2048
-"""Seconds and MiB that a worker may use beside the script, for example to fetch the commit."""
+"""Seconds, and MiB of memory, that a worker may use in addition to the script, for example to fetch the commit."""
 
 ScriptName = Annotated[str, StringConstraints(pattern=SLUG)]
 """Name of a script: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
@@ -71,7 +71,9 @@ class ScriptParameter(Request):
     minimum: float | None = Field(None, allow_inf_nan=False, description="Least value of a number.")
     maximum: float | None = Field(None, allow_inf_nan=False, description="Greatest value of a number.")
     choices: tuple[str, ...] = Field((), max_length=100, description="Allowed texts; empty: any text.")
-    default: Value | None = Field(None, description="Value if a run gives none; null: each run must give a value.")
+    default: Value | None = Field(
+        None, description="Value that is used if a run gives no value; null: each run must give a value."
+    )
     description: Message = ""
 
     @model_validator(mode="after")
@@ -81,9 +83,9 @@ class ScriptParameter(Request):
         if self.choices and self.type != "text":
             raise ValueError(f"choices need a parameter of the type text, not {self.type}")
         if any("\x00" in choice for choice in self.choices):
-            raise ValueError("choices: a text contains a zero character")
+            raise ValueError("choices: a text contains a NUL character; remove it")
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
-            raise ValueError("minimum is greater than maximum")
+            raise ValueError("minimum: must not be greater than maximum")
         if self.default is not None and (fault := self.fault_of(self.default)) is not None:
             raise ValueError(f"default: {fault}")
         return self
@@ -143,7 +145,7 @@ class ScriptOutput(Request):
         "of one step; absent: the file is one JSON object.",
     )
     max_bytes: int = Field(64 * MIB, ge=1, le=GIB, description="Greatest size of the file.")
-    required: bool = Field(True, description="Whether a run without this file fails.")
+    required: bool = Field(True, description="Whether a run fails if the script does not write this file.")
     description: Message = ""
 
     @model_validator(mode="after")
@@ -175,7 +177,7 @@ class ScriptLimits(Request):
 
     @property
     def resources(self) -> Resources:
-        """The limits of the job: those of the script, and what the worker needs beside it."""
+        """The limits of the job: those of the script, plus the time and memory that the worker itself needs."""
         time_limit_s, memory_limit_mb = self.seconds + WORKER_S, self.memory_mb + WORKER_MB
         return Resources(time_limit_s=time_limit_s, memory_limit_mb=memory_limit_mb)
 
@@ -188,9 +190,9 @@ class ScriptDeclaration(Request):
     argv: tuple[Annotated[str, StringConstraints(min_length=1, max_length=1000)], ...] = Field(
         min_length=1,
         max_length=MOST_WORDS,
-        description="Words of the command. The first is `python`, followed by a file of the commit, or is a program of "
-        "the commit such as `./measure`. A word `{parameter:name}`, `{input:name}` or `{output:name}` stands for a "
-        "value or the path of a file. No shell reads the words.",
+        description="Words of the command. The first word is `python`, followed by a file of the commit, or a "
+        "program of the commit, such as `./measure`. A word `{parameter:name}` is replaced by a value, a word "
+        "`{input:name}` or `{output:name}` by the path of a file. No shell interprets the words.",
     )
     parameters: dict[FieldName, ScriptParameter] = Field(default_factory=dict, max_length=MOST_DECLARED)
     inputs: dict[FieldName, ScriptInput] = Field(default_factory=dict, max_length=MOST_DECLARED)
@@ -198,8 +200,9 @@ class ScriptDeclaration(Request):
     limits: ScriptLimits = ScriptLimits()
     image: Image | None = Field(
         None,
-        description="Container image in which the script runs, named by its digest; it contains a worker of Marey. The "
-        "server must allow it, and start pods for single jobs. null: the image of the worker.",
+        description="Container image in which the script runs, named by its digest. The image must contain a worker "
+        "of Marey, the server must allow the image, and the server must start pods for single jobs. null: the "
+        "image of the worker.",
     )
 
     @field_validator("commit", mode="before")
@@ -219,7 +222,7 @@ class ScriptDeclaration(Request):
     @model_validator(mode="after")
     def _check_words(self) -> Self:
         if any("\x00" in word for word in self.argv):
-            raise ValueError("argv: a word contains a zero character")
+            raise ValueError("argv: a word contains a NUL character; remove it")
         self._check_program()
         used = set()
         for place, word in enumerate(self.argv):
@@ -234,9 +237,12 @@ class ScriptDeclaration(Request):
             for name in names
         }
         for kind, name in sorted(used - declared):
-            raise ValueError(f"argv: the {kind} {name!r} is not declared")
+            raise ValueError(f"argv: the {kind} {name!r} is not declared; declare it, or remove the word")
         for kind, name in sorted(declared - used):
-            raise ValueError(f"argv: the {kind} {name!r} is declared, but no word is {{{kind}:{name}}}")
+            raise ValueError(
+                f"argv: the {kind} {name!r} is declared, but no word is {{{kind}:{name}}}; add this "
+                "word, or remove the declaration"
+            )
         if sum(output.kind == "fields" for output in self.outputs.values()) > 1:
             raise ValueError("outputs: at most one output can be of the kind fields")
         return self
@@ -267,7 +273,7 @@ class ScriptDeclaration(Request):
                 yield paths[match[1], match[2]]
 
     def input_specs(self) -> dict[str, InputSpec]:
-        """Return the inputs as the declaration of a job kind has them."""
+        """Return the inputs in the form in which job kinds declare inputs."""
         return {
             name: InputSpec(kind=one.kind, many=one.many, description=one.description)
             for name, one in self.inputs.items()
@@ -321,8 +327,8 @@ class ScriptParams(ConsentOverride):
     )
     declaration: ScriptDeclaration | None = Field(
         None,
-        description="The script as it was registered when the job was submitted. The server fills it in; if a request "
-        "gives it, it must equal the registered script.",
+        description="The script as it was registered when the job was submitted. The server fills in this field; if "
+        "a request contains the field, its value must equal the registered script.",
     )
 
 

@@ -40,7 +40,7 @@ class ClaimRequest(Request):
     version: ShownText | None = Field(
         None, max_length=64, description="Version of Marey that the worker runs, shown to administrators."
     )
-    job: str | None = Field(None, description="Claim only this job.")
+    job: str | None = Field(None, description="Id of the only job that the worker claims; absent: any job.")
     task: int | None = Field(
         None, ge=0, le=1_000_000, description="Claim only the task of `job` that has this position."
     )
@@ -48,8 +48,8 @@ class ClaimRequest(Request):
         None,
         min_length=16,
         max_length=64,
-        description="Random id of the claim. If a claim with the same id and the same token is repeated, it gets the "
-        "same leases, renewed.",
+        description="Random id of the claim. If a request is repeated with the same id and the same token, it gets "
+        "the leases of the first request, renewed.",
     )
 
 
@@ -70,8 +70,8 @@ class PinnedInput(Answer):
     commit: str | None = Field(None, description="Commit of a dataset from which the input was taken.")
     consent_ended: str | None = Field(
         None,
-        description="Last day of the performer's consent, if the job would write the input to a file and this day has "
-        "passed, by the clock of the server in UTC.",
+        description="Last day of the performer's consent. Set only if this day has passed, by the clock of the "
+        "server in UTC, and the job would write the input to a file.",
     )
 
     @property
@@ -94,17 +94,17 @@ class PinnedInput(Answer):
         return RevisionRef(item=self.item, revision=self.revision)
 
     def as_input(self) -> ItemInput:
-        """Return the input in the form that is used in the record of the origin of a result."""
+        """Return the input as an `ItemInput`, the form in which the origin of a result is recorded."""
         return ItemInput(item=self.item, revision=self.revision)
 
 
 class JobTrace(Answer):
-    """Trace to which a job belongs, because the request that submitted the job was recorded."""
+    """Trace of the request that submitted a job, if it was recorded; spans of the job are added to it."""
 
     traceparent: str = Field(
         description="Span of the request that submitted the job, in the form of W3C Trace Context."
     )
-    waited_s: float = Field(description="Seconds for which the job could have run before it was claimed.")
+    waited_s: float = Field(description="Seconds for which the job was ready to run before it was claimed.")
 
 
 class Lease(Answer):
@@ -138,7 +138,9 @@ class LeaseList(Answer):
 
     leases: tuple[Lease, ...] = ()
     state: JobState | None = Field(
-        None, description="State of the job, if the claim names one and gets no lease; null if there is no such job."
+        None,
+        description="State of the job that the claim names, if the claim gets no lease; null if the job does "
+        "not exist, or if the claim names no job.",
     )
 
 
@@ -178,8 +180,8 @@ class StagedOutput(Request):
     )
     same_skeleton: bool = Field(
         False,
-        description="Publish nothing if the existing item has another skeleton; the skeleton of this output is not "
-        "published either. A skeleton of the same rig is no other one: the item keeps its own.",
+        description="Publish neither this output nor its skeleton if the existing item has another skeleton. If both "
+        "skeletons are the same rig, the output is published, and the item keeps its skeleton.",
     )
 
 
@@ -233,7 +235,9 @@ class FailRequest(Request):
     )
     retryable: bool = True
     interrupted: bool = Field(
-        False, description="Whether the attempt ended because the worker was stopped; such attempts are not counted."
+        False,
+        description="Whether the attempt ended because the worker was stopped. Such an attempt does not count "
+        "against the number of attempts.",
     )
 
 

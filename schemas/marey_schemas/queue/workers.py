@@ -14,12 +14,14 @@ class Worker(Answer):
 
     name: str
     alive: bool = Field(
-        description="Whether the worker claimed jobs or renewed a lease so recently that it may be waiting or working."
+        description="Whether the worker may still be active, because it claimed jobs or renewed a lease recently."
     )
     seen_at: datetime = Field(description="Time of the last claim or the last renewal of a lease.")
     running: int = Field(description="Number of attempts that the worker runs.")
     version: str | None = Field(
-        None, description="Version of Marey that the worker reported; null if it reported none, or to another server."
+        None,
+        description="Version of Marey that the worker reported to this server; null if it reported no version, "
+        "or only to another server.",
     )
     kinds: tuple[str, ...] | None = Field(
         None, description="Kinds of jobs that the worker claims; null if it claims jobs from another server only."

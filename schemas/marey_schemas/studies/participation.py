@@ -22,7 +22,7 @@ Place = Annotated[int, Field(ge=0, lt=SHOWN)]
 
 
 class StudyLink(Request):
-    """Request for what a link leads to."""
+    """Request for the study to which a participant's link leads."""
 
     code: LinkCode
 
@@ -41,8 +41,8 @@ class StudyWelcome(Answer):
 class ParticipationCreate(Request):
     """Consent to take part, in exchange for a token.
 
-    The browser makes the key and stores it before it sends this request. So a repeated request gets the same token, and
-    nobody else can use the link again.
+    The browser creates the key, and stores the key before it sends this request. Therefore, a repeated request gets the
+    same token, and nobody else can use the link again.
     """
 
     code: LinkCode
@@ -62,7 +62,7 @@ class Participation(Answer):
     """Progress of a participant."""
 
     title: str
-    clips: int = Field(description="Number of motions; their numbers are 0 to clips - 1.")
+    clips: int = Field(description="Number of motions. The motions are numbered from 0.")
     trials: int = Field(description="Number of trials to answer.")
     answered: int
     remaining: int
@@ -79,7 +79,7 @@ class NewParticipation(Answer):
 
 
 class OpenTrial(Answer):
-    """A trial that waits for its answer."""
+    """A trial that the participant has not answered yet."""
 
     number: int = Field(description="Number of the trial among all that were shown to this participant, from 1.")
     clips: tuple[int, ...] = Field(description="Numbers of the motions, by place on the screen.")
@@ -87,7 +87,7 @@ class OpenTrial(Answer):
 
 
 class TrialStep(Answer):
-    """The open trial of a participant, or the news that there is none left."""
+    """Next step of a participant: the open trial, or null if no trial is left."""
 
     finished: bool
     answered: int

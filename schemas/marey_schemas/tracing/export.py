@@ -32,7 +32,7 @@ _PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL
 PROTOCOL = "http/protobuf"
 PATH = "/v1/traces"
 CLOSE_S = 2.0
-"""Longest time in seconds that a process waits at its end for the collector."""
+"""Longest time in seconds that a process waits for the collector before it ends."""
 WARN_EVERY_S = 60.0
 """Shortest time in seconds between two log lines about a collector that does not work."""
 _LONGEST_WARNING = 300
@@ -58,7 +58,7 @@ class Tracer:
         self._share = share
 
     def new_root(self) -> TraceContext:
-        """Return the context of a new trace, of which a share is sampled; it has no span yet, so `span_id` is 0."""
+        """Return the context of a new trace, which has no span yet (`span_id` is 0) and may be sampled."""
         trace_id = new_trace_id()
         return TraceContext(trace_id, 0, trace_id % _WANTED < self._share * _WANTED)
 
@@ -198,7 +198,7 @@ def _readable(context: TraceContext, span: Span, resource: Resource) -> Readable
 
 
 class _Seldom(logging.Handler):
-    """Handler that passes on at most one message in `WARN_EVERY_S` seconds, so that no collector can flood the log."""
+    """Handler that logs at most one message in `WARN_EVERY_S` seconds, so that no collector can flood the log."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -206,7 +206,7 @@ class _Seldom(logging.Handler):
         self._held_back = 0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log the message as one of Marey's, without the traceback, or count it."""
+        """Log the message as a warning of Marey, without the traceback; if it comes too soon, only count it."""
         if (now := time.monotonic()) < self._due:
             self._held_back += 1
             return

@@ -23,7 +23,7 @@ _ERROR_TYPE = re.compile("[A-Za-z_][A-Za-z0-9_.-]{0,63}")
 
 @dataclass(slots=True)
 class Span:
-    """Work with a beginning and an end; times are nanoseconds since 1970."""
+    """Span of a trace: a piece of work with its beginning and end, in nanoseconds since 1970."""
 
     declaration: SpanDeclaration
     name: str
@@ -44,7 +44,7 @@ Emit = Callable[[TraceContext, Span], None]
 
 @dataclass(frozen=True, slots=True)
 class SpanScope:
-    """Place in a trace: `context` names the span under which new spans are recorded, `emit` sends them.
+    """Place in a trace: `context` names the span under which new spans are recorded, and `emit` sends the new spans.
 
     Without `emit`, nothing is recorded, and requests only pass the trace on. `span` is the span itself, if this process
     records it.
@@ -89,13 +89,13 @@ def entering(scope: SpanScope | None) -> Iterator[None]:
 
 
 class ProcessScope:
-    """SpanScope of the whole process, for threads without one of their own; a command sets it."""
+    """Holder of the `SpanScope` of the process, which threads without a scope of their own use; commands set it."""
 
     scope: ClassVar[SpanScope | None] = None
 
 
 def current_scope() -> SpanScope | None:
-    """Return the scope of this thread, or else of the process, or else of the program's own OpenTelemetry trace."""
+    """Return the scope of this thread, else that of the process, else that of an OpenTelemetry trace of the program."""
     return _current.get() or ProcessScope.scope or _foreign_scope()
 
 

@@ -160,7 +160,7 @@ def test_a_difference_that_does_not_fit_its_base_is_refused() -> None:
             sent.applied_to(encoded)
     other = base.copy()
     other[0] += 1
-    with pytest.raises(ArrayError, match="give an array with another digest"):
+    with pytest.raises(ArrayError, match="does not have the digest that was sent"):
         found.applied_to(EncodedArray.of(other))
     for malformed in ({"shape": "7"}, {"shape": [-1]}, {"dtype": "object"}):
         with pytest.raises(ArrayError):

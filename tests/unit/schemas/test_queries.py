@@ -153,7 +153,7 @@ def test_any_value_can_be_quoted(value: str) -> None:
         ("like(a) < 1", "column 6: 'a' names no frames"),
         ("like(a:9-3) < 1", "column 6: 'a:9-3': the end, frame 3, must be after"),
         ("like(a:1) > 2", "column 11: like(...) is a distance of motions; compare it with < or <="),
-        ("like(a:1) < -2", "column 13: a distance is at least 0"),
+        ("like(a:1) < -2", "column 13: the distance must not be negative"),
         ("like(a:1, '') < 2", "column 11: name a metric, or leave it out"),
         ("like = 3", "column 1: write like("),
         (" or ".join(["like(a:1) < 1"] * 4), "at most 3 conditions like"),

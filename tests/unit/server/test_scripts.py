@@ -184,7 +184,7 @@ WRONG_DECLARATIONS = [
     ({"argv": ["python"]}, "not the path"),
     ({"argv": ["python", "a.py\n"]}, "not the path"),
     ({"argv": ["python", "a.py", "{output:fields}\n"]}, "word of its own"),
-    ({"parameters": {"size": {"type": "text", "choices": ["a\0b"]}}}, "zero character"),
+    ({"parameters": {"size": {"type": "text", "choices": ["a\0b"]}}}, "NUL character"),
     ({"parameters": {"size": {"minimum": 5, "maximum": 1}}}, "greater than"),
     ({"argv": ["python", "a.py", "--size={parameter:size}"]}, "word of its own"),
     ({"argv": ["python", "a.py", "{input:clip}"]}, "not declared"),

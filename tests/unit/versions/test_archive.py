@@ -332,7 +332,7 @@ def refer(made: Example, content: str) -> None:
     ("damage", "message"),
     [
         (with_odd_tag, "not a list of changes"),
-        (with_odd_commit, "not that of a commit"),
+        (with_odd_commit, "not the record of a commit"),
         (with_odd_revision, "does not describe a revision"),
         (with_spaces, "not in canonical form"),
     ],

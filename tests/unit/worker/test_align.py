@@ -261,7 +261,7 @@ def test_clips_of_which_none_is_annotated_are_refused_with_the_first_reason(proj
     annotate(project, "z", keyframes=keyframe(5))
     refused = refusal(project)
     assert refused.code == "too-few-clips"
-    assert "walks/a: none of the given annotations belongs to this clip; add one" in refused.detail
+    assert "walks/a: none of the given annotations belongs to this clip; add an annotation" in refused.detail
 
 
 def test_an_input_rig_of_another_skeleton_is_refused(project: Project) -> None:

@@ -25,9 +25,9 @@ class _Check:
     on_progress: OnProgress
     checked: set[ArchiveMember] = field(default_factory=set)
     known: set[str] = field(default_factory=set)
-    """Content digests of the revisions that entries contain, or that members describe."""
+    """Content digests of the revisions that were found in entries and in members of the archive."""
     documents: set[str] = field(default_factory=set)
-    """Documents that were found and must be checked."""
+    """Digests of documents that were found, and that must still be checked."""
 
     def run(self) -> None:
         for digest, _ in self.archive.history():
@@ -39,7 +39,9 @@ class _Check:
             self._document(self.documents.pop())
         self._facets()
         if left := sorted(self.archive.members.keys() - self.checked):
-            raise BadArchive(f"{left[0].name}: no version in the archive contains this member; it was added later")
+            raise BadArchive(
+                f"{left[0].name}: no version in the archive contains this member; the member was added later"
+            )
 
     def _changes_of(self, commit: str) -> None:
         self._mark(ArchiveMember(MemberKind.CHANGES, commit))
@@ -48,7 +50,7 @@ class _Check:
                 if unchanged and not self.archive.manifest.base:
                     raise BadArchive(
                         f"{ArchiveMember(MemberKind.CHANGES, commit).name}: the member refers to an earlier archive, "
-                        "but this archive contains the whole history; it was altered"
+                        "but this archive contains the whole history; the archive was altered"
                     )
                 documents = [digest for part, digest in value["parts"].items() if part not in unchanged]
                 self._revision(revision_content(path_and_kind(key)[1], value["parts"]), documents)
@@ -111,7 +113,7 @@ class _Check:
             self._mark(member)
 
     def _facets(self) -> None:
-        """Check that facets belong to revisions of the archive, or to earlier ones if the archive builds on these."""
+        """Check that all facets belong to revisions that the archive contains or refers to."""
         strangers = sorted(self.archive.facets().keys() - self.known)
         for member in [one for one in self.archive.members if one.kind is MemberKind.FACETS]:
             if strangers:

@@ -20,7 +20,7 @@ from marey_schemas.sizes import MIB
 
 SCHEMA = "marey/archive@1"
 SCHEMA_WITH_FACETS = "marey/archive@2"
-"""Schema of archives that have facets; programs that know only the other schema refuse these archives."""
+"""Schema of archives that have facets; programs that know only the schema without facets refuse these archives."""
 SCHEMA_WITH_DIFFERENCES = "marey/archive@3"
 """Schema of archives in which arrays are described by their differences from arrays of earlier versions."""
 MANIFEST = "archive.json"
@@ -42,7 +42,7 @@ class MemberKind(StrEnum):
     REVISION = "revisions"
     """Revision that documents refer to: its kind, and the content digests of its parts."""
     FACETS = "facets"
-    """Facets of revisions: values by the name of the facet, by the content digest of the revision."""
+    """Facets of revisions: for each content digest of a revision, the values of its facets by name."""
     DIFFERENCES = "differences"
     """Arrays of a document that the archive has only as differences; the digest in the name is that of the document.
 

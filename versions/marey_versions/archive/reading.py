@@ -56,11 +56,11 @@ class EntryChange(NamedTuple):
     value: Value | None
     """The entry after the commit; None if the commit removed it."""
     unchanged: Mapping[str, str]
-    """Parts whose documents the archive lacks; for each, the content digest of an earlier revision with this part."""
+    """Parts whose documents the archive lacks, each with the content digest of an earlier revision that has it."""
 
 
 class Archive:
-    """Archive that is open for reading; a member is read, and compared with its digest, when it is requested.
+    """Archive that is open for reading. Each member is read and compared with its digest when it is requested.
 
     Raises `BadArchive` if the file is not a complete archive, or if the name of a member is not valid.
     """
@@ -81,7 +81,7 @@ class Archive:
             else:
                 self._add(ArchiveMember.of_name(header.name), header)
         if manifest is None:
-            raise BadArchive(f"the archive has no {MANIFEST}: it was not written to its end, or was cut off")
+            raise BadArchive(f"the archive has no {MANIFEST}: the archive was not written completely, or was cut off")
         return manifest
 
     def _add(self, member: ArchiveMember, header: tarfile.TarInfo) -> None:
@@ -104,8 +104,8 @@ class Archive:
     def differences(self, document: str) -> dict[str, ArrayDifference]:
         """Return the arrays of a document that the archive has only as differences, by the digest of the array.
 
-        The archive must build on earlier versions. An array is compared with its digest only by a server that has the
-        base of the difference.
+        Only archives that build on earlier versions have differences. A server that has the base of a difference
+        compares the array with its digest; this method does not.
         """
         member = ArchiveMember(MemberKind.DIFFERENCES, document)
         if member not in self.members:
@@ -146,7 +146,7 @@ class Archive:
             raise BadArchive(f"{member.name}: the content of the member is not a list of changes: {error!r}") from error
 
     def facets(self) -> dict[str, dict[str, float]]:
-        """Return the facets of revisions by content digest; an interrupted writing may have left older values, too."""
+        """Return the facets of revisions by content digest; newer values replace those of an interrupted export."""
         found: dict[str, dict[str, float]] = {}
         for member in self.members:
             if member.kind is MemberKind.FACETS:

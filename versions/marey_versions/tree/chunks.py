@@ -17,7 +17,7 @@ SCHEMA = "marey/tree-chunk@1"
 MOST_CHUNK_BYTES = 8 * 2**20
 """Greatest size of a chunk in bytes; a chunk usually has about 4,000."""
 MOST_ENTRIES = 1 << 40
-"""Greatest number of entries in a tree that a chunk can state, so that sums of these numbers remain lengths."""
+"""Greatest number of entries that a reference to a chunk can state, so that sums of such numbers stay valid lengths."""
 
 
 class DamagedChunk(Exception):
@@ -126,10 +126,10 @@ def decode_trusted(digest: str, data: bytes) -> Chunk:
     try:
         content = orjson.loads(data)
         if content["schema"] != SCHEMA:
-            raise ValueError(f"it does not have the schema {SCHEMA}")
+            raise ValueError(f"the schema is not {SCHEMA}")
         level = content["level"]
         if type(level) is not int or level < 0:
-            raise ValueError("its level is not a number of levels")
+            raise ValueError("the level is not an integer of at least 0")
         return _branch(level, content["children"]) if level else _leaf(content["entries"])
     except (orjson.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         raise DamagedChunk(f"the chunk {digest} cannot be read: {error}") from error
@@ -140,7 +140,7 @@ def _leaf(members: Any) -> Leaf:
     before = ""
     for key, value in members:
         if key <= before or type(value) is not dict:  # a key that is no text cannot be compared: a TypeError
-            raise ValueError(f"its entry {key!r} has no object as value, or is not in order")
+            raise ValueError(f"the value of the entry {key!r} is not an object, or the entry is not in order")
         before = key
         entries.append((key, value))
     return Leaf(tuple(entries))
@@ -151,9 +151,9 @@ def _branch(level: int, members: Any) -> Branch:
     before = ""
     for key, digest, entries in members:
         if key <= before or type(digest) is not str or type(entries) is not int or not 0 < entries <= MOST_ENTRIES:
-            raise ValueError(f"its reference to the chunk that ends with {key!r} is not valid, or is not in order")
+            raise ValueError(f"the reference to the chunk that ends with {key!r} is not valid, or is not in order")
         before = key
         children.append(Child(key, digest, entries))
     if not children:
-        raise ValueError("it refers to no chunk below it")
+        raise ValueError("the list of chunks below is empty")
     return Branch(level, tuple(children))

@@ -34,7 +34,7 @@ def difference(store: ChunkStore | ChunkReader, before: str, after: str, *, pref
 
 
 def _before_all_with(prefix: str) -> str | None:
-    """Return a text that is less than all texts with the prefix, but close to them; None for an empty prefix."""
+    """Return a text that sorts shortly before all texts with the prefix; None for an empty prefix."""
     if not prefix:
         return None
     last = ord(prefix[-1])

@@ -12,7 +12,7 @@ from marey_versions.tree.chunks import Branch, Child, Chunk, ChunkStore, Leaf, V
 from marey_versions.tree.reading import ChunkReader, leaves_with
 
 CHANGED_TOGETHER = 2_000
-"""Number of changes for which the chunks are read with the same few requests to the store."""
+"""Number of changes whose chunks are read together, with one request to the store for each level."""
 
 Changes = Mapping[str, Value | None]
 

@@ -180,7 +180,7 @@ def build_clips(
 
 
 def is_loop(pin: PinnedInput, info: Mapping[str, Any] | None, loops: Sequence[str]) -> bool:
-    """Return whether a clip is a loop: because the job lists it in `loops`, or by the tag in its part `info`."""
+    """Return whether a clip is a loop: either the job lists it in `loops`, or its part `info` has the loop tag."""
     return pin.item in loops or LOOP_TAG in (info or {}).get("tags", ())
 
 

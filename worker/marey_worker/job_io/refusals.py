@@ -45,8 +45,9 @@ class Refusals:
     def require_some(self, made: int, count: int, done: str, *, what: str = "clip") -> None:
         """Raise `JobRefused` if the job refused all of its `count` inputs and made nothing of them (`made` is 0).
 
-        `done` is what the job does, such as "edited", and `what` an input. Tasks of a job that is split do not fail,
-        because another task may succeed; the server ends the whole job.
+        In the message, `done` names the action of the job, such as "edited", and `what` names an input, such as "clip".
+        Tasks of a job that is split do not fail, because another task may succeed; the server decides about the whole
+        job.
         """
         if self.entries and not made and self._context.task.size == 1:
             raise JobRefused(NOTHING_DONE, f"none of {counted(count, what)} can be {done}{self.first}")

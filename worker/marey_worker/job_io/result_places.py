@@ -57,7 +57,7 @@ class ResultPlaces:
             )
         if (kind, collection, name) in self._taken:
             raise MotionError(
-                f"another result of the job in the same folder is called {name!r}; rename one of the inputs",
+                f"another result of the job in the same folder has the name {name!r}; rename one of the inputs",
                 code="same-name",
             )
 

@@ -171,7 +171,7 @@ class _Job:
             yield SourceExample(_uid(one.pin), one.pin.path, clip, cuts, recordings[_uid(one.pin)])
 
     def _recordings(self, clips: Sequence[_Clip]) -> dict[str, Recording]:
-        """Return take and performer of each clip, from its part `info`; a clip without it is a take of its own."""
+        """Return take and performer of each clip, from its part `info`; a clip without `info` is a separate take."""
         infos = self._context.documents([one.pin for one in clips], "info", required=False)
         return {
             _uid(pin): Recording(pin.item) if tree is None else _recording(pin, ClipInfo.model_validate(tree))
@@ -224,7 +224,8 @@ class _Job:
             raise MotionError(
                 f"the clip has {len(known)} annotations that could be used (layers: {layers}); name one layer"
                 if known
-                else f"none of the given annotations{self._of_layer()} belongs to this clip; add one, or omit the clip",
+                else f"none of the given annotations{self._of_layer()} belongs to this clip; add an annotation of "
+                "the clip, or omit the clip",
                 code="several-annotations" if known else "no-annotation",
             )
         (one,) = known
@@ -259,7 +260,10 @@ class _Job:
             return options
         named = [pin for pin in self._pins.values() if pin.item == options.reference]
         if not named:
-            raise JobRefused("unknown-reference", f"the reference {options.reference} is not one of the clips")
+            raise JobRefused(
+                "unknown-reference",
+                f"the reference {options.reference} is not one of the clips; give the id of one of them",
+            )
         return options.replace(reference=_uid(max(named, key=lambda pin: pin.revision)))
 
     def _digest(self, clips: Sequence[_Clip], examples: Sequence[SourceExample], rig: Rig) -> str:
@@ -282,7 +286,7 @@ class _Job:
         )
 
     def _written_options(self) -> dict[str, Any]:
-        """Return the parameters; without a metric, they are written as before metrics could be chosen."""
+        """Return the parameters as a document; without a metric, the member `metric` is left out."""
         return self._params.model_dump(mode="json", exclude={"metric"} if self._params.metric is None else set())
 
     def _metric_tree(self) -> dict[str, Any]:
@@ -350,7 +354,7 @@ class _Job:
 def _recording(pin: PinnedInput, info: ClipInfo) -> Recording:
     """Return take and performer of a clip.
 
-    Pieces that were cut from one clip have this clip as their take; otherwise the take's number in the records counts.
+    The take of a piece that was cut from a clip is this clip; otherwise, it is the take in the record of the clip.
     """
     cut_from = info.source.details.get("clip") if info.source is not None and info.source.format == "cut" else None
     item = cut_from.get("item") if isinstance(cut_from, dict) else None

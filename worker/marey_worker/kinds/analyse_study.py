@@ -85,7 +85,7 @@ def _judgements(study: StudyDocument, people: Sequence[JudgingParticipant]) -> J
 
 
 def _measured(context: Context, study: StudyDocument) -> tuple[list[PairDifferences], list[str]]:
-    """Measure all pairs of motions; without an exception, return why this is impossible."""
+    """Measure all pairs of motions; if this is impossible, return an empty list and the reason."""
     try:
         clips = [_measure(context, one.revision) for one in study.motions]
         counts = np.array([clip.frame_count for clip in clips])

@@ -93,9 +93,7 @@ def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
     for name in names:
         own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)
         if own is None:
-            raise UnknownJoint(
-                "the skeleton has no joint of this name, and its joint mapping has no such standard joint", where=name
-            )
+            raise UnknownJoint("neither the skeleton nor its joint mapping has a joint of this name", where=name)
         found.append(rigged.skeleton.index_of(own))
     return tuple(found)
 

@@ -22,7 +22,7 @@ from marey_worker.job_io.matching_clips import refusing_motion_errors
 def run(context: Context, params: CompareParams) -> dict[str, Any]:
     """Compare evaluations with the first one; the result counts the changes, and refers to the document and the report.
 
-    The document is that of the first two evaluations; with more, its member `others` contains one for each further
+    The document compares the first two evaluations; its member `others` contains a document for each further
     evaluation. Raises `JobRefused` if normalisers, options or scenarios differ, or if there are too many evaluations.
     """
     pins = (*context.inputs["before"], *context.inputs["after"], *context.inputs.get("others", ()))
@@ -52,7 +52,10 @@ def run(context: Context, params: CompareParams) -> dict[str, Any]:
 
 
 def _compared(pins: Sequence[PinnedInput], results: Sequence[EvaluationResult]) -> tuple[Comparison, ...]:
-    """Compare all others with the first. Raises `JobRefused`, with a command that helps, if they are not comparable."""
+    """Compare all further evaluations with the first one.
+
+    Raises `JobRefused` if they are not comparable; the message contains a command that makes them comparable.
+    """
     for pin, other in zip(pins[1:], results[1:], strict=True):
         try:
             require_same_conditions(results[0], other)

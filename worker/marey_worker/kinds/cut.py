@@ -110,8 +110,8 @@ class _Cutting:
             return self._context.item(Kind.CLIP, clip.item)
         if clip.item not in self._clips:
             raise MotionError(
-                f"the annotation belongs to the clip {clip.item}, which is not among the given clips; add "
-                "this clip, or give no clips at all",
+                f"the annotation refers to the clip {clip.item}, which is not among the given clips; add this clip, "
+                "or give no clips at all",
                 code="clip-not-given",
             )
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])

@@ -104,7 +104,7 @@ class _Editing:
         made = edit_clip(clip, self._edit.commands, body=body, sources=sources)
         if self._params.in_place and len(made) > 1:
             raise EditError(
-                "the edit splits the clip, so it cannot be applied in place: several clips cannot replace one",
+                "the edit splits the clip, and several clips cannot replace one clip; set in_place to false",
                 code="several-clips",
             )
         info = self._info(pin, known)
@@ -230,7 +230,7 @@ def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInp
     missing = [item for item in edit.sources if item not in found]
     if missing:
         raise JobRefused(
-            "source-missing", f"the commands refer to {', '.join(missing)}, which the input `sources` does not contain"
+            "source-missing", f"the commands refer to {', '.join(missing)}; add these clips to the input `sources`"
         )
     return found
 

@@ -37,7 +37,7 @@ Headline = dict[str, float | int | None]
 
 
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
-    """Simulate the trials of this task and their replicates; the result refers to the file with what was measured."""
+    """Simulate the trials of this task and their replicates; the result refers to the file with their records."""
     options = EvaluationOptions.of(params)
     trials = _trials(params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
@@ -126,7 +126,7 @@ def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, 
 def _read_trials(
     context: Context, results: Sequence[Mapping[str, Any]], trials: Sequence[Trial]
 ) -> tuple[list[TrialRecord], MeasuredReplicates | None]:
-    """Read what the tasks have found: the record of each trial, and its further replicates if there are any."""
+    """Read the results of the tasks: the record of each trial, and those of its further replicates, if any."""
     found = [decode_tree(context.blob(result["measured"]["blob"]), MSGPACK) for result in results]
     known = {name: record for one in found for name, record in records_from_tree(one["records"]).items()}
     trees = [one["replicates"] for one in found if "replicates" in one]

@@ -72,7 +72,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
 
 
 class ClipFiles:
-    """Clips of a job as files of one format; the skeletons of the clips are read once."""
+    """Converter of the clips of a job to files of one format; each skeleton is read only once."""
 
     def __init__(self, context: Context, params: ExportParams) -> None:
         self._context = context
@@ -128,7 +128,7 @@ def _place(pin: PinnedInput) -> str:
 
 
 def _free_name(pin: PinnedInput, name: str, taken: Collection[str]) -> str:
-    """Return `name` if it is not taken, otherwise a name with the item's id, or with its id and revision."""
+    """Return `name` if it is not taken; otherwise, a name with the item's id, or with the item's id and revision."""
     file = name.rpartition("/")[2]
     candidates = (name, f"{pin.item}-{file}", f"{pin.item}-{pin.revision}-{file}")
     return next(one for one in candidates if one not in taken)

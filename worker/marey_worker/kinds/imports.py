@@ -72,10 +72,10 @@ class _Importing:
     def _import(
         self, planned: PlannedFile, sibling_axis: UpAxis | None = None, *, is_last: bool = False
     ) -> tuple[ImportEntry | None, AxisFinding | None]:
-        """Import a file; return its entry, and what it shows about its upward axis.
+        """Import a file; return its entry, and a finding about the up axis that the motion shows.
 
-        Unless this is the last look at the file, a file that does not clearly show the axis is put aside: it has no
-        entry yet.
+        If the motion does not clearly show the up axis, the entry is None and nothing is staged, because the file is
+        read again later. With `is_last`, the file is imported in any case.
         """
         try:
             found = self._read(planned, sibling_axis)
@@ -137,7 +137,7 @@ class _Importing:
             raise
 
     def _find_models(self, name: str, collection: str | None) -> tuple[int, list[NamedModel]]:
-        """Find models of this job and of the project by name; return their number and the first few of them.
+        """Find models of this job and of the project by name; return the number of matches, and the first few models.
 
         If this job creates a new revision of a model, the new revision is returned.
         """

@@ -39,9 +39,9 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 
 KEPT_SHARE = 0.5
-"""Share of a full shard that must still be needed; shards with less are copied to new ones."""
+"""Least share of a full shard whose poses are still needed; the poses of shards with less are copied to new shards."""
 LEFT_OUT_NAMED = 100
-"""Greatest number of clips that cannot be compared that the log names."""
+"""Greatest number of clips named in the log because they cannot be compared."""
 
 
 def run(context: Context, params: IndexParams) -> dict[str, Any]:
@@ -122,7 +122,7 @@ def _damaged(pin: PinnedInput) -> JobRefused:
 
 
 def _needed(shard: IndexShard, clips: ShardClips, pins: Mapping[tuple[str, int], PinnedInput]) -> list[int]:
-    """List the clips of a shard, by number, that the index shall still contain."""
+    """List the positions, in a shard, of the clips that the new index shall contain."""
     places = zip(clips.items, clips.revisions, strict=True)
     return [run for run, place in enumerate(places) if place in pins and run not in shard.dropped]
 

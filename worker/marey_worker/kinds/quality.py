@@ -80,7 +80,7 @@ class _Found:
 
 
 class _Measuring:
-    """Measurement of the inputs of a job, one clip after another, so that memory does not grow with their number."""
+    """Measurement of the inputs of a job. Clips are read one by one, so that memory does not grow with their number."""
 
     def __init__(self, context: Context, params: QualityParams) -> None:
         self.refusals = Refusals(context)
@@ -93,7 +93,7 @@ class _Measuring:
 
     @property
     def facets(self) -> list[ItemFacets]:
-        """The numbers of all measured clips; those of the reference are the same measures."""
+        """The measures of all measured clips, including the clips of the reference, as facets."""
         return list(self._facets.values())
 
     def measure(self, name: str) -> _Found:
@@ -173,7 +173,7 @@ def _read_contacts(context: Context) -> dict[tuple[str, int], list[SegmentDocume
 
 
 def _take_of(pin: PinnedInput, info: Mapping[str, Any]) -> str:
-    """Return what all clips of the same recording have in common: performer and take, if they are known."""
+    """Return a key that clips of one recording share: performer and take, or the item's id if no take is known."""
     take = info.get("take")
     return pin.item if take is None else f"{info.get('subject') or ''}/{take}"
 

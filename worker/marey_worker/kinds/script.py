@@ -53,11 +53,17 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
     """
     declared = params.declaration
     if declared is None:
-        raise JobRefused("no-declaration", "the job has no declaration of its script; submit it to a newer server")
+        raise JobRefused(
+            "no-declaration", "the job has no declaration of its script; update the server, and submit the job again"
+        )
     if declared.image is not None and declared.image != os.environ.get(IMAGE_VARIABLE):
-        raise JobRefused("wrong-image", f"the script needs the image {declared.image}; this worker runs in another one")
+        raise JobRefused(
+            "wrong-image", f"the script needs the image {declared.image}, but this worker runs in another image"
+        )
     if landlock_version() == 0:
-        raise JobRefused("no-confinement", "this worker cannot confine scripts: it needs Linux 5.13 with Landlock")
+        raise JobRefused(
+            "no-confinement", "this worker cannot confine scripts: run the worker on Linux 5.13 or later with Landlock"
+        )
     folder = Path(tempfile.mkdtemp(prefix="run-", dir=context.scratch))
     for below in (CODE, OUTPUTS, "tmp"):
         (folder / below).mkdir()
@@ -75,7 +81,7 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
 
 
 def examine() -> tuple[str, str, str]:
-    """Run a command that does nothing as a script; return a check, its state (ok, warning or fault) and a detail."""
+    """Run an empty command as a script; return the check's name, its state (ok, warning or fault), and a detail."""
     if landlock_version() == 0:
         return "scripts", "fault", "this machine cannot confine scripts: they need Linux 5.13 with Landlock"
     with tempfile.TemporaryDirectory(prefix="marey-doctor-") as folder:
@@ -96,7 +102,7 @@ def _require_program(declared: ScriptDeclaration, code: Path) -> None:
 def _order(
     context: Context, params: ScriptParams, declared: ScriptDeclaration, folder: Path, inputs: dict[str, str]
 ) -> GuardedCommand:
-    """Return the command with its environment, which contains only what is named here, and its limits."""
+    """Return the command with its limits and its environment, which contains only the variables that are named here."""
     paths = {("input", name): path for name, path in inputs.items()}
     paths |= {("output", name): output_path(name, one) for name, one in declared.outputs.items()}
     first, *rest = declared.words(paths, declared.values_of(params.values))
@@ -141,7 +147,7 @@ def _words_of(end: CommandEnd) -> str:
 
 
 def _missing(end: CommandEnd) -> list[str]:
-    """Return in words what this system did not limit."""
+    """Return texts that name the protections and limits that this system did not provide."""
     return [*([] if end.isolated else [NOT_ISOLATED]), *([] if end.bounded else [NOT_BOUNDED])]
 
 

@@ -37,7 +37,7 @@ def run(context: Context, params: SuggestParams) -> dict[str, Any]:
 def facets_of(found: Suggestions) -> list[ItemFacets]:
     """Return how much the removal of a clip would harm the set, as a facet (published number) of the clip.
 
-    Only clips whose harm is known have this facet.
+    Only clips for which this harm was computed have the facet.
     """
     harms = {removal.source: removal.harm for removal in found.redundant}
     harms |= {clip.source: 0.0 for clip in found.unused.clips}

@@ -37,7 +37,7 @@ _SETTINGS = (
 
 
 class FetchFailed(Exception):
-    """A repository could not be read; another try may succeed."""
+    """A repository could not be read; a retry may succeed."""
 
     code = "script-fetch-failed"
 
@@ -89,8 +89,8 @@ class _Git:
     def contains(self, commit: str) -> bool:
         """Return whether a branch or tag contains the commit.
 
-        Large hosts serve the commits of all copies of a repository under the address of the original, so that it is not
-        enough that the host knows the commit.
+        Large hosts also serve the commits of forks under the address of the original repository. So a commit that the
+        host can serve is not necessarily a commit of the repository.
         """
         if not self._folder.exists():
             return False
@@ -157,7 +157,7 @@ def _unpack(stream: IO[bytes], folder: Path) -> None:
                     raise JobRefused("commit-too-large", f"the commit is too large: {detail}")
                 archive.extract(member, folder, filter="data")
     except tarfile.FilterError as error:
-        raise JobRefused("unsafe-commit", f"the commit has a file or link that leads out of it: {error}") from error
+        raise JobRefused("unsafe-commit", f"a file or link of the commit leads out of its folder: {error}") from error
     except tarfile.TarError as error:
         raise FetchFailed(f"the files of the commit cannot be read: {error}") from error
 
@@ -172,7 +172,7 @@ def _cache_folder(environment: Mapping[str, str]) -> Path:
 
 @contextmanager
 def _locked(repository: Path, how: int) -> Iterator[bool]:
-    """Lock a cached repository against other workers; yield false if `how` does not wait and another one holds it."""
+    """Lock a cached repository against other workers; yield false if it is locked and `how` does not wait."""
     repository.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     with repository.with_suffix(".lock").open("ab") as lock:
         try:

@@ -1,8 +1,8 @@
 """Kernel user of a script whose worker runs as root.
 
 The kernel limits the number of processes (RLIMIT_NPROC) of every user but root. So the command of a script runs as a
-user that no other process has. It keeps one right of root, in order to open the files of root that Landlock lets it
-open, such as a Python environment in the home of root.
+user that no other process has. The command keeps one right of root, so that it can open files of root that Landlock
+allows, such as a Python environment in the home of root.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from marey_worker.scripts.confinement import check, libc
 
 FIRST_USER, USERS = 61184, 4336
-"""Ids that no account has; systemd gives them to services while these run."""
+"""Ids of users that no account has. systemd assigns ids in this range to services while they run."""
 CAP_CHOWN, CAP_DAC_OVERRIDE, CAP_FOWNER, CAP_KILL, CAP_SETUID = 0, 1, 3, 5, 7
 NEEDED = (CAP_CHOWN, CAP_DAC_OVERRIDE, CAP_FOWNER, CAP_KILL, CAP_SETUID)
 """Rights that root needs to change the user, to kill the processes of another user, and to remove their files."""
@@ -24,7 +24,7 @@ _THIS_PROCESS = struct.pack("=Ii", 0x20080522, 0)  # version 3 of the rights, pr
 
 
 def free_user() -> int | None:
-    """Return the id of a user without processes, or None if this process may not run a command as another user."""
+    """Return the id of a user who has no processes, or None if this process may not run commands as another user."""
     rights = _rights("CapEff")
     if os.geteuid() != 0 or any(not rights >> one & 1 for one in NEEDED):
         return None
@@ -34,7 +34,7 @@ def free_user() -> int | None:
 
 
 def give(folder: Path, user: int) -> bool:
-    """Make `user` the owner of a folder with all that is in it; return false if its file system allows no owners.
+    """Make `user` the owner of a folder and its contents; return false if the file system does not support owners.
 
     Links are not followed. Raises `OSError` if only a part can be given.
     """
@@ -61,9 +61,9 @@ def become(user: int) -> None:
 
 
 def look_as(user: int) -> None:
-    """Let this process, which stays root, read what the kernel shows of processes only to their user, `user`.
+    """Let this process, still as root, read facts about processes of `user` that the kernel shows only to `user`.
 
-    Some containers do not give root the right to read this of every user. Raises `NotConfinedError`.
+    In some containers, root has no right to read these facts about every user. Raises `NotConfinedError`.
     """
     rights = _rights("CapPrm")
     libc().setfsuid(user)  # removes the rights to files, which this process still needs

@@ -46,7 +46,7 @@ def adopt_orphans() -> None:
 
 
 def confine(writable: Path, *, network: bool) -> None:
-    """Let this process and its future children write only below `writable`, and read only that and installed programs.
+    """Let this process and its future children write only below `writable`, and read only there and in program folders.
 
     Unless `network` is true, TCP is refused as well, if the kernel supports it. Raises `NotConfinedError`.
     """
@@ -87,9 +87,9 @@ def _allow(ruleset: int, paths: Iterable[str], rights: int) -> None:
 
 
 def check(answer: int) -> int:
-    """Return the answer of the kernel to a call. Raises `NotConfinedError` if it is an error."""
+    """Return the result of a system call. Raises `NotConfinedError` if the result is an error."""
     if answer < 0:
-        raise NotConfinedError(f"this system cannot confine it: {os.strerror(ctypes.get_errno())}")
+        raise NotConfinedError(f"this system cannot confine the script: {os.strerror(ctypes.get_errno())}")
     return answer
 
 

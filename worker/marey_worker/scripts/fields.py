@@ -1,4 +1,4 @@
-"""Fields that scripts log, which are not trusted: one JSON object, or JSON lines with the values of one step each."""
+"""Fields that scripts log, as one JSON object or as JSON lines with the values of one step each; not trusted."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_worker.context import JobRefused
 MOST_FIELD_BYTES = MIB
 MOST_LINE_BYTES = 64 * KIB
 STEP = "step"
-"""Member of a line that contains the step of its values."""
+"""Name of the member of a JSON line that contains the step of the values in this line."""
 
 _FIELD_NAME: TypeAdapter[str] = TypeAdapter(FieldName)
 
@@ -31,7 +31,7 @@ class LoggedFields(NamedTuple):
 
 
 def read_fields(name: str, declared: ScriptOutput, file: Path) -> LoggedFields:
-    """Return what a run logged in an output. Raises `JobRefused` if the file has another form."""
+    """Return the fields that a run logged in an output. Raises `JobRefused` if the content is not as required."""
     if declared.format == STEPWISE:
         return _read_lines(name, file)
     if file.stat().st_size > MOST_FIELD_BYTES:
@@ -87,7 +87,7 @@ def _parse_line(where: str, line: bytes, default_step: int) -> tuple[int, dict[s
 def _add(where: str, fields: dict[str, Value], field: str, value: Any) -> None:
     """Set a field to its last value; numbers that are not finite become the texts NaN, Infinity and -Infinity.
 
-    A run whose loss diverges is a result, too, and its last finite loss would be misleading.
+    The result of a run with a diverging loss is that text, because the last finite loss would be misleading.
     """
     fault = _fault_of_name(field) if field not in fields else None
     if isinstance(value, float) and not math.isfinite(value):
@@ -107,7 +107,7 @@ def _has_room(curves: Mapping[str, Any], field: str) -> bool:
 class _ThinnedCurve:
     """Curve that keeps every 2^n-th of its values, and the last one, while values are added.
 
-    So curves of different lengths keep many steps in common, and replicates can be averaged.
+    Curves of different lengths therefore have many steps in common, so that means of replicates can be computed.
     """
 
     def __init__(self) -> None:

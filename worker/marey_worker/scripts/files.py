@@ -29,7 +29,8 @@ def write_inputs(
     consent has ended.
 
     The file `inputs.json` lists the items of each input with the names of their files. Raises `JobRefused` if the
-    consent for a clip has ended and the job does not allow it, and if a clip cannot be written in its format.
+    consent for a clip has ended and the job does not allow exports after the end, or if a clip cannot be written in the
+    format of its input.
     """
     paths: dict[str, str] = {}
     listed: dict[str, list[dict[str, Any]]] = {}
@@ -118,7 +119,7 @@ def _collect_one(name: str, declared: ScriptOutput, outputs: int, target: Path) 
     facts = os.fstat(opened)
     if not stat.S_ISREG(facts.st_mode) or facts.st_nlink != 1:
         os.close(opened)
-        raise JobRefused("unsafe-output", f"the output {name!r} is not an ordinary file with one name")
+        raise JobRefused("unsafe-output", f"the output {name!r} is not an ordinary file, or has several hard links")
     with os.fdopen(opened, "rb") as source:
         if facts.st_size > declared.max_bytes:
             detail = f"the output {name!r} has {facts.st_size:,} bytes; it may have {declared.max_bytes:,}"

@@ -47,7 +47,7 @@ NO_PROGRAM_STATUS = 127
 
 @dataclass(frozen=True)
 class GuardedCommand:
-    """Command of a script, its folder, environment and limits."""
+    """Command of a script, with its folder, environment and limits."""
 
     argv: tuple[str, ...]
     folder: str
@@ -63,7 +63,8 @@ class GuardedCommand:
 class CommandEnd:
     """End of a command: its exit status (128 plus the number of a signal), or the reason why it was stopped.
 
-    `isolated` states whether it had namespaces of its own, and `bounded` whether the kernel limited its processes.
+    `isolated` states whether the command had namespaces of its own, and `bounded` whether the kernel limited the number
+    of its processes.
     """
 
     status: int | None
@@ -74,7 +75,7 @@ class CommandEnd:
 
 
 def main() -> None:
-    """Run the command of the order, and write its end to the pipe."""
+    """Run the command in the order from standard input, and write a `CommandEnd` to the pipe."""
     result = int(sys.argv[1])
     os.set_inheritable(result, False)
     given = json.load(sys.stdin)
@@ -100,7 +101,7 @@ def main() -> None:
 
 
 def _prepare(order: GuardedCommand) -> Separation:
-    """Create the namespaces of the command, and give its folder to its user, if it gets one of its own."""
+    """Create the namespaces of the command; if it gets its own user, make this user the owner of its folder."""
     folder = Path(order.folder)
     place = separate(folder, network=order.network, user=free_user())
     if place.user is None:
@@ -114,7 +115,7 @@ def _prepare(order: GuardedCommand) -> Separation:
 def _hold(order: GuardedCommand, output: int, user: int | None, *, bounded: bool) -> NoReturn:
     """Start the confined command, wait for it, and exit with its status.
 
-    In a process namespace of its own, this is the first process: when it ends, the kernel kills all others.
+    In a process namespace of the command, this is the first process; when it ends, the kernel kills all others.
     """
     os.setsid()
     null = os.open(os.devnull, os.O_RDONLY)
@@ -145,8 +146,8 @@ def _hold(order: GuardedCommand, output: int, user: int | None, *, bounded: bool
 def _take_precedence() -> None:
     """Let this process always run before those of the command, if the system allows it.
 
-    If the kernel does not limit the number of processes, the guard of a worker that runs as root must count them, and
-    could not do it in time if thousands of them shared the processors with it.
+    If the kernel does not limit the number of processes of the command, the guard must count them. It could not count
+    in time if it had to share the processors with thousands of these processes.
     """
     if os.geteuid() == 0:
         with contextlib.suppress(PermissionError):
@@ -245,8 +246,8 @@ class _Watch:
     def _end_all(self) -> None:
         """Kill all processes of the command, until none is left.
 
-        The first process is killed first: if it has a namespace of its own, the kernel then kills all others at once,
-        even those that fork faster than they can be listed.
+        The first process of the command is killed first. If this process has its own namespace, the kernel then kills
+        all other processes of the command at once, even those that fork faster than they can be listed.
         """
         if self.status is None:
             os.kill(self._held, signal.SIGKILL)
@@ -284,7 +285,7 @@ def _resident(one: psutil.Process) -> int:
 
 
 def nameless_bytes(family: Collection[psutil.Process]) -> int:
-    """Return how many bytes files take that have no name any more, or never had one (memory files).
+    """Return the total size in bytes of files without a name: deleted files that are still in use, and memory files.
 
     These are files that processes have opened or mapped; a mapped file exists even if its descriptor is closed. Only
     root may ask for the size of such a file; for other users, a file counts up to the end of its mapped part.
@@ -309,7 +310,7 @@ def nameless_bytes(family: Collection[psutil.Process]) -> int:
 
 
 def _mapped_files(pid: int) -> Iterator[tuple[tuple[int, int], int]]:
-    """Yield the device and inode of each nameless file that a process has mapped, and its bytes."""
+    """Yield device and inode of each mapped file of a process that has no name, and the file's size in bytes."""
     try:
         lines = Path(f"/proc/{pid}/maps").read_text(errors="replace").splitlines()
     except OSError:
@@ -328,9 +329,9 @@ def _mapped_files(pid: int) -> Iterator[tuple[tuple[int, int], int]]:
 
 
 def fault_of_files(folder: Path, nameless: int, written_mb: int) -> str | None:
-    """Return why the files below a folder are too large, too many or out of sight, or None; links are not followed.
+    """Return why the files below a folder are not allowed (too large, too many, too deep or unreadable), or None.
 
-    `nameless` is the number of bytes that files without a name take in addition.
+    Links are not followed. `nameless` is the total size in bytes of files without a name, which is added.
     """
     total, count, waiting = nameless, 0, [(str(folder), 0)]
     while waiting:

@@ -21,7 +21,7 @@ SEEN_USER, SEEN_ROOT = 1000, 1001
 
 @dataclass(frozen=True)
 class Separation:
-    """Result of `separate`: whether all its namespaces exist, and the id that the given user has in them, if any."""
+    """Result of `separate`: whether all namespaces were created, and the id of the user in them, if it has one."""
 
     isolated: bool
     user: int | None
@@ -31,8 +31,8 @@ def separate(writable: Path, *, network: bool, user: int | None = None) -> Separ
     """Move the next child of this process to namespaces of its own, as far as the system allows it.
 
     This process must have only one thread. Its next child sees no other processes and, unless `network` is true, no
-    network. Both see all files outside `writable` as read-only. With `user`, this process is root, and its child can
-    become this user.
+    network. For this process and the child, all files outside `writable` are read-only. With `user`, this process must
+    be root, and the child can become `user`.
     """
     flags = CLONE_NEWUSER | CLONE_NEWNS | CLONE_NEWPID | CLONE_NEWIPC | (0 if network else CLONE_NEWNET)
     this, group = os.geteuid(), os.getegid()
@@ -51,7 +51,7 @@ def separate(writable: Path, *, network: bool, user: int | None = None) -> Separ
 
 
 class _Outside:
-    """Process that stays outside the namespaces of this one: only such a process may give them a second user."""
+    """Helper process that stays outside the new namespaces, because only such a process may map two users into them."""
 
     def __init__(self, user: int) -> None:
         waiting, self._order = os.pipe()
@@ -63,7 +63,7 @@ class _Outside:
         os.close(waiting)
 
     def finish(self, *, write: bool) -> bool:
-        """Let the process write the ids, if `write` is true, and end; return whether it could write them."""
+        """Let the helper write the ids if `write` is true, and then end; return whether the ids were written."""
         if write:
             os.write(self._order, b"w")
         os.close(self._order)
@@ -72,7 +72,7 @@ class _Outside:
 
 
 def _map_both(process: int, user: int) -> bool:
-    """Give the namespace of a process `user` and root, and all groups, because root may open their files."""
+    """Map `user`, root and all groups into the namespace of a process, so that root may open files of any group."""
     groups = (line.split() for line in Path("/proc/self/gid_map").read_text().splitlines())
     maps = {
         "uid_map": f"{SEEN_USER} {user} 1\n{SEEN_ROOT} 0 1\n",
@@ -93,7 +93,7 @@ def _write_maps(process: str, maps: dict[str, str]) -> None:
 def _make_read_only(writable: Path) -> None:
     """Make all files read-only for the namespace of this process, except those below `writable`.
 
-    Landlock does not limit changes of modes, owners and times, which this process may make to all files of its user.
+    Landlock does not limit changes of the modes, owners and times of files, so read-only mounts prevent them.
     Raises `NotConfinedError`.
     """
     folder = os.fsencode(writable)

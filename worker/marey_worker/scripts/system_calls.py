@@ -39,7 +39,7 @@ _MACHINES = {  # refused: shmget, add_key, request_key, keyctl, io_uring_setup (
 
 
 def filter_system_calls() -> None:
-    """Refuse certain system calls to this process and its future children; it must have given up new privileges.
+    """Refuse certain system calls to this process and its future children; call this after setting "no new privileges".
 
     Sockets other than IP and netlink sockets are refused. Pairs of connected Unix sockets remain possible. Raises
     `NotConfinedError`.

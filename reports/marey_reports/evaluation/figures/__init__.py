@@ -1,4 +1,4 @@
-"""Figures of one evaluation or of two: the figures of Abichequer Sangalli et al. (2022), and a few more.
+"""Figures of one or two evaluations: the figures of Abichequer Sangalli et al. (2022), and a few more.
 
 matplotlib is loaded when the first figure is drawn. The same result gives the same bytes.
 """
@@ -46,8 +46,8 @@ class FigureKind(NamedTuple):
     Parameters
     ----------
     number : number of the figure in Abichequer Sangalli et al. (2022), or "" if that paper does not have the figure
-    trials : "one" if it shows one trial, "any" if it shows one or all trials, "none" if it always shows all trials
-    families : families of trials that it can show
+    trials : "one": the figure shows one trial; "any": one trial or all trials; "none": always all trials
+    families : families of trials that the figure can show
     draw : function that draws the figure for one or two subjects
     """
 
@@ -78,7 +78,7 @@ COVERAGE_FIGURES = ("density", "points", "holes", "directions")
 SCENARIO_FIGURES = ("scenario-circle", "scenario-switching")
 TRIAL_FIGURES = ("transition-cost", "errors")
 USE_FIGURES = ("usage", "frame-use", "clip-graph")
-"""Figures that a chapter shows together, in a report of one evaluation or of two."""
+"""Names of the figures of each chapter, in reports of one or two evaluations."""
 SHARED_FIGURES = ("offsets", "density")
 """Figures that can show more than two results, as small multiples on one scale."""
 
@@ -96,7 +96,7 @@ def draw_figure(
 
     Parameters
     ----------
-    name : one of `FIGURES`
+    name : name of the figure, a key of `FIGURES`
     trial : name of the trial to show, such as "switching v=1.5 w=-50". Default: the trial
         that the character follows worst, for figures that show only one trial; otherwise all trials
     other : second result, drawn beside the first for comparison

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from marey_reports.drawing.paper import QUIET, SMALL, write
 
 ROW = 0.235
-"""Height of the row of a clip, in inches."""
+"""Height in inches of a row that shows one clip."""
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -51,7 +51,7 @@ class _Line(NamedTuple):
 
 
 def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
-    """Draw the graph of clips of the suite or of one trial; two subjects have the same clips in the same places."""
+    """Draw the graph of clips for the suite or one trial; two subjects have their clips at the same places."""
     popularity = [_popularity(subject, trial) for subject in subjects]
     switches = [subject.switches(trial) for subject in subjects]
     uids = _most_used(popularity, min(options.most_clips, MOST_CLIPS))
@@ -151,7 +151,7 @@ def _fit(panel: Axes, circles: dict[str, Circle], longest_name: int, size_in: tu
 
 
 def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line]) -> None:
-    """Draw lines, each in the colour of the clip it leaves; more frequent jumps are thicker and darker."""
+    """Draw lines in the colour of the clip that the jump leaves; more frequent jumps have thicker and darker lines."""
     from matplotlib.collections import PathCollection
     from matplotlib.path import Path
 
@@ -170,7 +170,7 @@ def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line])
 
 
 def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], most: int, logarithmic: bool) -> None:
-    """Draw a dot for each displayed range of frames, in one of few sizes, because an SVG has a shape for each size."""
+    """Draw a dot for each displayed range of frames. Few sizes are used, because an SVG stores a shape per size."""
     colours = _colours(circles)
     places, levels, looks = [np.empty((0, 2))], [np.empty(0, np.int64)], []
     for uid, total in dots.items():

@@ -19,7 +19,7 @@ FEWEST_DOTS, FULLEST = 12, 72  # dots on one circle
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """Circle of a clip: centre, radius, number of frames, and number of dots; a dot represents a range of frames."""
+    """Circle of a clip: centre, radius, number of frames, and number of dots; a dot shows a range of frames."""
 
     centre: Floats
     radius: float
@@ -40,7 +40,7 @@ class Circle:
         return np.asarray(-(-np.arange(self.dots + 1) * self.frames // self.dots), dtype=np.int64)
 
     def middle_of(self, dots: Any) -> Any:
-        """Return the middle of the range of frames that each dot stands for."""
+        """Return the middle frame of the range that each dot represents."""
         bounds = self.bounds
         return (bounds[dots] + bounds[np.asarray(dots) + 1]) // 2
 
@@ -83,7 +83,7 @@ def _neighbours(uids: Sequence[str], links: Mapping[tuple[str, str], int]) -> li
 
 
 def _ring(radii: Floats) -> Floats:
-    """Place the centres (n, 2) of circles on a ring, clockwise from the top, so that neighbours do not touch."""
+    """Place circles on a ring, clockwise from the top, so that neighbours do not touch; return their centres (n, 2)."""
     if len(radii) < 2:
         return np.zeros((len(radii), 2))
     rooms = radii + BETWEEN / 2
@@ -97,7 +97,7 @@ def _ring(radii: Floats) -> Floats:
 
 
 def _dots(frames: Sequence[int]) -> Ints:
-    """Compute the numbers of dots: proportional to the square root of the number of frames, at most one per frame."""
+    """Compute each clip's number of dots: proportional to the square root of its frame count, at most one per frame."""
     counts = np.asarray(frames, dtype=np.float64)
     earned = np.clip(MOST_DOTS * counts**0.5 / max((counts**0.5).sum(), 1.0), FEWEST_DOTS, FULLEST)
     return np.asarray(np.maximum(1, np.minimum(counts, earned)), dtype=np.int64)

@@ -78,7 +78,7 @@ def _draw_bars(
 ) -> None:
     """Draw the labelled bars of the subject with index `number`.
 
-    There is one bar for each listed clip, one for all remaining clips if `others` is true, and a hatched one for
+    There is one bar for each listed clip, one for all remaining clips if `others` is true, and a hatched bar for
     transitions. `values` are the lengths of all bars except the bar for transitions. `places` are the positions of all
     bars, and `thick` is their thickness.
     """

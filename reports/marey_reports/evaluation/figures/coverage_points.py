@@ -43,7 +43,7 @@ class _Points(NamedTuple):
 
 
 def draw_points(subjects: Sequence[Subject], _trial: str | None, options: FigureOptions) -> Sketch:
-    """Draw a point for each window of one second, or for at most `MOST_POINTS` windows at even intervals."""
+    """Draw a point for each window of one second; of more than `MOST_POINTS` windows, only some at even intervals."""
     chosen = _choose(subjects, min(options.most_clips, CATEGORIES))
     width = 9.6 if len(subjects) > 1 else 8.6
     keys = 2.5

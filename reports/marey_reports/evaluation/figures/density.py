@@ -37,7 +37,7 @@ DIRECTION_CELL_M_S = 0.25
 
 
 class _Plane(NamedTuple):
-    """Axes of a density map: two measured quantities, their names, and the area to which a value of the map refers."""
+    """Axes of a density map: two quantities with their names, and the area to which the values of the map refer."""
 
     x: Callable[[Coverage], Floats]
     y: Callable[[Coverage], Floats]
@@ -147,7 +147,7 @@ def _draw_map(
     ceiling: float,
     labels: tuple[str, str],
 ) -> Any:
-    """Draw one map; return what the colour bar describes."""
+    """Draw one map; return the drawn image, from which a colour bar can be made."""
     x, y = labels
     panel = add_panel(figure, place, title=subject.label, x=x, y=y, grid=False)
     panel.tick_params(labelleft=bool(y))
@@ -182,7 +182,7 @@ def _least_ranges(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float
 
 
 def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell: tuple[float, float]) -> Floats:
-    """Compute the smoothed seconds of data (FINE, FINE) in an area of size `cell` around each cell of the map."""
+    """Compute the smoothed seconds of data in an area of size `cell` around each point of the map, (FINE, FINE)."""
     from scipy.ndimage import gaussian_filter
 
     coverage = subject.result.coverage
@@ -194,7 +194,7 @@ def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell
 
 
 def _norm(ceiling: float) -> Any:
-    """Make a square-root colour scale, on which little data can be distinguished from none."""
+    """Make a square-root colour scale, on which small amounts of data can be distinguished from none."""
     from matplotlib.colors import PowerNorm
 
     return PowerNorm(0.5, vmin=0.0, vmax=ceiling)

@@ -36,9 +36,9 @@ def fit_one(values: AnyFloats) -> Normals:
 def fit_two(values: AnyFloats, second: NDArray[np.bool_]) -> Normals:
     """Fit a mixture of two normal distributions with scikit-learn.
 
-    The mask `second` selects the values from which the second distribution starts; the first one starts from the other
-    values. Because the start is given, the fit is repeatable. If one of these groups is empty, the values are split at
-    their mean. Values that are all equal give two equal components.
+    The fit starts with two groups of values: the mask `second` selects the second group, and the other values are the
+    first group. Because the start is given, the fit is repeatable. If a group is empty, the values are split at their
+    mean instead. If all values are equal, both components are equal.
     """
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture

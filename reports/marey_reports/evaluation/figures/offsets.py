@@ -73,7 +73,7 @@ def _field(subject: Subject, family: str) -> _Field:
 
 
 def _largest(field: _Field) -> float:
-    """Compute the largest absolute value of a field of offsets or of their changes; 0 if the field has no value."""
+    """Compute the largest absolute value in a field of offsets, or of changes of offsets; 0 if it has no value."""
     return float(np.abs(np.nan_to_num(field.offset_m)).max(initial=0.0))
 
 
@@ -129,7 +129,7 @@ def _draw_two(
 def _draw_many(
     subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], levels: Floats
 ) -> Figure:
-    """Draw small multiples: below each other, a band of up to `COLUMNS` subjects for each family."""
+    """Draw small multiples in rows of up to `COLUMNS` subjects; each row shows one family of trials."""
     width, height, gap, beneath = 1.96, 1.8, 0.26, 0.85
     bands = [
         (family, row, range(first, min(first + COLUMNS, len(subjects))))
@@ -201,7 +201,7 @@ def _draw_field(
 
 
 def _mark_extreme(panel: Axes, field: _Field, signed: bool) -> None:
-    """Write the value that is farthest from zero beside its dot, with a plus sign if `signed` and positive."""
+    """Write the value that is farthest from zero beside its dot; with `signed`, a positive value gets a plus sign."""
     row, column = np.unravel_index(np.nanargmax(np.abs(field.offset_m)), field.offset_m.shape)
     right, up = column <= field.offset_m.shape[1] // 2, row <= field.offset_m.shape[0] // 2
     panel.annotate(

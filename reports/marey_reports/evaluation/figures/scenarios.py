@@ -29,7 +29,7 @@ def draw_circle(subjects: Sequence[Subject], trial: str | None, _options: Figure
 
 
 def draw_switching(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
-    """Draw a trial whose speed switches from section to section (Figure 4b)."""
+    """Draw a trial in which the speed changes from section to section (Figure 4b)."""
     return _draw(subjects, trial, "switching")
 
 

@@ -24,7 +24,7 @@ class FigureOptions:
 
     Parameters
     ----------
-    negate_errors : draw reference minus simulated, as the paper's figure 8, instead of simulated minus reference
+    negate_errors : draw errors as reference minus simulated, as in figure 8 of the paper, not simulated minus reference
     logarithmic : whether the sizes of dots and the lengths of bars have a logarithmic scale
     most_clips : number of clips that are drawn one by one; all other clips are summed up
     """
@@ -52,7 +52,7 @@ class Subject:
         return f"{self.label}: " if self.label else ""
 
     def column(self, name: str) -> str:
-        """Return the name of this subject's column in a table; if there are two subjects, its label precedes `name`."""
+        """Return the name of this subject's column in a table: `name`, after the subject's label if there are two."""
         return f"{self.label}_{name}" if self.label else name
 
     def usage(self, trial: str | None) -> tuple[ClipUsage, ...]:
@@ -84,7 +84,7 @@ class TrialView:
 
     @property
     def switched(self) -> NDArray[np.bool_]:
-        """Mask (S,) of the steps that jump to another frame because a search chose it, not because a clip ended."""
+        """Mask (S,) of the steps that jump to another frame because of a search, not because a clip ended."""
         return np.asarray(self.record.status[1:] == Status.REPLACING)
 
 

@@ -55,7 +55,7 @@ class CostView(NamedTuple):
 
 
 def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None) -> Sketch | None:
-    """Draw the costs of the clips with the median and the highest cost; return None if there is only the reference."""
+    """Draw the costs of the clips with the median and the highest cost; None if the reference is the only clip."""
     views = [_view(aligned, role, clip, options) for role, clip in _chosen(aligned)]
     if not views:
         return None

@@ -68,7 +68,7 @@ def written(deviation: float) -> str:
 
 
 def most_moved(subject: ModelSubject, points: Floats) -> tuple[str, float]:
-    """Find the joint that differs most between the first and last of several motions, and the difference in cm.
+    """Find the joint that differs most between the first and the last motion; return it with the difference in cm.
 
     `points` (motions, T, P, 3) are positions in metres.
     """

@@ -168,7 +168,7 @@ def _deviations(judged: Floats) -> Floats:
 
 
 def _judged(example: ExampleReport) -> float:
-    """Return the log-likelihood that shows whether an example is unusual: the held-out one if it was computed."""
+    """Return the log-likelihood by which an example is judged unusual: the held-out value if it was computed."""
     held_out = example.held_out_log_likelihood
     return example.log_likelihood if held_out is None else held_out
 

@@ -33,7 +33,7 @@ WIDTH, LEAST_WIDTH, LEAST_HEIGHT, MOST_HEIGHT = 4.2, 2.6, 1.0, 3.2
 
 
 class Reach(NamedTuple):
-    """Space that a joint reaches in the examples and in the samples.
+    """Region of space that a joint reaches in the examples and in the samples.
 
     `examples_m` and `samples_m` (3, 2) are the least and the greatest x (left), y (up) and z (forward), in metres.
     """
@@ -44,7 +44,7 @@ class Reach(NamedTuple):
 
 
 def reach_of(subject: ModelSubject) -> list[Reach]:
-    """Compute the space that wrists and ankles reach in examples and samples, from the 1 % to the 99 % quantile."""
+    """Compute the 1 % and 99 % quantiles, per axis, of the positions of wrists and ankles in examples and samples."""
     frames = evenly(subject.primitive.frame_count, FRAMES)
     drawn = subject.primitive.sample(max(LEAST_REACHING, len(subject.poses)), subject.seed)
     sets = [subject.points(poses) for poses in (subject.poses[:, frames], subject.primitive.poses(drawn, frames))]
@@ -138,7 +138,7 @@ def _path_table(names: list[str], joints: list[str], frames: NDArray[np.int64], 
 
 
 def _followed(subject: ModelSubject) -> dict[str, int]:
-    """Return the indices of the known wrists and ankles by name, or of the ends of chains if none is known."""
+    """Return the indices of the known wrists and ankles by name; if none is known, those of the ends of chains."""
     skeleton = subject.primitive.skeleton
     known = map_joints(skeleton).joints
     named = {name: skeleton.index_of(known[key]) for name, (key, _, _) in FOLLOWED.items() if key in known}

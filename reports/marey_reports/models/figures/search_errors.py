@@ -43,7 +43,7 @@ def draw_search_check(subject: ModelSubject) -> Sketch | None:
 
 
 def draw_search_errors(searched_cm: Floats, refined_cm: Floats, *, about: str = "") -> Sketch:
-    """Draw the errors at n targets: after a search in the sample tree, and after refinement of the found samples.
+    """Draw the errors at n targets, after the search in the sample tree and after refinement of the found samples.
 
     Parameters
     ----------

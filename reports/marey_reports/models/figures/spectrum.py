@@ -81,7 +81,7 @@ def _held(kind: str, energy: Floats, kept: int) -> str:
 
 
 def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
-    """Draw the error of rebuilt examples over the number of components; return None if it was not measured."""
+    """Draw the error of reconstructed examples over the number of components; return None if no error was measured."""
     errors = subject.report.reconstruction
     if errors is None:
         return None

@@ -36,7 +36,7 @@ SPEED_SPAN = (0.1, 10.0)
 
 
 def draw_time_warps(aligned: AlignedSet) -> Sketch:
-    """Draw time functions and speeds; name the reference and the clips that differ most from it in time."""
+    """Draw time functions and speeds of all clips; the legend names the reference and the clips most unlike it."""
     times_s = aligned.time_functions / aligned.frame_rate_hz
     speeds = 1.0 / np.diff(aligned.time_functions, axis=1)
     reference = [clip.uid for clip in aligned.clips].index(aligned.reference)

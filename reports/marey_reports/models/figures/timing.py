@@ -26,7 +26,7 @@ WIDTH, HEIGHT = 2.7, 1.9
 
 
 def draw_time_components(subject: ModelSubject) -> Sketch | None:
-    """Draw time functions (time warps) and speeds along each time component; return None if time does not vary."""
+    """Draw time functions (time warps) and speeds along each time component; return None if there are no components."""
     primitive = subject.primitive
     count = min(MOST_COMPONENTS, primitive.temporal.count)
     if not count:
