@@ -162,7 +162,7 @@ def _example(stored: StoredExample) -> AlignedClip:
     if len(times) != clip.frame_count or info["frame_rate_hz"] != clip.frame_rate_hz:
         raise MotionError(
             f"the clip has {clip.frame_count} frames at {clip.frame_rate_hz:g} Hz, but its time function has "
-            f"{len(times)} at {info['frame_rate_hz']:g} Hz; align the clips again",
+            f"{len(times)} frames at {info['frame_rate_hz']:g} Hz; align the clips again",
             code="alignment-invalid",
             where=name,
         )

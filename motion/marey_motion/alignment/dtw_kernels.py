@@ -340,7 +340,7 @@ def _mean_distance(a, b):
 
 @compiled
 def _cost_from_box(points, start, stop, low, high, most):
-    """Sum the mean distances of the points from a bounding box over frames; stop when the sum exceeds `most`."""
+    """Sum, over frames, the mean distance of the points from a bounding box; stop when the sum exceeds `most`."""
     total = 0.0
     for i in range(start, stop):
         cost = 0.0
