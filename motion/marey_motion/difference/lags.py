@@ -16,11 +16,14 @@ WINDOWS = 12
 """Number of windows of the old clip that are searched for in the whole new clip."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
-"""Multiple of the least squared distance up to which the second-best place of a window is a candidate, too."""
+"""Factor that decides whether the second-best place of a window is a candidate, too.
+
+It is one if its squared distance is at most about this factor times that of the best place.
+"""
 NEGLIGIBLE = 1e-3
 """Squared distance of two frames that is attributed to noise."""
 GREATEST_PACE = 4.0
-"""Greatest pace that is tried, in new frames per old frame; the least pace is 1 / `GREATEST_PACE`."""
+"""Greatest pace that is tried: frames of the new clip per frame of the old clip. The least is 1 / `GREATEST_PACE`."""
 PACES = 97
 DECIMATED = 2048
 """Approximate number of frames of the longer clip that are used in the search for the pace."""
@@ -58,7 +61,7 @@ def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
 
 
 def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, ...]:
-    """Find the lags at which windows of frames of `before` are most similar to frames of `after`.
+    """Find the lags at which windows of the old clip, `before`, are most similar to the new clip, `after`.
 
     Each window is compared with all places of the other clip at once, by correlation in the frequency domain.
 
