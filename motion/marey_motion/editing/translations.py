@@ -9,7 +9,7 @@ from marey_motion.skeleton import Skeleton
 
 
 def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> Motion:
-    """Add translations for further joints. They equal the offsets of these joints, so the motion does not change.
+    """Add translations for further joints, equal to the offsets of these joints, so that the motion does not change.
 
     Parameters
     ----------

@@ -86,7 +86,9 @@ def stances_of(speed: Floats, frame_rate_hz: float, options: ContactOptions) -> 
 
 
 def contact_labels(points: Floats, rate_hz: float) -> NDArray[np.bool_]:
-    """Label the frames in which points of feet stand, by their speeds, as the proposals of steps do.
+    """Label the frames in which points of feet are on the ground, by the speed of each point (see `stances_of`).
+
+    The limits of speed and duration are the defaults of `ContactOptions`.
 
     Parameters
     ----------
