@@ -102,8 +102,9 @@ def sweep_weights(
 ) -> tuple[SweepRow, ...]:
     """Run the suite with each setting of the weights; the features and their standard deviations stay the same.
 
-    Each setting also runs in the replicates of the confirmation, because the best settings are known only when all have
-    ended, which may be in other tasks. Progress counts runs of trials over all settings.
+    Each setting also runs in the replicates of the confirmation, because the best settings are known only after all
+    settings have run, and settings may be divided among several tasks. Progress counts runs of trials over all
+    settings.
 
     Parameters
     ----------
