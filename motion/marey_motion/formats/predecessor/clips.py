@@ -170,7 +170,7 @@ def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArra
         )
     # Some writers counted the tips of chains as joints and filled their columns with zeros.
     if poses[:, width:].any():
-        raise FormatError(f"the poses have {poses.shape[1]} columns, but {len(names)} joints need {width}", file=file)
+        raise FormatError(f"the poses have {poses.shape[1]} columns, but {len(names)} joints need {width} columns", file=file)
     return names, poses[:, :width], float(frame_time_s)
 
 
