@@ -145,7 +145,7 @@ def clip_from_document(document: clips.MotionDocument, skeleton: Skeleton) -> Cl
     if set(document.joints) != set(skeleton.joint_names) or len(document.joints) != skeleton.joint_count:
         odd = sorted(set(document.joints) ^ set(skeleton.joint_names)) or ["a repeated name"]
         raise ClipError(
-            f"the motion and the skeleton do not have the same joints; only one of them has {', '.join(odd[:5])}",
+            f"the motion and the skeleton must have the same joints, but only one of the two has {', '.join(odd[:5])}",
             where="joints",
         )
     if document.joints[0] != skeleton.joint_names[0]:

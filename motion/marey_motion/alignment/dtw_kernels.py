@@ -34,7 +34,7 @@ def align(costs, path):
 
 @compiled
 def _cheapest(both, first, second):
-    """Find the least of three totals, and the number of the step that it belongs to.
+    """Find the least of three totals, and the number of its step.
 
     Step 0 advances both motions, step 1 the first motion alone, and step 2 the second motion alone. The code has no
     branches, because the processor could not predict them.

@@ -162,8 +162,8 @@ def _stretched(window: Floats, count: int) -> Floats:
 def _features(poses: Poses) -> Floats:
     """Compute features (F, `CHANNELS` + 4) of F poses.
 
-    They are random projections of the rotations, the height of the root, and the displacement of the root since the
-    previous frame.
+    The first `CHANNELS` features are random projections of the rotations. The other four are the height of the root,
+    and the displacement (x, y, z) of the root since the previous frame.
     """
     rotations = poses.rotations * np.where(poses.rotations[..., :1] < 0.0, -1.0, 1.0)
     flat = rotations.reshape(poses.frame_count, -1).astype(np.float64)
