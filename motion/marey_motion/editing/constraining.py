@@ -164,7 +164,7 @@ def _check_range(constraint: Constraint, number: int, frames: int) -> None:
     start, stop = constraint.start, constraint.stop
     if not 0 <= start < stop <= frames:
         raise EditError(
-            f"the frames {start}:{stop} are not a range within the clip's {frames} frames",
+            f"the range {start}:{stop} must be within the clip's frames 0:{frames}, with its start before its stop",
             code="frames-missing",
             where=f"constraints[{number}]",
         )

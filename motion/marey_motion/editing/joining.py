@@ -152,7 +152,7 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
 def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_hz: float) -> Motion:
     """Join two motions.
 
-    If `overlap` is not 0, this many frames of both are blended into each other. Otherwise, the difference in pose and
+    If `overlap` is not 0, this many frames of both motions are blended. Otherwise, the difference in pose and
     velocity decays over the first `count` frames of the second motion; if `count` is 0, the result is a hard cut.
     """
     if overlap:

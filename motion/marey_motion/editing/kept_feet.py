@@ -125,7 +125,7 @@ def with_feet(
 
 
 def _solved(motion: Motion, legs: Sequence[_Leg], ankles: Floats) -> Motion:
-    """Solve the legs so that the ankles get the places (F, n, 3)."""
+    """Solve the n legs so that their ankles are at the positions `ankles` (F, n, 3)."""
     for number, leg in enumerate(legs):
         motion = leg.solved(motion, ankles[:, number])
     return motion

@@ -49,7 +49,7 @@ def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
     """Compute the speed of the slowest point of a foot, without outliers.
 
     While a foot rolls from heel strike to toe off, first its heel does not move, then its toe. The ankle is close to
-    the heel, so the slower of these two points is slow during the whole contact.
+    the heel, so the slower of ankle and toe is slow during the whole contact.
 
     Parameters
     ----------

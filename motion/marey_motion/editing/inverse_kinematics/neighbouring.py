@@ -23,9 +23,9 @@ def solve_in_order(
     kernel: Callable[..., None], problem: IkProblem, options: SolverOptions, room: Any, found: SolverResult,
     neighbours: Neighbours | None,
 ) -> None:  # fmt: skip
-    """Solve each frame alone; then solve runs of frames in which a joint jumps a second time, frame by frame.
+    """Solve each frame alone, then repeat this in the runs of frames in which a joint jumps.
 
-    In the second pass, each frame starts with the change of its neighbour.
+    In the second pass, each frame starts with the change of its neighbour in time.
 
     Parameters
     ----------
@@ -50,8 +50,8 @@ def solve_in_order(
 def _changes_to_carry(given: Floats, solved: Floats, neighbours: Neighbours) -> tuple[Ints, Ints]:
     """Find the frames to solve again, each starting with the change of its neighbour.
 
-    In a run with a jump, the frame with the smallest change stays as it is. The other frames are solved in order of
-    their distance from this frame, forwards and backwards in time.
+    In a run with a jump, the frame with the smallest change stays as it is. From this frame on, the other frames are
+    solved one after another: first forwards in time, then backwards.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ COHERENT_RAD = 0.05
 """Largest change of the swivel between two frames, in radians, at which a run of frames is not corrected."""
 LEAST_CLARITY = 1e-4
 POLE_FRAMES = 2.0
-"""Number of frames over which swivels towards a pole are evened out."""
+"""Number of frames over which swivels towards a pole are smoothed."""
 
 
 def swivel_coherently(
@@ -104,7 +104,11 @@ def _even_swivels(wished: Floats, jumps: Floats, clear: Floats, reach: float) ->
 
 
 def _unwrapped(angles: Floats, clear: Floats) -> Floats:
-    """Add full turns to angles (n,), so that each clear angle is within half a turn of the clear angle before it."""
+    """Add full turns to angles (n,), so that each angle with enough weight is within half a turn of the last such
+    angle before it.
+
+    The weights are `clear` (n,). Angles with less weight are not compared.
+    """
     told = np.flatnonzero(clear >= min(0.05, float(clear.max())))
     turns = np.round(np.diff(angles[told]) / (2.0 * np.pi))
     full = np.zeros(len(angles))
