@@ -61,7 +61,7 @@ class MetricChange:
     before, after : means over the trials in which the metric is defined in both evaluations, in the unit of the metric
     change : mean of after - before over these trials
     low, high : bounds of the mean change at `CONFIDENCE`, over the replicates; None if there are too few replicates
-    trials : number of these trials
+    trials : number of trials in which the metric is defined in both evaluations
     replicates : number of replicates with a change
     p : probability of a mean change of this size or more by chance, corrected for the other metrics of its family; None
         if there are too few replicates, or if nothing changed
@@ -110,7 +110,7 @@ class TrialChange:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Differences between the evaluations of two sets of clips by the same trials.
+    """Differences between two evaluations, of two sets of clips, that ran the same trials.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def corrected(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
 
 
 def corrected_family(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
-    """Correct the probabilities of changes for their number, by Holm's method.
+    """Correct the probabilities of changes for the number of these changes, by Holm's method.
 
     Parameters
     ----------

@@ -4,8 +4,8 @@ A trial counts as followed if the character keeps the desired place, speed and h
 while they are in contact, it steps as often as the clips, and its poses follow each other smoothly. Each measure is
 divided by its limit; the result is the *strain*. The share of followed trials gives the grade: from 75 % very good,
 from 55 % good, from 30 % usable in part, below that poor. The best grade can be reached, but hardly surpassed: with
-clips generated for every cell of the default grid, 76 % of the trials are followed (97 % of the circles, and 57 % of
-the trials with changes of speed, of which motion matching leaves many unanswered in tight turns).
+clips generated for every cell of the default grid, 76 % of the trials are followed: 97 % of the circles, and 57 % of
+the trials with changes of speed. In tight turns, motion matching does not respond to many of these changes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ REGIONS: tuple[Region, ...] = ("straight", "gentle turns", "sharp turns", "speed
 
 
 class LimitCheck(NamedTuple):
-    """One measure of a trial beside its limit; `metric` is the name of the metric that is compared.
+    """One measure of a trial and its limit; `metric` is the name of the metric that is compared with the limit.
 
     `value` is None if the measure is not defined, which counts as infinite strain; the sign of `value` is the sign of
     the error.

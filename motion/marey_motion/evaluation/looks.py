@@ -2,7 +2,7 @@
 
 Everything is measured from the displayed poses, that is after the blending of transitions, and compared with the same
 measures of the clips that the trial shows. Values of several clips are averaged by the time for which the trial shows
-each of them. Clips that are not shown have no influence, so removing them changes no number.
+each of them. Clips that are not shown have no influence, so removing them from the database changes no measure.
 """
 
 from __future__ import annotations

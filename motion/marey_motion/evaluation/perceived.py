@@ -179,7 +179,7 @@ class PerceivedRows:
 
 
 def indistinguishable(metric: MetricDocument) -> float:
-    """Compute the perceptual distance up to which people cannot distinguish two motions from nearly equal motions.
+    """Compute the perceptual distance up to which two motions count as looking the same.
 
     Parameters
     ----------

@@ -81,7 +81,9 @@ def require_comparable(
 
 
 def differing_options(before: EvaluationOptions, after: EvaluationOptions) -> dict[str, list[str]]:
-    """Describe the options that differ between two evaluations, by the condition of a comparison to which they belong.
+    """Describe the options that differ between two evaluations, grouped by the condition that they change.
+
+    The conditions of a comparison are "options", "scenarios" and "limits".
 
     Parameters
     ----------
@@ -126,7 +128,7 @@ _CONDITIONS = {
 
 
 def _named(texts: Sequence[str], first: str, second: str) -> str:
-    """Name the options that differ, or the digests if the options are not the reason."""
+    """Describe a difference: the options that differ or, if `texts` is empty, the two digests."""
     if not texts:
         return f"{_short(first)} and {_short(second)}"
     more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""

@@ -103,7 +103,7 @@ class UsageTally:
 
     @classmethod
     def of(cls, clips: Sequence[DatabaseClip]) -> UsageTally:
-        """Make a count without any record.
+        """Make a tally in which all counts are zero.
 
         Parameters
         ----------

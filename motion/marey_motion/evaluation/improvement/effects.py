@@ -152,7 +152,7 @@ def corrected_for(effect: Effect, tried: int) -> Effect:
 
     Returns
     -------
-    Effect    with all probabilities times this number, at most 1; intervals stay those of a single effect
+    Effect    with all probabilities multiplied by `tried`, at most 1; intervals are not corrected
     """
 
     def raised(change: MetricChange) -> MetricChange:

@@ -46,8 +46,8 @@ class OptimisationStep:
     data_s : seconds of data after the step
     evaluations : number of candidates tried, over all steps so far
     changed_trials : trials whose result the step changes, in any replicate of the estimate
-    confirmed : effect of the step in other replicates, its probabilities corrected for the number of candidates that
-        could be confirmed; None if no step is confirmed, and for the start
+    confirmed : effect of the step in other replicates, with probabilities corrected for the number of candidates that
+        could be confirmed; None for the start, and None for all steps if the optimisation confirms no steps
     """
 
     number: int
@@ -111,7 +111,7 @@ def optimise(
     options : OptimisationOptions    objective and budget
     confirming : Resimulation, optional    the same trials in other replicates; without it, no step is confirmed, and
         the estimated gain decides
-    absent : collection of str    sources that may be added; all other sources are the set
+    absent : collection of str    sources that may be added; the set at the start consists of all other sources
     log : sequence of OptimisationStep    earlier steps to continue from; `absent` must then list the sources that were
         absent before the first of these steps
     made : callable, optional    called with every new step

@@ -60,7 +60,7 @@ class Suggestions:
     unused : data whose removal changes no trial
     redundant : all clips that were tried, ranked by the harm of their removal per second saved
     plan : a sequence of removals from the set without its unused clips, with confirmed effects
-    confirmed : effects that were measured in replicates without a part in the choice
+    confirmed : effects, measured in replicates from which no suggestion was chosen
     spared : near-duplicates to remove, each with the pair to which it belongs; the other clip of the pair stays
     fillings, additions : clips of other collections that fill holes. In `fillings`, each is measured alone; `additions`
         is a sequence in which each is measured after all earlier clips were added

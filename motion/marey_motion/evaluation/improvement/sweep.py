@@ -111,7 +111,7 @@ def sweep_weights(
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     settings : sequence of FeatureWeights    weights to try
-    how : SweepOptions    measure of the result, and replicates
+    how : SweepOptions    objective that rates each setting, and replicates
     trials : sequence of Trial, optional    trials to run; all trials of the suite if None
     threads : int, optional    number of trials to run at once
     progress : callable, optional    called as progress(done, total, name)
