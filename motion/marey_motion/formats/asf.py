@@ -43,8 +43,8 @@ class Bone:
 
     `vector` is the direction times the length, in the file's unit and world axes. `axis` are three angles, and the
     order of the axes about which they turn; `frame` is the quaternion of these turns. `channels` are the degrees of
-    freedom in order ("rx", "tz"). `line` is the number of the bone's line in the file. `written_name` is the name as
-    bytes of the file, by which an AMC file calls the bone.
+    freedom in order ("rx", "tz"). `line` is the number of the bone's line in the file. `written_name` is the bone's
+    name as the bytes in the file; AMC files contain the same bytes.
     """
 
     name: str

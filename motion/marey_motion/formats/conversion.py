@@ -54,7 +54,8 @@ def convert(
     source : SourceMotion    the file in its own unit and axes
     file : str    name of the file, for messages
     options : ImportOptions    facts given by the user
-    sibling_axis : str, optional    upward axis of other files with this skeleton, for a file that does not show its own
+    sibling_axis : str, optional    upward axis of other files with this skeleton; used if the file does not determine
+        its own upward axis
 
     Returns
     -------

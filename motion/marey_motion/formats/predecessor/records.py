@@ -119,7 +119,7 @@ def _secrets_of(value: Mapping[str, Any]) -> set[str]:
 
 
 def _is_secret(value: Any) -> bool:
-    """Return whether a value is a text with a credential, or a list with the name of a credential or such a text."""
+    """Return whether a value contains a credential: in a text, or in a list as a text or after its name."""
     if isinstance(value, str):
         return tells_credential(value)
     if not isinstance(value, list):
