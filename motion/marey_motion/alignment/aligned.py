@@ -40,7 +40,7 @@ class Placement:
 class Recording(NamedTuple):
     """Take and performer of an example.
 
-    Examples of the same take or performer are not independent, so cross-validation keeps them in one group.
+    Examples of the same take or performer are not independent, so cross-validation of models keeps them together.
 
     Parameters
     ----------

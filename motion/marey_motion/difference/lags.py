@@ -16,10 +16,7 @@ WINDOWS = 12
 """Number of windows of the old clip that are searched for in the whole new clip."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
-"""Factor that decides whether the second-best place of a window is a candidate, too.
-
-It is one if its squared distance is at most about this factor times that of the best place.
-"""
+"""Largest ratio of squared distances, of the second-best and the best place of a window, if both are candidates."""
 NEGLIGIBLE = 1e-3
 """Squared distance of two frames that is attributed to noise."""
 GREATEST_PACE = 4.0

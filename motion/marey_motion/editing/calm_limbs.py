@@ -81,7 +81,7 @@ class CalmLimb:
     given : Motion    the n frames before they are solved
     usual : (2,) float64    largest steps of middle joint and end in the whole unedited motion, in metres
     reach : float    number of frames within which changes are blended
-    fold_rad : float    smallest angle between the two bones, to which the limb can fold
+    fold_rad : float    angle between the two bones of the limb when it is folded as far as possible
     """
 
     skeleton: Skeleton
@@ -97,7 +97,7 @@ class CalmLimb:
         Parameters
         ----------
         targets : (n, 3) float64    desired positions of the limb's end, in metres in the world
-        solve : callable    called as solve(motion, path); returns the motion with the limb's end on the path
+        solve : callable    called as solve(motion, path); returns the motion solved for this path of the limb's end
         first : Motion    the solution for `targets`
 
         Returns

@@ -300,7 +300,7 @@ class _Cluster:
         neighbours: Neighbours,
         solved: Callable[[Motion, Sequence[Target], Neighbours], Motion],
     ) -> Motion:
-        """Replace the solution `made` of `targets`, in runs of frames in which the limb jumps, as `CalmLimb` does."""
+        """Use smoother targets in runs of frames in which the limb jumps; `made` is the solution for `targets`."""
         (place,) = (one for one in targets if isinstance(one, PositionTarget))
         if place.pole is not None or np.any(place.offset):
             return made

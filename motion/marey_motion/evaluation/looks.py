@@ -25,9 +25,9 @@ from marey_schemas.options.matching import ControllerOptions
 LEAST_PATH_M = 1.0
 """Length of a path, in metres, below which contacts per metre are not defined."""
 LEAST_SKATE_M_S = 0.01
-"""Least sliding speed of the clips' feet, in metres per second, to which the speed in a trial is compared as a ratio.
+"""Least sliding speed of the clips' feet, in metres per second, for which a ratio to this speed is defined.
 
-Below this speed, which is about the accuracy of motion capture, the ratio is not defined.
+Motion capture does not measure lower speeds accurately.
 """
 
 

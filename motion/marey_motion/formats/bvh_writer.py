@@ -69,11 +69,11 @@ def write_bvh(
 def with_folded_positions(clip: Clip) -> Clip:
     """Make a clip in which only the root is translated.
 
-    Some exporters write the path of the body to the hips, below a root that does not move. In this case, the path is
-    moved from the hips, or a similar joint, to the root: from the translated joint nearest to the root that has more
-    than half of all joints at or below it. The position of this joint in the world does not change. Every other
-    translated joint gets its median translation as a constant offset. If its translation varied, the joint and the
-    joints below it are displaced by the difference.
+    Some exporters write the path of the body to the hips, below a root that does not move. If a translated joint has
+    more than half of all joints at or below it, the root takes over the motion of this joint, which stays exactly in
+    place; of several such joints, the one nearest to the root is chosen. Every other translated joint gets its median
+    translation as a constant offset. If its translation varied, the joint and the joints below it are displaced by
+    the difference.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ def solve_in_order(
     kernel: Callable[..., None], problem: IkProblem, options: SolverOptions, room: Any, found: SolverResult,
     neighbours: Neighbours | None,
 ) -> None:  # fmt: skip
-    """Solve each frame alone, then repeat this in the runs of frames in which a joint jumps.
+    """Solve each frame alone; a run of frames in which a joint jumps is then solved a second time.
 
     In the second pass, each frame starts with the change of its neighbour in time.
 

@@ -193,7 +193,7 @@ def _unused(simulation: Resimulation, result: EvaluationResult) -> Unused:
 def _spared(
     database: MatchingDatabase, result: EvaluationResult, duplicates: NearDuplicates, metric: MetricDocument | None
 ) -> tuple[tuple[str, NearDuplicate], ...]:
-    """Choose the source clips that can be removed so that no pair of near-duplicates is left, the less used ones."""
+    """Choose the clip that can be removed from each pair of near-duplicates: the one that the trials use less."""
     ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
     most = np.inf if metric is None else indistinguishable(metric)
     return spared_sources(database, duplicates, ticks, most_perceived=most)
