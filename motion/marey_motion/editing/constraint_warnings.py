@@ -81,7 +81,7 @@ def contradictions(constraints: Sequence[Constraint]) -> Iterator[str]:
         if apart.size:
             yield (
                 f"constraints[{first}] and constraints[{second}] contradict each other in the frames "
-                f"{apart[0]}:{apart[-1] + 1}; the result is between them, by their weights"
+                f"{apart[0]}:{apart[-1] + 1}; the result is a compromise according to their weights"
             )
 
 
@@ -179,5 +179,6 @@ def jumps(
         step = float(np.linalg.norm(places[1][frame + 1, joint] - places[1][frame, joint]))
         yield (
             f"{skeleton.joint_names[joint]} moves {100.0 * step:.1f} cm between the frames {frame} and {frame + 1}; "
-            f"before, its largest step was {100.0 * usual[joint]:.1f} cm; use a longer blend_s or a nearer target"
+            f"before the edit, its largest step was {100.0 * usual[joint]:.1f} cm; use a longer blend_s or a nearer "
+            "target"
         )
