@@ -120,7 +120,7 @@ def _is_secret(words: Sequence[str]) -> bool:
 def _is_given(name: str, value: str) -> bool:
     """Return whether a name and its value are a credential.
 
-    A whole number counts only if the last word of the name means a credential: `PASSWORD=12`, but not `TOKEN_COUNT=12`.
+    A whole number counts only if the name ends with a word for a credential: `PASSWORD=12`, but not `TOKEN_COUNT=12`.
     """
     words = _words_of(name)
     if value.isdigit() and words and words[-1] not in _WORDS and tuple(words[-2:]) not in _PAIRS:
