@@ -13,7 +13,10 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.clips import UNIT_TOLERANCE
 
 _SURELY_UNIT = 1.9 * UNIT_TOLERANCE
-"""Deviation of a squared length from 1 that is surely permitted, whatever the rounding errors of float32."""
+"""Deviation of a squared quaternion length from 1 that the quick check accepts.
+
+The value is a little below the limit of the full check, so that float32 rounding in the quick check does no harm.
+"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -145,11 +145,13 @@ def clip_from_document(document: clips.MotionDocument, skeleton: Skeleton) -> Cl
     if set(document.joints) != set(skeleton.joint_names) or len(document.joints) != skeleton.joint_count:
         odd = sorted(set(document.joints) ^ set(skeleton.joint_names)) or ["a repeated name"]
         raise ClipError(
-            f"the motion and the skeleton do not have the same joints; only one of them has {', '.join(odd[:5])}",
+            f"the motion and the skeleton must have the same joints, but only one of the two has {', '.join(odd[:5])}",
             where="joints",
         )
     if document.joints[0] != skeleton.joint_names[0]:
-        raise ClipError(f"the first joint must be the root, {skeleton.joint_names[0]}", where="joints")
+        raise ClipError(
+            f"the first joint of the motion must be {skeleton.joint_names[0]}, the root of the skeleton", where="joints"
+        )
     poses, translations = document.poses, document.translations
     if document.joints != skeleton.joint_names:
         place = {name: index for index, name in enumerate(document.joints)}
@@ -261,13 +263,18 @@ def mapping_from_document(
     for standard, name in document.joints.items():
         if standard not in STANDARD_JOINTS:
             raise MappingError(
-                f"the mapping contains {standard!r}, which is not a standard joint", where=f"joints.{standard}"
+                f"the mapping contains {standard!r}, which is not a standard joint; correct or remove this entry",
+                where=f"joints.{standard}",
             )
         if name not in skeleton:
-            raise MappingError(f"the skeleton has no joint {name!r}", where=f"joints.{standard}")
+            raise MappingError(
+                f"the skeleton has no joint {name!r}; correct or remove this entry", where=f"joints.{standard}"
+            )
     for name in document.axes:
         if name not in skeleton:
-            raise MappingError(f"the skeleton has no joint {name!r}", where=f"axes.{name}")
+            raise MappingError(
+                f"the skeleton has no joint {name!r}; correct or remove this entry", where=f"axes.{name}"
+            )
     axes = {name: _orthonormal(name, one) for name, one in document.axes.items()}
     mapping = JointMapping(
         document.rig, dict(document.joints), document.confidence, document.method, tuple(document.notes)

@@ -213,7 +213,7 @@ class UnknownFormat(FormatError):
 
 
 class AmbiguousUnits(FormatError):
-    """The file does not state its unit of length, and its sizes fit more than one.
+    """The file does not state its unit of length, and the sizes in the file are plausible in more than one unit.
 
     Examples
     --------

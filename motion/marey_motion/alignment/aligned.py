@@ -38,7 +38,9 @@ class Placement:
 
 
 class Recording(NamedTuple):
-    """Take and performer that an example comes from; what a model has seen of one example, it has seen of all of them.
+    """Take and performer of an example.
+
+    Examples of the same take or performer are not independent, so cross-validation of models keeps them together.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ ALIGNMENT_SCHEMA = "marey/alignment@1"
 Tree = dict[str, Any]
 
 SHARED = ("set", "reference", "keyframes")
-"""Fields that all examples of a set have in common."""
+"""Fields that have the same value in all examples of a set."""
 
 
 class StoredExample(NamedTuple):
@@ -56,7 +56,7 @@ def uid_of(item: str, revision: int, *, mirrored: bool = False) -> str:
 def example_to_tree(
     aligned: AlignedSet, example: AlignedClip, *, digest: str | None = None, options: Tree | None = None
 ) -> Tree:
-    """Convert one example of a set to the tree that is stored as the part `info` of its document.
+    """Convert one example of a set to a tree, which is stored with the example as the part `info`.
 
     All uids of the set must come from `uid_of`.
 
@@ -162,7 +162,7 @@ def _example(stored: StoredExample) -> AlignedClip:
     if len(times) != clip.frame_count or info["frame_rate_hz"] != clip.frame_rate_hz:
         raise MotionError(
             f"the clip has {clip.frame_count} frames at {clip.frame_rate_hz:g} Hz, but its time function has "
-            f"{len(times)} at {info['frame_rate_hz']:g} Hz; align the clips again",
+            f"{len(times)} frames at {info['frame_rate_hz']:g} Hz; align the clips again",
             code="alignment-invalid",
             where=name,
         )

@@ -208,7 +208,11 @@ class _Aligning:
             raise MotionError("two examples have this uid; each example needs a different one", where=repeated[0])
         wanted = self._options.reference
         if wanted not in (MEDOID, NEAREST_MEAN_LENGTH) and wanted not in {one.uid for one in clips}:
-            raise MotionError("the reference is not one of the clips to align", code="unknown-reference", where=wanted)
+            raise MotionError(
+                "the reference is not one of the clips to align; choose one of them",
+                code="unknown-reference",
+                where=wanted,
+            )
 
     def _require_size(self, clips: Sequence[SourceExample], rate_hz: float) -> None:
         frames = sum(one.clip.frame_count / one.clip.frame_rate_hz * rate_hz for one in clips)
@@ -267,7 +271,8 @@ class _Aligning:
             if not 0 <= cut.frame < clip.frame_count:
                 shown = ", ".join(cut.labels)
                 raise MotionError(
-                    f"the frame of the cut is outside the clip, whose frames are 0 to {clip.frame_count - 1}",
+                    f"the frame of the cut is outside the clip, whose frames are 0 to {clip.frame_count - 1}; correct "
+                    "the annotation",
                     code="outside-clip",
                     where=f"{shown}, frame {cut.frame}",
                 )

@@ -14,7 +14,8 @@ from marey_motion.kernels import compiled
 def _products(points, others, real, imaginary, heights):
     """Compare the points of one frame (P, 3) with each of m frames, `others` (P, 3, m).
 
-    h = x + i·z is the horizontal position of a point in the one frame, and h' its position in one of the m frames.
+    h = x + i·z is the horizontal position of a point in the single frame, and h' that of the same point in one of the
+    m frames.
     `real` and `imaginary` (m,) are filled with the real and imaginary parts of the sum over the points of h times the
     complex conjugate of h'. `heights` (m,) are filled with the sums of the squared differences of height.
     """

@@ -110,7 +110,7 @@ def least_total(costs: Floats, *, max_run: int | None = None) -> float:
 
 
 def _found(matrix: Floats, max_run: int | None, backwards: NDArray[np.int32], total: float) -> Alignment:
-    """Return an alignment, given its path from the last cell to the first. Raises `MotionError` if there is none."""
+    """Reverse a path that runs from the last cell to the first; raise `MotionError` if `total` is infinite."""
     if not np.isfinite(total):
         raise MotionError(
             f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames if one motion may pause for "

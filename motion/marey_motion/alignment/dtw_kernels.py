@@ -34,7 +34,7 @@ def align(costs, path):
 
 @compiled
 def _cheapest(both, first, second):
-    """Find the least of three totals, and the number of the step that it belongs to.
+    """Find the least of three totals, and the number of its step.
 
     Step 0 advances both motions, step 1 the first motion alone, and step 2 the second motion alone. The code has no
     branches, because the processor could not predict them.
@@ -340,7 +340,7 @@ def _mean_distance(a, b):
 
 @compiled
 def _cost_from_box(points, start, stop, low, high, most):
-    """Sum the mean distances of the points from a bounding box over frames; stop when the sum exceeds `most`."""
+    """Sum, over frames, the mean distance of the points from a bounding box; stop when the sum exceeds `most`."""
     total = 0.0
     for i in range(start, stop):
         cost = 0.0

@@ -14,7 +14,7 @@ from marey_motion.arrays import Floats
 
 Points = TypeVar("Points")
 Advance = Callable[[int, int], None]
-"""Function called with the number of alignments done and their total."""
+"""Function called with the number of finished alignments and the number of all alignments."""
 
 SAME = 1e-9
 """Relative difference below which two sums of costs count as equal."""
@@ -22,8 +22,8 @@ SAME = 1e-9
 MOST_COMPARED = 200
 """Greatest number of motions that are compared with each other to find the medoid.
 
-The number of pairs grows with its square: 200 motions are 19,900 pairs. With a probability of 99 %, a random sample of
-this size contains one of the best 2.3 % of all motions (0.977^200 = 1 %).
+The number of pairs grows with the square of the number of motions: 200 motions form 19,900 pairs. With a probability of
+99 %, a random sample of 200 motions contains one of the best 2.3 % of all motions (0.977^200 = 1 %).
 """
 
 _SAMPLE_SEED = 0

@@ -45,7 +45,7 @@ class Sections(NamedTuple):
 
     @property
     def keyframes(self) -> dict[str, int]:
-        """Frame of each bound, by its label."""
+        """Frame of the motion by label, for all labels of the bounds."""
         return {label: frame for frame, labels in zip(self.bounds, self.labels, strict=True) for label in labels}
 
 

@@ -21,7 +21,10 @@ JOINED_S = 0.1
 POINT_M = 0.01
 """Extent in metres. A path of at most this extent counts as a point, whose turn cannot be measured."""
 UNEXPLAINED = 0.1
-"""A movement of a whole path is reported only if at most this share of the path's mean change remains afterwards."""
+"""Largest share of a path's mean change that may remain after a movement of the whole path is compensated.
+
+If more remains, no such movement is reported.
+"""
 MOST_SPANS = 100
 """Maximum number of ranges in a list; if there are more, ranges are joined over the smallest gaps between them."""
 

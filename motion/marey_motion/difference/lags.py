@@ -16,11 +16,11 @@ WINDOWS = 12
 """Number of windows of the old clip that are searched for in the whole new clip."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
-"""Multiple of the least squared distance up to which the second-best place of a window is a candidate, too."""
+"""Largest ratio of squared distances, of the second-best and the best place of a window, if both are candidates."""
 NEGLIGIBLE = 1e-3
 """Squared distance of two frames that is attributed to noise."""
 GREATEST_PACE = 4.0
-"""Greatest pace that is tried, in new frames per old frame; the least pace is 1 / `GREATEST_PACE`."""
+"""Greatest pace that is tried: frames of the new clip per frame of the old clip. The least is 1 / `GREATEST_PACE`."""
 PACES = 97
 DECIMATED = 2048
 """Approximate number of frames of the longer clip that are used in the search for the pace."""
@@ -58,7 +58,7 @@ def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
 
 
 def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, ...]:
-    """Find the lags at which windows of frames of `before` are most similar to frames of `after`.
+    """Find the lags at which windows of the old clip, `before`, are most similar to the new clip, `after`.
 
     Each window is compared with all places of the other clip at once, by correlation in the frequency domain.
 
@@ -159,8 +159,8 @@ def _stretched(window: Floats, count: int) -> Floats:
 def _features(poses: Poses) -> Floats:
     """Compute features (F, `CHANNELS` + 4) of F poses.
 
-    They are random projections of the rotations, the height of the root, and the displacement of the root since the
-    previous frame.
+    The first `CHANNELS` features are random projections of the rotations. The other four are the height of the root,
+    and the displacement (x, y, z) of the root since the previous frame.
     """
     rotations = poses.rotations * np.where(poses.rotations[..., :1] < 0.0, -1.0, 1.0)
     flat = rotations.reshape(poses.frame_count, -1).astype(np.float64)

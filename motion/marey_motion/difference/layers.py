@@ -15,11 +15,11 @@ from marey_schemas.documents.differences import AnnotationDifference, KeyframeCh
 ALONE = 0.6
 """Cost of an added or removed segment."""
 OTHER_LABEL = 0.7
-"""Cost of different labels, in a pair of segments; the cost of the ranges, from 0 to 1, is added to it."""
+"""Cost of a pair of segments with different labels; the cost of the two ranges (0 to 1) is added to this cost."""
 SHIFTED = 0.05
 """Cost added to a pair of segments if the ranges are compared after the shift that most segments have in common."""
 MOST_PAIRS = 16_000_000
-"""Maximum product of the numbers of differing segments in both annotations."""
+"""Maximum of n times m, for n differing segments in the old annotation and m in the new annotation."""
 
 
 def compare_annotations(before: Annotation, after: Annotation) -> AnnotationDifference:
@@ -82,7 +82,8 @@ def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[in
     old, new = before[head : len(before) - tail], after[head : len(after) - tail]
     if len(old) * len(new) > MOST_PAIRS:
         raise AnnotationError(
-            f"too many entries differ to be compared: {len(old):,} of the old and {len(new):,} of the new annotation",
+            f"too many segments or keyframes differ to be compared: {len(old):,} of the old and {len(new):,} of the "
+            "new annotation; compare annotations with fewer changes",
             code="too-many-entries",
         )
     labels = {one.label: number for number, one in enumerate((*old, *new))}

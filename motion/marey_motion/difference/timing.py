@@ -17,9 +17,12 @@ SAME_PACE = 1e-9
 WELL_EXPLAINED = 0.98
 """Share of the shorter clip's frames. If this share is matched well, no other pace is tried."""
 MUCH_BETTER = 0.5
-"""Another pace is chosen only if its cost is less than this share of the cost at the best pace so far."""
+"""Another pace is chosen only if its matching costs less than this share of the cost at the best pace so far."""
 SIMILAR_ENOUGH = 0.1
-"""A matching that costs at most this share of the greatest cost, and has fewer than `MANY_RUNS` runs, is accepted."""
+"""Largest accepted cost of a matching, as a share of the cost if all frames differed entirely.
+
+A matching is accepted only if it also has fewer than `MANY_RUNS` runs.
+"""
 MANY_RUNS = 8
 MOST_REFINEMENTS = 8
 FEWEST_PAIRS = 8
@@ -33,7 +36,7 @@ FARTHEST_OFFSET = 2.0
 ROUNDED_FRAMES = 0.02
 """Deviation over the whole clip, in frames, that is attributed to rounding."""
 GREATEST_PACE = 16.0
-"""Greatest pace that is tried, in new frames per old frame; the least pace is 1 / `GREATEST_PACE`."""
+"""Greatest pace that is tried: frames of the new clip per frame of the old clip. The least is 1 / `GREATEST_PACE`."""
 
 
 class Pace(NamedTuple):
@@ -165,7 +168,8 @@ def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Ti
 def _rounded(start: float, step: float, count: int) -> Pace:
     """Convert a line to a pace: frame n of the new clip is at place `start` + n·`step` of the old clip.
 
-    Values that are nearly simple fractions are rounded to these, if this moves no sample of `count` frames noticeably.
+    The pace is rounded to a simple fraction, and the start to a whole frame, if rounding moves none of the `count`
+    frames by more than `ROUNDED_FRAMES`.
     """
     pace = 1.0 / step
     simple = float(Fraction(pace).limit_denominator(1000))

@@ -1,9 +1,9 @@
-"""Limbs that cannot follow their targets smoothly follow calmer paths of targets, and miss what was asked for a little.
+"""Smoother targets for limbs that would jump: the limb moves steadily, and misses the original targets a little.
 
-A limb cannot reach a target at its shoulder or hip, because the fold of its middle joint has a limit. Where a target
-passes by the shoulder, the limb would turn over between two frames. And where a running body passes a target, the limb
-would turn as fast as the body passes. An animator leads the hand round the shoulder, and lets it lag behind. So does
-this module, but only in runs of frames in which the limb jumps.
+A limb cannot reach a target at its shoulder or hip, because its middle joint cannot fold completely. If a target passes
+close to the shoulder, the limb would turn over between two frames. If a running body passes a target, the limb would
+turn as fast as the body passes. In the runs of frames in which the limb would jump, this module therefore leads the
+hand round the shoulder and lets it lag behind the target, as an animator would.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 MOST_STEP = 1.5
-"""Largest step of a joint between two frames, as a multiple of its largest step in the whole motion before."""
+"""Largest permitted step of a joint between two frames, as a multiple of its largest step in the unedited motion."""
 BLEND_PEAK = 2.0
-"""Largest step of a change that is blended in over n frames, as a multiple of the mean step."""
+"""Largest step between two frames of a change that is blended in, as a multiple of the mean step of this change."""
 _WIDTHS = (0.0, 0.1, 0.2, 0.4, 0.8)
-"""Standard deviations over which targets are smoothed, as shares of the frames within which changes are blended."""
+"""Smoothing widths that are tried in turn, as shares of the number of frames within which changes are blended."""
 _CLEAR = 0.5
-"""Length of the sum of two unit directions below which they count as opposite."""
+"""Two unit directions count as opposite if the length of their sum is below this value."""
 
 
 def largest_steps(places: Floats) -> Floats:
@@ -52,8 +52,8 @@ def allowed_steps(usual: Floats, moved: Floats, blend_frames: float) -> Floats:
 
     Parameters
     ----------
-    usual : (n,) float64    largest step of each joint in the motion before
-    moved : (n,) float64    largest distance by which the edit moves each joint
+    usual : (n,) float64    largest step of each joint between two frames of the unedited motion, metres
+    moved : (n,) float64    largest distance by which the edit moves each joint, metres
     blend_frames : float    number of frames within which the change is blended in
 
     Returns
@@ -67,21 +67,21 @@ def allowed_steps(usual: Floats, moved: Floats, blend_frames: float) -> Floats:
 class _Attempt(NamedTuple):
     motion: Motion
     excess: Floats
-    """Steps (n - 1,) of elbow or wrist, in metres, beyond what they may move."""
+    """Metres (n - 1,) by which the step of the elbow or wrist exceeds the permitted step; the larger of the two."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalmLimb:
-    """A limb in a run of consecutive frames, and how fast it may move.
+    """A limb in a run of consecutive frames, and the limits of its steps from frame to frame.
 
     Parameters
     ----------
     skeleton : Skeleton    J joints
     limb : TwoBoneLimb    the limb
     given : Motion    the n frames before they are solved
-    usual : (2,) float64    largest steps of middle joint and end in the whole motion, in metres
+    usual : (2,) float64    largest steps of middle joint and end in the whole unedited motion, in metres
     reach : float    number of frames within which changes are blended
-    fold_rad : float    angle between the bones up to which the limb folds
+    fold_rad : float    angle between the two bones of the limb when it is folded as far as possible
     """
 
     skeleton: Skeleton
@@ -92,17 +92,17 @@ class CalmLimb:
     fold_rad: float
 
     def solved(self, targets: Floats, solve: Callable[[Motion, Floats], Motion], first: Motion) -> Motion:
-        """Solve the limb for calmer paths of its end until it does not jump; return the calmest motion.
+        """Solve the limb for smoother and smoother paths of its end until no joint of the limb jumps.
 
         Parameters
         ----------
-        targets : (n, 3) float64    where the end of the limb should be, in metres in the world
-        solve : callable    solves the frames of a motion for paths of the end
+        targets : (n, 3) float64    desired positions of the limb's end, in metres in the world
+        solve : callable    called as solve(motion, path); returns the motion solved for this path of the limb's end
         first : Motion    the solution for `targets`
 
         Returns
         -------
-        Motion    n frames; `first` itself if nothing jumps
+        Motion    n frames, the solution with the smallest jumps; `first` itself if it has no jumps
         """
         best = self._judged(first)
         if best.excess.max(initial=0.0) <= 0.0:
@@ -131,10 +131,10 @@ class CalmLimb:
         return _Attempt(motion, (steps - allowed_steps(self.usual, moved, self.reach)).max(axis=1))
 
     def _slowed(self, vectors: Floats, jumps: Flags, width: int) -> Floats:
-        """Slow down the turns of a path (n, 3), relative to the first joint, and lead it round this joint.
+        """Slow down the turns of a path (n, 3), relative to the limb's first joint, and lead it round this joint.
 
-        Around jumps, and where the limb would have to fold too far, the direction changes evenly, over `width` frames
-        before and after; the distance is at least that of the folded limb.
+        From `width` frames before to `width` frames after each jump, or each frame in which the limb would have to fold
+        too far, the direction changes evenly, and the distance is at least that of the folded limb.
         """
         from scipy.ndimage import maximum_filter1d
 
@@ -162,15 +162,15 @@ class CalmLimb:
 
 
 def _directions(vectors: Floats, otherwise: Floats) -> Floats:
-    """Compute unit directions (..., 3) of vectors, and those of other vectors where a vector is zero."""
+    """Compute the unit directions (..., 3) of vectors; a vector of length zero is replaced by that of `otherwise`."""
     vectors = np.where(np.linalg.norm(vectors, axis=-1, keepdims=True) > 1e-6, vectors, otherwise)
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))
 
 
 def _turned(first: Floats, last: Floats, guide: Floats, places: Floats) -> Floats:
-    """Turn one unit direction (3,) into another one, on a great circle; opposite ones by way of `guide`.
+    """Interpolate between two unit directions (3,) on a great circle; if they are opposite, by way of `guide`.
 
-    Returns the directions (n, 3) at `places` (n,), from 0 to 1.
+    Returns the directions (n, 3) at `places` (n,): 0 is the first direction, 1 the last.
     """
     middle, chord = first + last, last - first
     size = float(np.linalg.norm(middle))

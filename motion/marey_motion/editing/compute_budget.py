@@ -12,18 +12,18 @@ from math import inf
 from marey_motion.errors import EditError
 
 PER_COMMAND, PER_NUMBER = 1_000_000, 100
-"""Work of most commands, and work for each number of the motion, in nanoseconds."""
+"""Estimated work of most commands, in nanoseconds: a fixed part, and a part for each value of the motion's arrays."""
 PER_RIG = 10_000_000
-"""Work of finding the limbs of a skeleton and the axes they bend about, in nanoseconds."""
+"""Work, in nanoseconds, to find the limbs of a skeleton and the axes about which the limbs bend."""
 PER_PLANTED_NUMBER = 600
 PER_TAP, MOST_OF_TAPS = 0.35, 200.0
-"""Work of a moving mean for each number of the motion, in nanoseconds: per frame of the window, and at most."""
+"""Work of a moving mean for each value of the motion, in nanoseconds: per frame of the window, and its upper limit."""
 PER_COMPARED_POSES = 4_000
-"""Work of the perceptual distance of two poses, in nanoseconds."""
+"""Work, in nanoseconds, to compute the perceptual distance of two poses."""
 PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
-"""Work of applying a group of constraints without the solver, and additional work for each number of the rotations.
+"""Work to apply a group of constraints, in nanoseconds: a fixed part, and a part for each value of the rotations.
 
-Both are in nanoseconds.
+The work of the solver is not included.
 """
 
 

@@ -39,10 +39,10 @@ from marey_schemas.editing.constraints import Solver
 MOST_ROUNDS = 12
 SETTLED = 1e-3
 _PER_FRAME = 40_000
-"""Work per frame, in nanoseconds, of preparing the arrays, measuring the errors and evaluating closed forms."""
+"""Work per frame, in nanoseconds, to prepare the arrays, measure the errors and evaluate closed forms."""
 _LIMIT_PASSES = 4
 FLIP_SHARE = 0.25
-"""Share of a range of frames over which a limb that would flip is turned over, if this is longer than the blend."""
+"""Share of a range of frames over which the flip of a limb is spread, unless the blend has more frames."""
 
 Method = Literal["ccd", "two_bone", "least_squares"]
 
@@ -72,7 +72,8 @@ class ConstrainedMotion:
     Parameters
     ----------
     motion : the whole motion
-    residuals_before, residuals_after : error of each constraint in each of its frames, in metres or radians
+    residuals_before, residuals_after : error of each constraint in each of its frames, before and after constraining,
+        in metres (positions) or radians (orientations and look-at targets)
     """
 
     motion: Motion
@@ -92,7 +93,7 @@ def constrain_motion(
     budget: ComputeBudget | None = None,
     damping_zone_rad: float = 0.0,
 ) -> ConstrainedMotion:
-    """Meet constraints in their frames and blend the change in and out before and after them.
+    """Change a motion so that it meets constraints, and blend the change into the frames before and after them.
 
     Parameters
     ----------
@@ -163,7 +164,7 @@ def _check_range(constraint: Constraint, number: int, frames: int) -> None:
     start, stop = constraint.start, constraint.stop
     if not 0 <= start < stop <= frames:
         raise EditError(
-            f"the frames {start}:{stop} are not a range within the clip's {frames} frames",
+            f"the range {start}:{stop} must be within the clip's frames 0:{frames}, with its start before its stop",
             code="frames-missing",
             where=f"constraints[{number}]",
         )
@@ -195,7 +196,7 @@ def residuals_of(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> 
 def _clusters(
     skeleton: Skeleton, constraints: Sequence[Constraint], together: bool
 ) -> tuple[tuple[Constraint, ...], ...]:
-    """Group the constraints that must be solved together because one constraint turns a joint that affects another one.
+    """Group the constraints that must be solved together, since one of them turns a joint that affects another of them.
 
     If `together` is true, all constraints are in one group.
     """
@@ -228,11 +229,11 @@ class _Cluster:
     usual: Floats
 
     def constrained(self, motion: Motion, blend_frames: int) -> Motion:
-        """Solve the constraints and blend the motion in and out of the solution.
+        """Solve the constraints and blend the solution into the motion before and after the constrained frames.
 
-        Constraints on different ranges are first solved one range after another, and each solution is blended in and
-        out, until the remaining errors are small. Solving all ranges together then changes little at the borders of a
-        range.
+        Constraints on different ranges are first solved one range after another, and each solution is blended into
+        the motion, until the remaining errors are small. Then all ranges are solved together; this last solution
+        changes little at the borders of a range.
         """
         spans: dict[tuple[int, int], list[Constraint]] = {}
         for one in self.constraints:
@@ -262,8 +263,9 @@ class _Cluster:
     def _solve(self, given: Motion, frames: Ints, constraints: Sequence[Constraint], blend_frames: int) -> Motion:
         """Solve frames that all have the same constraints; return only these frames.
 
-        `given` is the motion in these frames, and `frames` are their numbers. A limb that would flip is turned over
-        about `blend_frames` instead, or over a share of a long range.
+        `given` is the motion in these frames, and `frames` are their numbers. If a limb would flip from one frame to
+        the next, the flip is spread over `blend_frames` frames or over the share `FLIP_SHARE` of the frames, whichever
+        is longer.
         """
         reach = max(blend_frames, FLIP_SHARE * len(frames), 1.0)
         limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
@@ -298,7 +300,7 @@ class _Cluster:
         neighbours: Neighbours,
         solved: Callable[[Motion, Sequence[Target], Neighbours], Motion],
     ) -> Motion:
-        """Solve runs of frames in which the limb jumps for calmer paths; `made` is the solution of `targets`."""
+        """Use smoother targets in runs of frames in which the limb jumps; `made` is the solution for `targets`."""
         (place,) = (one for one in targets if isinstance(one, PositionTarget))
         if place.pole is not None or np.any(place.offset):
             return made
@@ -341,7 +343,7 @@ def _target_at(constraint: Constraint, frames: Ints) -> Target:
 
 
 def _rows_of(target: Target, rows: slice) -> Target:
-    """Select the values of a target for some of the frames that it is given for."""
+    """Select some frames of a target that has one value per frame; a constant target is returned as it is."""
     return target if len(target.values) == 1 else _with_values(target, target.values[rows])
 
 
@@ -353,7 +355,7 @@ def _solved_for(
     given: Motion,
     path: Floats,
 ) -> Motion:
-    """Solve a run of frames for another path (n, 3) of the point that `place` puts in place."""
+    """Solve a run of frames, with the positions of the target `place` replaced by `path` (n, 3)."""
     return solved(given, [replace(place, position=path), *others], neighbours)
 
 

@@ -1,4 +1,7 @@
-"""Constraints that cannot act are refused; what else an animator would not expect in their result gives a warning."""
+"""Checks of constraints: a constraint without effect is refused, and an unexpected result of constraints is reported.
+
+Warnings report contradictions, missed constraints, and joints that jump.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +20,14 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 MISSED_M, MISSED_DEG = 0.02, 5.0
-"""Error of a constraint, in metres or in degrees, above which its result has a warning."""
+"""Error of a constraint, in metres or in degrees, above which a warning is given."""
 LEAST_LEVER_M = 1e-6
 """Distance of a point from a joint, in metres, up to which turning the joint does not move the point."""
 _OPTIONS = SolverOptions()
 
 
 def require_acting(skeleton: Skeleton, constraint: Constraint, *, root_moves: bool) -> None:
-    """Refuse a constraint of a position that no joint that may turn can change.
+    """Refuse a position constraint if none of the joints that may turn can move the constrained point.
 
     Parameters
     ----------
@@ -55,7 +58,7 @@ def require_acting(skeleton: Skeleton, constraint: Constraint, *, root_moves: bo
 
 
 def contradictions(constraints: Sequence[Constraint]) -> Iterator[str]:
-    """Name pairs of constraints that want a joint in two places, or in two orientations, in the same frames.
+    """List pairs of constraints that require two positions, or two orientations, of one joint in the same frame.
 
     Parameters
     ----------
@@ -78,7 +81,7 @@ def contradictions(constraints: Sequence[Constraint]) -> Iterator[str]:
         if apart.size:
             yield (
                 f"constraints[{first}] and constraints[{second}] contradict each other in the frames "
-                f"{apart[0]}:{apart[-1] + 1}; the result is between them, by their weights"
+                f"{apart[0]}:{apart[-1] + 1}; the result is a compromise according to their weights"
             )
 
 
@@ -93,7 +96,7 @@ def _apart(a: Target, b: Target, of_a: Floats, of_b: Floats) -> Flags:
 
 
 def joined(pairs: Sequence[JoinedWindows]) -> Iterator[str]:
-    """Say in which frames a joint goes from the target of one constraint to that of the next.
+    """Describe in which frames a joint moves from the target of one constraint to the target of the next constraint.
 
     Parameters
     ----------
@@ -119,7 +122,7 @@ def joined(pairs: Sequence[JoinedWindows]) -> Iterator[str]:
 
 
 def missed(constraints: Sequence[Constraint], residuals: Sequence[Floats]) -> Iterator[str]:
-    """Say which constraints are missed, how far, and in which frames.
+    """Describe the constraints that are missed: by how much, and in how many frames.
 
     Parameters
     ----------
@@ -145,7 +148,7 @@ def missed(constraints: Sequence[Constraint], residuals: Sequence[Floats]) -> It
 def jumps(
     skeleton: Skeleton, before: Motion, after: Motion, constraints: Sequence[Constraint], blend_frames: int
 ) -> Iterator[str]:
-    """Say which joints move faster than the motion before and the constraints require.
+    """Describe joints that move faster between two frames than in the unedited motion, beyond what the blend needs.
 
     Parameters
     ----------
@@ -176,5 +179,6 @@ def jumps(
         step = float(np.linalg.norm(places[1][frame + 1, joint] - places[1][frame, joint]))
         yield (
             f"{skeleton.joint_names[joint]} moves {100.0 * step:.1f} cm between the frames {frame} and {frame + 1}; "
-            f"before, its largest step was {100.0 * usual[joint]:.1f} cm; use a longer blend_s or a nearer target"
+            f"before the edit, its largest step was {100.0 * usual[joint]:.1f} cm; use a longer blend_s or a nearer "
+            "target"
         )

@@ -1,4 +1,4 @@
-"""Windows of constraints that follow each other: a joint gets time to go from one target to the next."""
+"""Shortening of the frame ranges (windows) of successive constraints, so that a joint has time to change its target."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from marey_motion.editing.inverse_kinematics.targets import PositionTarget
 
 @dataclass(frozen=True)
 class JoinedWindows:
-    """Two constraints of one joint between which the joint would jump.
+    """Two successive constraints of one joint, whose windows were shortened because the joint would jump between them.
 
     Parameters
     ----------
     first, second : numbers of the constraints
-    start, stop : frames [start, stop) in which the joint goes from the first target to the second one; empty if the
-        windows leave no frames, so that it jumps from the frame `start - 1` to the frame `stop`
-    apart_m : distance of the two targets
+    start, stop : frames [start, stop) in which the joint moves from the first target to the second one; empty if the
+        windows leave no frames between them, so that the joint jumps from the frame `start - 1` to the frame `stop`
+    apart_m : distance between the two targets, metres
     """
 
     first: int
@@ -36,16 +36,16 @@ class JoinedWindows:
 def join_windows(
     constraints: Sequence[Constraint], usual: Floats, blend_frames: int
 ) -> tuple[list[Constraint], list[JoinedWindows]]:
-    """Shorten windows of one joint that follow each other, where the joint would jump from one target to the next.
+    """Shorten successive windows of one joint if the joint would otherwise jump from one target to the next.
 
-    The ramps out of the first window and into the second one need `blend_frames` together; if there are fewer frames
-    between the windows, the rest is taken from both windows, less than half of each, so that a window between two
-    others keeps a frame at least.
+    The joint needs `blend_frames` frames to move from the target of the first window to that of the second one. If
+    there are fewer frames between the windows, both windows are shortened, each by less than half. So a window that
+    is shortened at both ends keeps at least one frame.
 
     Parameters
     ----------
     constraints : sequence of Constraint    C constraints
-    usual : (J,) float64    largest step of each joint in the motion before, metres
+    usual : (J,) float64    largest step of each joint between two frames of the unedited motion, metres
     blend_frames : int    number of frames within which a change is blended
 
     Returns
@@ -74,14 +74,17 @@ def join_windows(
 
 
 def _same_point(a: Constraint, b: Constraint) -> bool:
-    """Return whether two constraints put the same point of a joint in place."""
+    """Return whether two constraints are position constraints of the same point of the same joint."""
     if not (isinstance(a.target, PositionTarget) and isinstance(b.target, PositionTarget)):
         return False
     return a.target.joint == b.target.joint and np.allclose(a.target.offset, b.target.offset)
 
 
 def _distance(a: Constraint, b: Constraint) -> float:
-    """Compute how far the last target of one constraint is from the first one of the next, in their common axes."""
+    """Compute the distance from the last target of `a` to the first target of `b`, along the axes that both constrain.
+
+    The distance is in metres.
+    """
     assert isinstance(a.target, PositionTarget)
     assert isinstance(b.target, PositionTarget)
     axes = ["xyz".index(axis) for axis in a.target.axes if axis in b.target.axes]

@@ -14,7 +14,7 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 FAR_M = 0.05
-"""Error of a position before this step, in metres, above which the model counts as unable to reach the position."""
+"""Error in metres: if a position is missed by more before the final step, the model counts as unable to reach it."""
 
 
 @dataclass(frozen=True, eq=False)

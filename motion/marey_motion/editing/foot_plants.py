@@ -35,7 +35,7 @@ MOST_LOWERING_M = 0.1
 SHORTEST_CONTACT_S = 0.06
 """Duration, in seconds, below which a contact counts as noise."""
 MOST_SUNK_M = 0.005
-"""Depth below the floor, in metres, to which the roll of a planted foot may move its sole."""
+"""Greatest permitted depth of a planted sole below the floor, in metres, while the foot rolls."""
 # Less than this is rounding.
 SHORTEST_LOWERING_M = 1e-9
 
@@ -180,9 +180,10 @@ def plant_feet(
 
 
 def _sunk_m(skeleton: Skeleton, motion: Motion, planted: Motion, feet: Sequence[Foot], blend: int) -> Floats:
-    """Compute how far (F, n), in metres, planting moved soles more than `MOST_SUNK_M` below their floor.
+    """Compute the depth (F, n), in metres, of planted soles below a limit, which is `MOST_SUNK_M` below their floor.
 
-    The floor of a frame is the lowest height of the sole within `blend` frames before planting.
+    The depth is 0 for soles above the limit. The floor of a sole in a frame is the lowest height that the sole has in
+    `motion`, the motion before planting, from `blend` frames before this frame to `blend` frames after it.
     """
     from scipy.ndimage import minimum_filter1d
 
@@ -287,8 +288,8 @@ def faded(flags: Flags, values: Floats, blend: int) -> Floats:
 
     Parameters
     ----------
-    flags : (F,) bool    the frames to keep
-    values : (F, c) float64    values; only those of the frames to keep count
+    flags : (F,) bool    True in the frames whose values are kept
+    values : (F, c) float64    values; those of frames without a flag are not used
     blend : int    number of frames within which the values fade; all other frames are zero
 
     Returns

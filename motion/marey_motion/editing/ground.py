@@ -24,9 +24,9 @@ LOWEST_SHARE = 0.05
 """Quantile of the heights of the lower sole that counts as the ground if the lower foot is never in stance."""
 
 SOLE_SHARE = 0.05
-"""Height of the joints and tips of a standing foot in a shoe, as a share of the length of the leg."""
+"""Height above the floor of the ball of a standing foot in a shoe, as a share of the length of the leg."""
 STANDING_SHARE = 0.9
-"""Height of the hip above the ankle, as a share of the leg's length, above which a rest pose stands."""
+"""A rest pose counts as standing if the hip is higher above the ankle than this share of the leg's length."""
 
 
 class Ground(NamedTuple):
@@ -149,7 +149,8 @@ def estimate_sole(skeleton: Skeleton, body: MatchingBody) -> float:
     """Estimate the distance from the lowest joint or tip of a foot down to its sole.
 
     Skeletons end at joints inside the foot, and the ball of a foot in a shoe is about `SOLE_SHARE` of the leg's length
-    above the floor. Tips that hang below the joint of the toes in the rest pose are nearer to the sole by that much.
+    above the floor. If the lowest joint or tip of a foot is below the joint of its toes in a standing rest pose, the
+    difference in height is subtracted.
 
     Parameters
     ----------
@@ -190,7 +191,7 @@ def sole_heights(points: AnyFloats, skeleton: Skeleton, ankles: Sequence[int]) -
 
 
 def lower_soles_in_stance(heights: Floats, stances: Sequence[Sequence[Stance]]) -> Flags:
-    """Find the frames and feet that show where the ground is.
+    """Mark the feet from whose height the ground is estimated: the lower foot of each frame, if it is in stance.
 
     Parameters
     ----------

@@ -28,9 +28,10 @@ from marey_motion.skeleton import SAME_SKELETON_M, Skeleton, same_hierarchy
 from marey_schemas.editing.commands import Concatenate
 
 FARTHEST_HELD_M, LONGEST_HELD_S = 0.15, 1.5
-"""Distance from its place in the second clip, and time, up to which a standing foot is held where it is at the seam.
+"""Limits, in metres and seconds, for feet that are held in place from the seam to the end of their stance.
 
-A foot that is farther away would overstretch its leg, and one that stands longer would never get to its own place.
+A foot that is farther than this distance from its place in the second clip would overstretch its leg. A foot whose
+stance lasts longer than this time would be in the wrong place for too long.
 """
 
 
@@ -80,7 +81,10 @@ def concatenate(take: Take, command: Concatenate) -> Take:
 
 
 def _fastest(skeleton: Skeleton, first: Motion, second: Motion, joined: Motion) -> str | None:
-    """Say which joint the blend moves more than `MOST_STEP` times as far as any joint moves before or after it."""
+    """Describe the fastest joint of the joined motion if it moves too far between two frames; otherwise return None.
+
+    A step is too large if it is more than `MOST_STEP` times the largest step of any joint in the two clips.
+    """
     before, after, made = (np.asarray(one.positions(skeleton), np.float64) for one in (first, second, joined))
     usual = max(float(largest_steps(one).max()) for one in (before, after))
     steps = np.linalg.norm(np.diff(made, axis=0), axis=-1)
@@ -148,7 +152,7 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
 def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_hz: float) -> Motion:
     """Join two motions.
 
-    If `overlap` is not 0, this many frames of both are blended into each other. Otherwise, the difference in pose and
+    If `overlap` is not 0, this many frames of both motions are blended. Otherwise, the difference in pose and
     velocity decays over the first `count` frames of the second motion; if `count` is 0, the result is a hard cut.
     """
     if overlap:
@@ -157,9 +161,10 @@ def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_
 
 
 def _with_kept_feet(take: Take, first: Motion, second: Motion, joined: Motion, overlap: int, count: int) -> Motion:
-    """Join the paths of the feet like the path of the root, and keep the feet above the lower of their two floors.
+    """Join the paths of the feet like the path of the root, and keep the soles above the lower floor of the two clips.
 
-    A foot that stands on both sides of the seam stays where it stands, and goes to its own place with its next step.
+    A foot that is planted just before and just after the seam stays in place. With its next step, it moves to its
+    place in the second clip.
     """
     feet = feet_of(take)
     if not feet:
@@ -182,10 +187,10 @@ def _with_kept_feet(take: Take, first: Motion, second: Motion, joined: Motion, o
 def _with_held_stances(
     take: Take, tracks: Sequence[Motion], wanted: Motion, feet: Sequence[Foot], count: int
 ) -> tuple[Motion, int]:
-    """Keep feet that stand on both sides of the seam in place until their stance ends.
+    """Hold each foot that is planted just before and just after the seam in place until its stance ends.
 
-    `tracks` are the feet before and after the seam. Returns the new paths of the feet, and the number of frames after
-    the seam in which they may differ from those of the second clip.
+    `tracks` are the paths of the feet in the first and in the second clip. Returns the new paths of the feet, and the
+    number of frames after the seam in which the new paths may differ from those of the second clip.
     """
     translations, seam, longest = wanted.translations.copy(), tracks[0].frame_count, count
     for number in range(len(feet)):

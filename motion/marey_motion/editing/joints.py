@@ -61,7 +61,7 @@ def paste(take: Take, command: Paste) -> Take:
 
 
 def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> list[int]:
-    """Find the indices in `source` of the target's `joints`, by name.
+    """Find the indices, in the skeleton `source`, of the joints `joints` of the skeleton `target`, by name.
 
     Raises `UnknownJoint` if a joint is missing, and `EditError` if the axes of a joint differ.
     """

@@ -1,8 +1,8 @@
 """Feet that keep their contacts and stay above the floor while the pose of the body is blended or smoothed.
 
-Blending rotations moves feet on paths that nobody chose: a foot that is on the ground in both poses may sink or slide
-in between. Here the ankles are blended or smoothed as points of the world, as the root is, and the legs are solved to
-reach them.
+If only rotations are blended, a foot that is on the ground in both poses may sink or slide in between. This module
+therefore blends or smooths the positions of the ankles in the world, like that of the root, and solves the legs so that
+they reach these positions.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SUNK_M = 1e-4
 MOST_LIFTS = 5
 """Greatest number of times that feet are lifted and their legs solved again."""
 CALM_S = 0.6
-"""Longest time, in seconds, over which a leg is slowed down where its knee would jump."""
+"""Longest time, in seconds, over which the movement of a leg is slowed down if its knee would jump."""
 _ZONE_RAD = radians(PlantOptions().knee_damping_deg)
 ROUNDING = 1e-9
 """Difference, in metres and in components of quaternions, up to which a foot counts as in place."""
@@ -61,7 +61,7 @@ def feet_of(take: Take) -> tuple[Foot, ...]:
 
 
 def feet_as_motion(skeleton: Skeleton, motion: Motion, feet: Sequence[Foot]) -> Motion:
-    """Describe the feet of a motion as a motion of their own, which can be joined or smoothed like any motion.
+    """Make a motion that consists of the feet only, and can be joined or smoothed like any other motion.
 
     Parameters
     ----------
@@ -83,14 +83,14 @@ def feet_as_motion(skeleton: Skeleton, motion: Motion, feet: Sequence[Foot]) -> 
 def with_feet(
     take: Take, motion: Motion, feet: Sequence[Foot], wanted: Motion, floors: Floats, frames: slice
 ) -> Motion:
-    """Move the feet of some frames to given places, and up to the floor where their soles would be below it.
+    """Move feet to given places in a range of frames; soles that would be below the floor are lifted to the floor.
 
     Parameters
     ----------
     take : Take    the skeleton
     motion : Motion    F frames
     feet : sequence of Foot    n feet
-    wanted : Motion    ankles of F frames, as of `feet_as_motion`
+    wanted : Motion    ankles in F frames, in the form of `feet_as_motion`
     floors : (F, n) float64    height below which no sole may be, metres
     frames : slice    the frames to change
 
@@ -125,7 +125,7 @@ def with_feet(
 
 
 def _solved(motion: Motion, legs: Sequence[_Leg], ankles: Floats) -> Motion:
-    """Solve the legs so that the ankles get the places (F, n, 3)."""
+    """Solve the n legs so that their ankles are at the positions `ankles` (F, n, 3)."""
     for number, leg in enumerate(legs):
         motion = leg.solved(motion, ankles[:, number])
     return motion
@@ -142,7 +142,7 @@ class _Leg:
     reach: float
 
     def solved(self, motion: Motion, ankle: Floats) -> Motion:
-        """Bring the ankle to its places (F, 3); where the knee would jump, bring it near them."""
+        """Move the ankle to the positions `ankle` (F, 3), or only near them in frames in which the knee would jump."""
         leg = self.foot.leg
         calm = CalmLimb(self.take.skeleton, leg, motion, self.usual[[leg.middle, leg.end]], self.reach, 0.5 * _ZONE_RAD)
         coherent = Neighbours(np.arange(len(ankle)), self.reach)

@@ -74,7 +74,7 @@ def cut_loop(take: Take, command: CutLoop) -> Take:
 
     Returns
     -------
-    Take    the frames of one cycle, with the place of the cycle in the clip and the movement to the next round
+    Take    the frames of one cycle, with a finding: place of the cycle in the clip, and travel and turn per cycle
 
     Raises
     ------

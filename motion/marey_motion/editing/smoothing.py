@@ -79,7 +79,7 @@ def smooth(take: Take, command: Smooth) -> Take:
 
 
 def _with_kept_feet(take: Take, smoothed: Motion, weights: Floats, span: slice, shares: Floats) -> Motion:
-    """Smooth the feet as points of the world, and keep them above the lowest place that they have in the window."""
+    """Smooth the positions of the feet in the world, and keep each sole above its lowest height within the window."""
     from scipy.ndimage import minimum_filter1d
 
     feet = feet_of(take)

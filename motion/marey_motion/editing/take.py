@@ -21,7 +21,10 @@ from marey_motion.rigs import JointMapping, map_joints, symmetric_joints
 from marey_motion.skeleton import Skeleton
 
 MOST_NUMBERS = 200_000_000
-"""Maximum count of numbers in a motion that a command makes: 1.6 GB, or two and a half hours of 60 joints at 90 Hz."""
+"""Maximum number of values in the arrays of a motion that a command makes.
+
+The maximum corresponds to 1.6 GB of memory, or to two and a half hours of a motion with 60 joints at 90 Hz.
+"""
 
 
 UNIT_IN_SINGLE = 3e-7
@@ -209,7 +212,8 @@ class Take:
         stop = self.frame_count if stop is None else stop
         if not 0 <= start < stop <= self.frame_count:
             raise EditError(
-                f"the frames {start}:{stop} are not a range within the clip's {self.frame_count} frames",
+                f"the range {start}:{stop} must be within the clip's frames 0:{self.frame_count}, with its start "
+                "before its stop",
                 code="frames-missing",
             )
         return start, stop

@@ -9,7 +9,7 @@ from marey_motion.skeleton import Skeleton
 
 
 def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> Motion:
-    """Add translations for further joints. They equal the offsets of these joints, so the motion does not change.
+    """Add translations for further joints, equal to the offsets of these joints, so that the motion does not change.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> M
 def with_equal_joints(a: Motion, b: Motion, skeleton: Skeleton) -> tuple[Motion, Motion]:
     """Add translations to two motions of one skeleton, so that both store translations for the same joints.
 
-    Afterwards, both store translations for all joints for which `a` or `b` did.
+    Afterwards, both motions store translations for every joint for which at least one of them stored translations.
 
     Parameters
     ----------

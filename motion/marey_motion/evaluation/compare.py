@@ -1,10 +1,10 @@
 """Comparison of evaluations of the same trials: changes with their confidence intervals.
 
-Trials are no sample: they differ by what they ask for, and not by chance. What differs by chance are replicates. So
-each replicate gives one change, the mean over the trials, and the interval is that of these changes by Student's t. A
-verdict needs more: among many metrics, one in twenty would seem to change by chance alone. So their probabilities are
-corrected by Holm's method within each family of metrics, and the probability that a family contains any false verdict
-is at most 1 - `CONFIDENCE`.
+Trials differ by design and not by chance, so they are not a random sample; replicates differ by chance. Therefore, each
+replicate gives one change, the mean over the trials, and the confidence interval is computed from these changes by
+Student's t. An interval is not enough for a verdict: of many metrics, one in twenty would seem to change by chance
+alone. So the probabilities of the changes are corrected by Holm's method within each family of metrics. The probability
+that a family contains any false verdict is then at most 1 - `CONFIDENCE`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SAME_CHANGE = 1e-12
 """Relative difference up to which two changes count as equal, because rounding can cause a difference of this size."""
 
 OBJECTIVE = "objective"
-"""Name of the objective of an improvement where its change is stated like that of a metric, in metres."""
+"""Name of the objective of an improvement, whose change is reported in metres, in the form of a `MetricChange`."""
 
 LESS_IS_BETTER = (
     OBJECTIVE,
@@ -49,7 +49,7 @@ LESS_IS_BETTER = (
     "foot_depth_p95",
     "treading_per_s",
 )
-"""Metrics for which a lower value is better: one family. All others are another family, without directions."""
+"""Metrics for which a lower value is better, one family in Holm's correction; all other metrics are the second."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class MetricChange:
     before, after : means over the trials in which the metric is defined in both evaluations, in the unit of the metric
     change : mean of after - before over these trials
     low, high : bounds of the mean change at `CONFIDENCE`, over the replicates; None if there are too few replicates
-    trials : number of these trials
+    trials : number of trials in which the metric is defined in both evaluations
     replicates : number of replicates with a change
     p : probability of a mean change of this size or more by chance, corrected for the other metrics of its family; None
         if there are too few replicates, or if nothing changed
@@ -110,7 +110,7 @@ class TrialChange:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Differences between the evaluations of two sets of clips by the same trials.
+    """Differences between two evaluations, of two sets of clips, that ran the same trials.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def compare_several(before: EvaluationResult, others: Sequence[EvaluationResult]
 
     Returns
     -------
-    tuple of Comparison    one for each other evaluation; probabilities are corrected for all metrics of all of them
+    tuple of Comparison    one for each of `others`; probabilities are corrected for all metrics of all comparisons
 
     Raises
     ------
@@ -226,7 +226,7 @@ def paired_change(metric: str, before: Floats, after: Floats) -> MetricChange:
 
 
 def probability(changes: Floats) -> float:
-    """Compute the probability of a mean at least so far from 0 if the changes of replicates differed by chance only.
+    """Compute the probability that chance alone moves the mean of the changes this far from 0, or farther.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def probability(changes: Floats) -> float:
 
     Returns
     -------
-    float    0 to 1, for both sides: by Student's t; if all changes are equal, which counts often are, by the sign test
+    float    two-sided probability, 0 to 1, by Student's t or, if all changes are equal (as in counts), by the sign test
     """
     from scipy.special import stdtr
 
@@ -265,7 +265,7 @@ def corrected(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
 
 
 def corrected_family(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
-    """Correct the probabilities of changes for their number, by Holm's method.
+    """Correct the probabilities of changes for the number of these changes, by Holm's method.
 
     Parameters
     ----------

@@ -116,7 +116,7 @@ def coverage_of(
     owners : (W,) int32    index of the clip of each window
     too_short : tuple of int    indices of clips without a window
     options : EvaluationOptions    grid and minimum seconds per cell
-    window_s : float    seconds of data that each window counts for
+    window_s : float    seconds of data that each window adds to its cell
 
     Returns
     -------
@@ -150,7 +150,7 @@ def cell_deficits(seconds: Floats, least_s: float, window_s: float) -> Floats:
     ----------
     seconds : (V, O) float64    seconds in each cell
     least_s : float    seconds wanted in each cell
-    window_s : float    seconds of data that each window counts for
+    window_s : float    seconds of data that each window adds to its cell
 
     Returns
     -------

@@ -4,8 +4,8 @@ A trial counts as followed if the character keeps the desired place, speed and h
 while they are in contact, it steps as often as the clips, and its poses follow each other smoothly. Each measure is
 divided by its limit; the result is the *strain*. The share of followed trials gives the grade: from 75 % very good,
 from 55 % good, from 30 % usable in part, below that poor. The best grade can be reached, but hardly surpassed: with
-clips generated for every cell of the default grid, 76 % of the trials are followed (97 % of the circles, and 57 % of
-the trials with changes of speed, of which motion matching leaves many unanswered in tight turns).
+clips generated for every cell of the default grid, 76 % of the trials are followed: 97 % of the circles, and 57 % of
+the trials with changes of speed. In tight turns, motion matching does not respond to many of these changes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from marey_schemas.options.verdict import VerdictLimits
 GRADES = ((0.75, "very good"), (0.55, "good"), (0.3, "usable in part"), (0.0, "poor"))
 TOLERANCE = 1e-12
 GENTLE_DEG_S = 50.0
-"""Turn rate up to which a turn is gentle."""
+"""Greatest turn rate, in degrees per second, of a gentle turn."""
 
 Measure = Literal[
     "place",
@@ -42,15 +42,16 @@ Measure = Literal[
     "treading",
 ]
 LOOKS: tuple[Measure, ...] = ("skating", "sinking", "gliding", "pattering", "jerking", "jumping", "treading")
-"""The measures that judge how the motion looks, not where it leads."""
+"""The measures of how the motion looks; all other measures are about place, speed and heading."""
 Region = Literal["straight", "gentle turns", "sharp turns", "speed changes"]
 REGIONS: tuple[Region, ...] = ("straight", "gentle turns", "sharp turns", "speed changes")
 
 
 class LimitCheck(NamedTuple):
-    """One measure of a trial beside its limit; `metric` is the name of the metric that is compared.
+    """One measure of a trial and its limit; `metric` is the name of the metric that is compared with the limit.
 
-    `value` is None if the measure is not defined, which counts as infinite strain; its sign is that of the error.
+    `value` is None if the measure is not defined, which counts as infinite strain; the sign of `value` is the sign of
+    the error.
     """
 
     measure: Measure
@@ -61,7 +62,7 @@ class LimitCheck(NamedTuple):
 
     @property
     def exceeded(self) -> bool:
-        """Whether the measure exceeds its limit."""
+        """True if the measure exceeds its limit."""
         return self.strain > 1.0 + TOLERANCE
 
 
@@ -74,7 +75,7 @@ class TrialVerdict:
 
     @property
     def worst(self) -> LimitCheck:
-        """The check with the largest strain; the first of several."""
+        """The check with the largest strain; the first one if several are equal."""
         return max(self.checks, key=lambda each: each.strain)
 
     @property
@@ -84,17 +85,17 @@ class TrialVerdict:
 
     @property
     def followed(self) -> bool:
-        """Whether no limit is exceeded."""
+        """True if no limit is exceeded."""
         return not self.exceeded
 
     @property
     def on_path(self) -> bool:
-        """Whether no limit of place, speed and heading is exceeded, whatever the motion looks like."""
+        """True if no limit of place, speed or heading is exceeded; limits on the looks of the motion are ignored."""
         return all(each.measure in LOOKS for each in self.exceeded)
 
     @property
     def region(self) -> Region:
-        """The part of the trials to which this one belongs."""
+        """The group of trials to which the trial belongs, by its turn rate and its changes of speed."""
         trial = self.outcome.trial
         turn_deg_s = abs(float(np.degrees(trial.turn_rate_rad_s)))
         if trial.family == "switching":
@@ -127,12 +128,12 @@ class Judgement:
 
     @property
     def on_path(self) -> int:
-        """Number of trials that keep place, speed and heading, whatever they look like."""
+        """Number of trials in which no limit of place, speed or heading is exceeded; looks are ignored."""
         return sum(each.on_path for each in self.trials)
 
     @property
     def ranked(self) -> tuple[TrialVerdict, ...]:
-        """The trials in the order of their largest strain, the worst first; equal ones in the order of their names."""
+        """The trials in descending order of their largest strain; trials with equal strain are ordered by name."""
         return tuple(sorted(self.trials, key=lambda each: (-each.worst.strain, each.outcome.trial.name)))
 
 
@@ -174,7 +175,7 @@ def judge_trial(outcome: TrialResult, limits: VerdictLimits) -> TrialVerdict:
 
 
 def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[LimitCheck]:
-    """Check the speed of each regime away from switches, and the answers to switches."""
+    """Check the speed in each regime, apart from the time around speed switches, and the response to the switches."""
     trial, metrics = outcome.trial, outcome.metrics
     regimes = [(mean_speed_m_s(trial), metrics)]
     if "settled_se_v" in metrics and trial.family == "switching" and "switched" in outcome.regimes:
@@ -189,7 +190,7 @@ def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[Limit
 
 
 def _response_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitCheck]:
-    """Check the median answer to switches, which is not defined if most of them have no answer."""
+    """Check the median response time to speed switches; it is not defined if most switches have no response."""
     if metrics.get("response_median_s") is not None or ("response_median_s" in metrics and metrics["response_missed"]):
         yield _check("response", metrics, "response_median_s", limits.response_s)
 
@@ -224,9 +225,9 @@ def _looks_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitChec
 
 
 def exceeded_in_suite(result: EvaluationResult) -> frozenset[str]:
-    """Find the metrics over all trials that exceed the limits of single trials.
+    """Find the metrics of the suite that exceed the limits for single trials.
 
-    Limits that depend on the desired speed of a trial are left out.
+    Limits that depend on the desired speed of a trial are not checked.
 
     Parameters
     ----------

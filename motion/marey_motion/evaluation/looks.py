@@ -1,8 +1,8 @@
-"""Looks of a trial: what its feet do on the ground, and how smoothly its poses follow each other.
+"""Looks of a trial: the contacts, sliding and sinking of the feet, and the smoothness of the motion.
 
 Everything is measured from the displayed poses, that is after the blending of transitions, and compared with the same
 measures of the clips that the trial shows. Values of several clips are averaged by the time for which the trial shows
-each of them. Clips that are not shown have no influence, so removing them changes no number.
+each of them. Clips that are not shown have no influence, so removing them from the database changes no measure.
 """
 
 from __future__ import annotations
@@ -23,9 +23,12 @@ from marey_motion.matching.record import TrialRecord
 from marey_schemas.options.matching import ControllerOptions
 
 LEAST_PATH_M = 1.0
-"""Distance below which contacts per metre are not defined."""
+"""Length of a path, in metres, below which contacts per metre are not defined."""
 LEAST_SKATE_M_S = 0.01
-"""Speed of the feet of clips below which a ratio to this speed is not defined: motion capture is not more accurate."""
+"""Least sliding speed of the clips' feet, in metres per second, for which a ratio to this speed is defined.
+
+Motion capture does not measure lower speeds accurately.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +38,7 @@ class ClipLooks:
     Parameters
     ----------
     rows : number of rows
-    standing : number of steps of a foot from one row to the next during which it is in contact
+    standing : number of steps from one row to the next during which a foot is in contact, over both feet
     skated_m_s : sum of the horizontal speeds of the toes during these steps
     standing_rows, heights_m : number of feet in contact, over all rows, and sum of the heights of their toes
     contacts : number of times that a foot comes into contact
@@ -174,7 +177,7 @@ def ground_speeds(points: AnyFloats, positions: Floats, headings: Floats, rate_h
 
 
 def standing_steps(contacts: Flags) -> Flags:
-    """Mark the steps during which a foot stands: in contact at both ends.
+    """Mark the steps during which a foot stays on the ground: it is in contact at both ends of the step.
 
     Parameters
     ----------
@@ -216,7 +219,7 @@ def _toes_of_rows(database: MatchingDatabase) -> AnyFloats:
 
 
 def _skate_ratio(skate: float | None, of_clips: float | None) -> float | None:
-    """Divide two speeds; None if the clips hardly skate, because the ratio would say nothing."""
+    """Divide the sliding speed in a trial by that of the clips; None if the clips' feet hardly slide."""
     return skate / of_clips if skate is not None and of_clips is not None and of_clips >= LEAST_SKATE_M_S else None
 
 

@@ -25,13 +25,16 @@ from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
 REGIMES = ("approach", "base", "switched")
 RESPONSE_SHARE = 0.1
-"""A desired speed counts as reached if the error stays below this share of the desired speed for `RESPONSE_HOLD_S`."""
+"""A desired speed counts as reached if the error stays below this share of that speed for `RESPONSE_HOLD_S` seconds."""
 RESPONSE_HOLD_S = 0.5
 """Seconds for which the error must stay below `RESPONSE_SHARE` for the speed to count as reached."""
 SETTLING_S = 1.0
-"""Time around a switch of the desired speed in which the character changes its speed: it looks one second ahead."""
+"""Seconds around a switch of the desired speed that do not count as settled, since the character changes its speed.
+
+The character changes its speed before the switch, too, because it looks one second ahead.
+"""
 LEAST_TRAVEL_M_S = 0.05
-"""Speed below which the direction of travel of a step is not defined."""
+"""Speed, in metres per second, below which the direction of travel of a step is not defined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,9 +245,10 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
 
 
 def _settled_metrics(series: TrialSeries, window: Flags, speeds: Metrics) -> dict[str, float | None]:
-    """Compute error and spread of the speed away from its switches, and the error of the heading as an angle.
+    """Compute error and spread of the speed in settled steps, and the root mean square of the heading error.
 
-    `speeds` are the metrics of the whole window, which are the same if the speed does not switch.
+    Settled steps are not near a switch of the desired speed. `speeds` are the metrics of the whole window; if the
+    desired speed does not switch, they are used for the settled steps, too.
     """
     heading = _of(_rms, series.heading_errors_rad[window])
     heading_deg = None if heading is None else float(np.degrees(heading))

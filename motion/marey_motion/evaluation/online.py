@@ -1,4 +1,4 @@
-"""Coverage during a recording: the data recorded so far, the missing data, and paths to walk to record missing data.
+"""Coverage during a recording: the data recorded so far, the missing data, and paths to walk to fill the gaps.
 
 A performance arrives as frames, in groups of any size. For a whole clip, the counted windows are the same as those of
 `coverage.measure_coverage` at the same frame rate.

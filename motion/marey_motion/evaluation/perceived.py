@@ -1,4 +1,4 @@
-"""Evaluated clips as people see them: transitions and near-duplicates under a perceptual metric."""
+"""Perceptual distances in an evaluation: of transitions, and of clips that may be near-duplicates."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class PerceivedTransitions:
 
 
 class PerceivedRows:
-    """Rows of a database as a metric measures them.
+    """Rows of a database, prepared for measuring distances by a perceptual metric.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class PerceivedRows:
 
     @cached_property
     def _measured(self) -> MeasuredClip:
-        """All rows, clip by clip."""
+        """The rows of all clips of the database, measured clip by clip and joined in the order of the rows."""
         parts = [self._measured_clip(clip) for clip in self._database.clips]
         first = parts[0]
         return replace(
@@ -179,7 +179,7 @@ class PerceivedRows:
 
 
 def indistinguishable(metric: MetricDocument) -> float:
-    """Compute the greatest distance of two motions that judgements cannot separate from nearly equal motions.
+    """Compute the perceptual distance up to which two motions count as looking the same.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def indistinguishable(metric: MetricDocument) -> float:
 
     Returns
     -------
-    float    the constant that every difference costs, and twice the standard error of the judgements
+    float    the metric's constant cost of any difference, plus twice the standard error of the human judgements
     """
     constant = sum(one.share * one.constant for one in metric.components)
     return constant + 2.0 * metric.judgement_error
@@ -206,8 +206,9 @@ def require_same_metric(before: PerceivedTransitions | None, after: PerceivedTra
     """
     if before is not None and after is not None and before.digest != after.digest:
         raise MotionError(
-            f"their perceptual metrics differ ({before.metric} and {after.metric}), so distances of transitions cannot "
-            f"be compared; evaluate one of them again with --metric {before.metric} or --metric {after.metric}",
+            f"the evaluations use different perceptual metrics ({before.metric} and {after.metric}), so their "
+            f"distances cannot be compared; run one evaluation again with --metric {before.metric} or --metric "
+            f"{after.metric}",
             code="not-comparable",
             where="metric",
         )

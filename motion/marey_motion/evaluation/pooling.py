@@ -1,4 +1,4 @@
-"""Metrics of a suite from those of its trials and of their replicates."""
+"""Metrics of a suite, pooled from the metrics of its trials and their replicates."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TREADING_SHARE = "treading_share"
 
 @dataclass(frozen=True, eq=False)
 class PooledSuite:
-    """Metrics of each trial and of the suite, as means over the replicates, and those of each replicate."""
+    """Metrics of each trial and of the suite as means over the replicates, and the metrics of each replicate."""
 
     trials: tuple[TrialResult, ...]
     suite: Metrics
@@ -37,14 +37,14 @@ def pool_suite(
 
     Parameters
     ----------
-    results : sequence of TrialResult    the trials themselves: their first replicate
-    treading : float or None    share of treading in the chosen jumps of these trials
+    results : sequence of TrialResult    the first replicate of each trial, which is the trial itself
+    treading : float or None    share of the chosen jumps of these trials that make the character tread on the spot
     options : EvaluationOptions    number of replicates, families and limits
     further : MeasuredReplicates, optional    the other replicates
 
     Returns
     -------
-    PooledSuite    with one replicate, the metrics of the trials themselves
+    PooledSuite    means over the replicates; if there is only one replicate, the metrics of the trials themselves
 
     Raises
     ------
@@ -72,7 +72,7 @@ def pool_suite(
 
 
 def suite_metrics(results: Sequence[TrialResult], options: EvaluationOptions) -> dict[str, float | None]:
-    """Pool the metrics of trials, over all of them and by family.
+    """Pool the metrics of trials over the whole suite and over each family of trials.
 
     Parameters
     ----------

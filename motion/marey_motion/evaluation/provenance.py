@@ -49,7 +49,7 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
 
 
 def _drawn(options: EvaluationOptions) -> list[dict[str, int]]:
-    """Return what determines the replicates; empty if there is only one, which is the trial itself."""
+    """Return number and seed of the replicates for the digest; empty if each trial runs only once."""
     return [{"replicates": options.replicates, "seed": options.seed}] if options.replicates > 1 else []
 
 
@@ -81,7 +81,9 @@ def require_comparable(
 
 
 def differing_options(before: EvaluationOptions, after: EvaluationOptions) -> dict[str, list[str]]:
-    """Describe the options that differ between two evaluations, by the condition of a comparison to which they belong.
+    """Describe the options that differ between two evaluations, grouped by the condition that they change.
+
+    The conditions of a comparison are "options", "scenarios" and "limits".
 
     Parameters
     ----------
@@ -106,9 +108,10 @@ _CONDITION_OF = {
     **dict.fromkeys(("switch_speed_m_s", "switch_every_s", "replicates", "seed"), "scenarios"),
     "limits": "limits",
 }
-"""Condition of a comparison to which a member of the options belongs.
+"""For each member of the evaluation options, the condition of a comparison that changes with this member.
 
-Other members decide only what is counted or computed in addition: `coverage_least_s` and `literal_formulas`.
+The members `coverage_least_s` and `literal_formulas` are missing, because two evaluations can be compared even if these
+members differ.
 """
 _NAMED = 5
 """Greatest number of differing options that an error names."""
@@ -125,7 +128,7 @@ _CONDITIONS = {
 
 
 def _named(texts: Sequence[str], first: str, second: str) -> str:
-    """Name the options that differ, or the digests if the options are not the reason."""
+    """Describe a difference: the options that differ or, if `texts` is empty, the two digests."""
     if not texts:
         return f"{_short(first)} and {_short(second)}"
     more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""

@@ -94,7 +94,7 @@ class UsageTally:
     ----------
     popularity : (N,) int64    number of ticks that displayed each row
     entries : (C,) int64    number of jumps to each clip
-    shown : (C,) bool for each trial, by its name: whether one of its records displayed each clip
+    shown : mapping of str to (C,) bool    by name of the trial, True for each clip that a record of the trial displayed
     """
 
     popularity: NDArray[np.int64]
@@ -103,7 +103,7 @@ class UsageTally:
 
     @classmethod
     def of(cls, clips: Sequence[DatabaseClip]) -> UsageTally:
-        """Make a count without any record.
+        """Make a tally in which all counts are zero.
 
         Parameters
         ----------
@@ -117,7 +117,7 @@ class UsageTally:
 
     @classmethod
     def total(cls, tallies: Sequence[UsageTally]) -> UsageTally:
-        """Add counts of the same clips; a trial that several of them have is shown where one of them shows it.
+        """Add counts of the same clips; a trial displayed a clip if it did so in any of the counts.
 
         Parameters
         ----------

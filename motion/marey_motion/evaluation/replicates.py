@@ -1,10 +1,10 @@
 """Replicates of trials: the same trial with another start, which shows how much its metrics vary by chance.
 
-A replicate differs from its trial in two things that no result should depend on: the character starts up to
-`START_S` later in the motion that the first search finds, so in another phase of its stride, and the approach is up to
-`APPROACH_S` longer. Both are drawn from a random stream that belongs to the seed, the trial and the number of the
-replicate alone, so that results depend neither on threads nor on the division into tasks. Replicate 0 is the trial
-itself.
+A replicate differs from its trial in two respects on which no result should depend. The character starts up to
+`START_S` seconds later in the motion that the first search finds, and thus in another phase of its stride. And the
+approach is up to `APPROACH_S` seconds longer. Both times are drawn from a random stream that depends only on the seed,
+the trial and the number of the replicate, so that results depend neither on threads nor on the division into tasks.
+Replicate 0 is the trial itself.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ APPROACH_S = 1.0
 
 @dataclass(frozen=True)
 class TrialReplicate:
-    """One run of a trial; `driven` is the trial with the length of its approach in this replicate."""
+    """One run of a trial; `driven` is a copy of the trial with the approach time of this replicate."""
 
     trial: Trial
     replicate: int
@@ -127,7 +127,7 @@ def measure_run(
 
 @dataclass(frozen=True)
 class MeasuredRun:
-    """Metrics of one replicate, and the numbers of all its chosen jumps and of those that tread on the spot."""
+    """Metrics of one replicate, the number of its chosen jumps, and how many of them tread on the spot."""
 
     outcome: TrialResult
     jumps: int

@@ -38,7 +38,7 @@ class ReplicateValues:
     ----------
     names : names of the M metrics of trials
     values : (T, R, M) float64    in the unit of each metric
-    followed : (T, R) bool    whether the character kept all limits
+    followed : (T, R) bool    whether the character kept within all limits
     suite : (R,) float64 for each metric of the suite, by name
     """
 

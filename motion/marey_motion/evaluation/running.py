@@ -27,11 +27,11 @@ def run_each(
     threads: int,
     cancelled: CancelCallback,
 ) -> None:
-    """Run items, some at a time, and pass each result on as soon as it exists, so that few results are held.
+    """Run items on several threads, and pass on each result as soon as it exists, so that few are in memory.
 
     Parameters
     ----------
-    run : callable    called with one item, in a thread of its own
+    run : callable    called with one item, in a worker thread
     items : sequence    the items
     keep : callable    called with each item and its result, in the calling thread
     threads : int    number of items at a time

@@ -162,7 +162,7 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
     if tick_count < 1 or trial.approach_s < 0.0 or trial.duration_s < 0.0:
         raise MotionError(
             f"a trial with an approach of {trial.approach_s:g} s and a duration of {trial.duration_s:g} s is "
-            f"too short: it has no ticks at {rate_hz:g} Hz",
+            f"too short: it has no ticks at {rate_hz:g} Hz; make the approach or the duration longer",
             where=trial.name,
         )
     if trial.family == "switching" and not trial.switch_every_s > 0.0:

@@ -43,8 +43,8 @@ class Bone:
 
     `vector` is the direction times the length, in the file's unit and world axes. `axis` are three angles, and the
     order of the axes about which they turn; `frame` is the quaternion of these turns. `channels` are the degrees of
-    freedom in order ("rx", "tz"). `line` is the number of the bone's line in the file. `written_name` is the name as
-    bytes of the file, by which an AMC file calls the bone.
+    freedom in order ("rx", "tz"). `line` is the number of the bone's line in the file. `written_name` is the bone's
+    name as the bytes in the file; AMC files contain the same bytes.
     """
 
     name: str
@@ -218,7 +218,9 @@ class _AsfReader:
             elif section:
                 section(text.split())
         if not self.children:
-            raise self.lines.error("the file has no :hierarchy", code="file-truncated")
+            raise self.lines.error(
+                "the file has no section :hierarchy; copy or export the file again", code="file-truncated"
+            )
         return self._assembled()
 
     def _units(self, words: list[bytes]) -> None:
@@ -285,7 +287,7 @@ class _AsfReader:
             raise self.lines.error("the bone has no length; add a line 'length x'", joint=bone.name)
         if len(self.bones) + 1 == MAX_JOINTS:
             raise FormatLimit(
-                f"the file has more than {MAX_JOINTS} bones, the most that are accepted",
+                f"the file has more than {MAX_JOINTS} bones, which is the limit; remove bones from the skeleton",
                 file=self.lines.file,
                 line=self.lines.number,
             )
@@ -301,7 +303,9 @@ class _AsfReader:
         for name in (parent, *children):
             if name != ROOT and name not in self.bones:
                 raise self.lines.error(
-                    "the section :hierarchy names this bone, but :bonedata does not define it", joint=name
+                    "the section :hierarchy contains this bone, but the section :bonedata does not define the bone; "
+                    "add or remove the bone",
+                    joint=name,
                 )
         self.children.setdefault(parent, []).extend(children)
 
@@ -340,14 +344,16 @@ class _AsfReader:
         while waiting:
             name, parent = waiting.pop()
             if name in placed:
-                raise self.lines.error("the section :hierarchy gives this bone two parents", joint=name)
+                raise self.lines.error("the section :hierarchy gives this bone two parents; remove one", joint=name)
             placed.add(name)
             waiting.extend((child, len(bones)) for child in reversed(self.children.get(name, ())))
             bones.append(self.root if name == ROOT else self.bones[name])
             parents.append(parent)
         loose = next((name for name in self.bones if name not in placed), None)
         if loose is not None:
-            raise self.lines.error("the section :hierarchy does not connect this bone to the root", joint=loose)
+            raise self.lines.error(
+                "the section :hierarchy does not connect this bone to the root; add a parent of the bone", joint=loose
+            )
         return AsfSkeleton(
             bones,
             np.array(parents, np.int32),

@@ -171,12 +171,15 @@ class _HierarchyReader:
             )
         if len(header.names) == MAX_JOINTS:
             raise FormatLimit(
-                f"the file has more than {MAX_JOINTS} joints", file=self.lines.file, line=self.lines.number
+                f"the file has more than {MAX_JOINTS} joints, which is the limit; remove joints from the skeleton",
+                file=self.lines.file,
+                line=self.lines.number,
             )
         name = decode_name(rest) or f"joint{len(header.names)}"
         if len(name) > MAX_JOINT_NAME_LENGTH:
             raise self.lines.error(
-                f"the joint name has {len(name)} characters, more than the limit of {MAX_JOINT_NAME_LENGTH}"
+                f"the joint name has {len(name)} characters, more than the limit of {MAX_JOINT_NAME_LENGTH}; shorten "
+                "the name"
             )
         self.brace_due = True
         header.parents.append(self.open[-1] if self.open else -1)
@@ -213,7 +216,8 @@ class _HierarchyReader:
             raise self.lines.error(f"channel {unknown!r} is not one of {', '.join(CHANNELS)}", joint=joint)
         if len(words[0]) > 3 or int(words[0]) != len(names):
             raise self.lines.error(
-                f"CHANNELS declares {excerpt(words[0])} channels, but lists {len(names)}", joint=joint
+                f"CHANNELS declares {excerpt(words[0])} channels, but lists {len(names)}; correct the number",
+                joint=joint,
             )
         if len(set(names)) != len(names):
             raise self.lines.error("CHANNELS lists a channel twice; remove one", joint=joint)

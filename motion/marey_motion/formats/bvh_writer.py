@@ -69,10 +69,11 @@ def write_bvh(
 def with_folded_positions(clip: Clip) -> Clip:
     """Make a clip in which only the root is translated.
 
-    Some exporters write the path of the body to the hips below a root that stands still. The root takes over the motion
-    of such a joint: the joint that carries more than half of the joints, and is nearest to the root. It and the joints
-    below it stay exactly where they were. The other translated joints get their median translations as offsets, so the
-    joints below them move by what their bones stretch.
+    Some exporters write the path of the body to the hips, below a root that does not move. If a translated joint has
+    more than half of all joints at or below it, the root takes over the motion of this joint, which stays exactly in
+    place; of several such joints, the one nearest to the root is chosen. Every other translated joint gets its median
+    translation as a constant offset. If its translation varied, the joint and the joints below it are displaced by
+    the difference.
 
     Parameters
     ----------
@@ -197,7 +198,10 @@ def format_table(values: NDArray[np.float64]) -> bytes:
     """
     largest = float(np.abs(values).max(initial=0.0))
     if not largest < _LARGEST:
-        raise FormatError(f"the value {largest:.3g} is too large to be written to a BVH file", code="value-range")
+        raise FormatError(
+            f"the value {largest:.3g} is too large to be written to a BVH file; choose a larger unit of length",
+            code="value-range",
+        )
     widest = len(str(int(largest))) + _DECIMALS + 3
     text = np.empty(values.size * widest, np.uint8)
     return text[: _format(values, text)].tobytes()

@@ -25,7 +25,7 @@ Real = TypeVar("Real", np.float32, np.float64)
 
 _LARGEST_LENGTH = 1e12
 _FASTEST_BODY_M_S = 30.0
-"""Greatest typical speed of a body, which no animal on the ground exceeds for long."""
+"""Greatest plausible median speed of a body, in metres per second; no animal on the ground is faster for long."""
 _USUAL_RATES_HZ = (10.0, 1000.0)
 
 # Rows are the file's axes that become x, y, z; each matrix is a rotation.
@@ -54,7 +54,8 @@ def convert(
     source : SourceMotion    the file in its own unit and axes
     file : str    name of the file, for messages
     options : ImportOptions    facts given by the user
-    sibling_axis : str, optional    upward axis of other files with this skeleton, for a file that does not show its own
+    sibling_axis : str, optional    upward axis of other files with this skeleton; used if the file does not determine
+        its own upward axis
 
     Returns
     -------
@@ -125,13 +126,13 @@ def _check_range(source: SourceMotion, file: str) -> None:
 
 
 def _compare_rate_with_speed(clip: Clip, file: str) -> None:
-    """Refuse a given frame rate with which the body is faster than any person or animal, most of the time."""
+    """Refuse a frame rate given by the user if the median speed of the body would be greater than any animal's."""
     speeds_m_s = np.linalg.norm(np.diff(clip.root_translations, axis=0), axis=1) * clip.frame_rate_hz
     if len(speeds_m_s) and (typical := float(np.median(speeds_m_s))) > _FASTEST_BODY_M_S:
         raise ContradictedOption(
             f"the frame rate of {clip.frame_rate_hz:g} Hz contradicts the motion: the body would move at "
-            f"{typical:.0f} m/s half of the time; give the right rate with --fps (frame_rate_hz), or confirm this one "
-            "with --trust-options (trust_options)",
+            f"{typical:.0f} m/s or faster half of the time; give the right rate with --fps (frame_rate_hz), or confirm "
+            "this rate with --trust-options (trust_options)",
             file=file,
         )
 

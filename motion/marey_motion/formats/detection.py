@@ -60,7 +60,9 @@ def detect_format(data: bytes, name: str) -> FileFormat:
     foreign = next((kind for mark, kind in _FOREIGN.items() if data.startswith(mark)), None)
     if foreign:
         raise UnknownFormat(
-            f"{foreign}, a format that cannot be imported; convert the motion to BVH", code="reader-absent", file=name
+            f"the file is {foreign}, which cannot be imported; convert the motion to BVH",
+            code="reader-absent",
+            file=name,
         )
     found = next((one for one in FORMATS if one.begins is not None and one.begins.search(start)), named)
     if found is None:

@@ -87,7 +87,7 @@ def changed(aligned: AlignedSet, **info: Any) -> list[StoredExample]:
         ({"set": f"sha256:{64 * 'b'}"}, "not aligned together"),
         ({"keyframes": {"down": 31}}, "not aligned together"),
         ({"reference": {"item": "clip_b", "revision": 1, "mirrored": False}}, "not aligned together"),
-        ({"frame_rate_hz": 30.0}, "60 frames at 60 Hz, but its time function has 60 at 30 Hz"),
+        ({"frame_rate_hz": 30.0}, "60 frames at 60 Hz, but its time function has 60 frames at 30 Hz"),
         ({"clip": {"item": "clip_c", "revision": 1, "mirrored": True}}, "the set of clips contains this clip twice"),
     ],
 )

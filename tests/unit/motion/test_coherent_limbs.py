@@ -121,7 +121,7 @@ def test_an_elbow_points_at_its_pole(body: Callable[[], Skeleton]) -> None:
         ways /= np.linalg.norm(ways, axis=1)[:, None]
         assert ways[0] @ ways[1] > 0.999
     assert np.linalg.norm(edited[:, wrist] - target, axis=1).max() < 1e-4
-    with pytest.raises(EditError, match="a pole needs the two-bone solver"):
+    with pytest.raises(EditError, match="a pole works only with the two-bone solver"):
         _constrained(clip, asked, solver="ccd")
 
 

@@ -195,7 +195,7 @@ def test_what_is_no_body_can_be_constrained_but_has_no_front_and_no_feet(tumblin
         ({"kind": "position", "joint": "left_wirst"}, r"constraints\[0\].*left_wirst"),
         (
             {"kind": "position", "joint": "left_wrist", "frames": [110, 130]},
-            "frames 110:130 are not a range",
+            "the range 110:130 must be within",
         ),
         ({"kind": "position", "joint": "left_wrist", "top": "right_shoulder"}, "is not an ancestor of"),
     ],

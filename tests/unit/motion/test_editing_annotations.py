@@ -93,7 +93,7 @@ def test_a_neighbour_across_a_gap_gives_way_only_where_it_must() -> None:
         Segment("right", 10, 25),
         Segment("stand", 25, 30),
     )
-    with pytest.raises(AnnotationError, match=r"'stand' 22:30: moving the end of segment 'right' 10:18 to 30"):
+    with pytest.raises(AnnotationError, match=r"'stand' 22:30: moving the end of segment 'right' 10:18 to frame 30"):
         annotations.move_boundary(WALK, 15, "end", 30)
 
 

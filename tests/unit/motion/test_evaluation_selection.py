@@ -90,7 +90,7 @@ def test_what_does_not_belong_together_is_refused() -> None:
     database = synthetic_database(tracks)
     with pytest.raises(MotionError, match="no clip nobody"):
         rows_of_sources(database.clips, ["nobody"])
-    with pytest.raises(MotionError, match="no clip is left"):
+    with pytest.raises(MotionError, match="no clip is left in the database"):
         without_sources(database, list(clips_by_source(database.clips)))
     with pytest.raises(MotionError, match="both databases contain the clip clip_000"):
         joined(database, synthetic_database(tracks[:1]))

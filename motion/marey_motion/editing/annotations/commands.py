@@ -151,7 +151,12 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
     segment = layer.segments[index]
     moved = segment._replace(start=to) if edge == "start" else segment._replace(end=to)
     if moved.end <= moved.start:
-        raise wrong(segment, "empty-segment", f"with its {edge} at frame {to}, the segment would have no frames")
+        raise wrong(
+            segment,
+            "empty-segment",
+            f"with its {edge} at frame {to}, the segment would have no frames; choose another frame or remove the "
+            "segment",
+        )
     beside = index - 1 if edge == "start" else index + 1
     if not 0 <= beside < len(layer.segments):
         return layer.with_segments(index, index + 1, moved)
@@ -164,7 +169,8 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
         raise wrong(
             other,
             "neighbour-in-the-way",
-            f"moving the {edge} of {segment} to {to} would leave its neighbour {other} without frames",
+            f"moving the {edge} of {segment} to frame {to} would leave its neighbour {other} without frames; choose a "
+            "frame nearer to the present one, or remove the neighbour first",
         )
     first = min(index, beside)
     return layer.with_segments(first, first + 2, *((changed, moved) if edge == "start" else (moved, changed)))

@@ -49,7 +49,7 @@ def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
     """Compute the speed of the slowest point of a foot, without outliers.
 
     While a foot rolls from heel strike to toe off, first its heel does not move, then its toe. The ankle is close to
-    the heel, so the slower of these two points is slow during the whole contact.
+    the heel, so the slower of ankle and toe is slow during the whole contact.
 
     Parameters
     ----------
@@ -86,7 +86,9 @@ def stances_of(speed: Floats, frame_rate_hz: float, options: ContactOptions) -> 
 
 
 def contact_labels(points: Floats, rate_hz: float) -> NDArray[np.bool_]:
-    """Label the frames in which points of feet stand, by their speeds, as the proposals of steps do.
+    """Label the frames in which points of feet are on the ground, by the speed of each point (see `stances_of`).
+
+    The limits of speed and duration are the defaults of `ContactOptions`.
 
     Parameters
     ----------

@@ -77,7 +77,11 @@ class Layer:
         """
         index = bisect_right(self.segments, frame, key=_start) - 1
         if index < 0 or frame >= self.segments[index].end:
-            raise AnnotationError("no segment contains this frame", code="no-segment", where=f"frame {frame}")
+            raise AnnotationError(
+                "no segment contains this frame; choose a frame inside a segment",
+                code="no-segment",
+                where=f"frame {frame}",
+            )
         return index
 
     def overlapping(self, start: int, end: int) -> tuple[int, int]:
@@ -189,7 +193,11 @@ def require_segments(segments: Sequence[Segment], frame_count: int) -> None:
             raise wrong(segment, "outside-clip", f"the segment must be within the clip's frames 0:{frame_count}")
     for before, after in pairwise(segments):
         if after.start < before.end:
-            raise wrong(after, "segments-overlap", f"the segment overlaps {before}")
+            raise wrong(
+                after,
+                "segments-overlap",
+                f"the segment overlaps {before}, but segments of one layer must not overlap",
+            )
 
 
 def _require_keyframes(keyframes: Sequence[Keyframe], frame_count: int) -> None:
@@ -200,7 +208,9 @@ def _require_keyframes(keyframes: Sequence[Keyframe], frame_count: int) -> None:
             raise wrong(keyframe, "outside-clip", f"the keyframe must be within the clip's frames 0:{frame_count}")
     for earlier, later in pairwise(keyframes):
         if earlier == later:
-            raise wrong(later, "keyframe-exists", "the layer already has this keyframe")
+            raise wrong(
+                later, "keyframe-exists", "the layer already has this keyframe; choose another label or another frame"
+            )
 
 
 def _require_label(label: str, place: str) -> None:

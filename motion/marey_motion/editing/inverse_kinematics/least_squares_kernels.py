@@ -246,8 +246,8 @@ def _solve_frame(body, targets, frame, offsets, ends, carried, local, root, work
     """Solve one frame: change the pose `local` (K, 4) and `root` (3,) in place.
 
     `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `solve_frames`. If `carried`,
-    the solver starts with the pose `work.trial` and `work.trial_root`, and changes it as little as it can. Returns the
-    number of steps tried, and whether all targets are reached.
+    the solver starts with the pose `work.trial` and `work.trial_root`, and changes it as little as possible. Returns
+    the number of steps tried, and whether all targets are reached.
     """
     most_steps, tolerance_m, tolerance_rad = ends
     work.first[:] = local
@@ -302,10 +302,10 @@ def _solve_frame(body, targets, frame, offsets, ends, carried, local, root, work
 def solve_frames(body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found):
     """Solve the frames `order` (n,) in this order; change `roots` (F, 3) and `rotations` (F, K, 4) in place.
 
-    `given_rotations` and `given_roots` are the poses of all frames before they were solved. Where `carried` (n,) is at
-    least 0, the solver starts with the change that the frame of this number got; otherwise each frame is solved
-    independently. Also fills the `SolverResult` `found`. `ends` holds the three stopping criteria: the maximum number
-    of steps, and the tolerances in metres and in radians.
+    `given_rotations` and `given_roots` are the poses of all frames before they were solved. If `carried[i]` is at least
+    0, frame `order[i]` is solved from its given pose, changed as frame `carried[i]` was changed; otherwise, it is
+    solved from its given pose. Also fills the `SolverResult` `found`. `ends` holds the three stopping criteria: the
+    maximum number of steps, and the tolerances in metres and in radians.
     """
     for n in range(order.shape[0]):
         f, other = order[n], carried[n]

@@ -1,4 +1,4 @@
-"""Limbs of two bones, such as arms and legs: found by their ends, and the targets that they alone can meet."""
+"""Limbs of two bones, such as arms and legs, and the targets that such a limb can meet without other joints."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def straight_hinge(
     skeleton : Skeleton    J joints
     mapping : JointMapping    its standard joints
     joint : int    index of the hinge
-    axes : JointAxes    axes of the hinge, as of `rigs.guess_axes`
+    axes : JointAxes    axes of the hinge, a result of `rigs.guess_axes`
 
     Returns
     -------

@@ -13,14 +13,19 @@ from marey_motion.editing.inverse_kinematics.problem import IkProblem, SolverRes
 from marey_motion.editing.inverse_kinematics.targets import Neighbours, SolverOptions
 
 JUMP_RAD = 0.1
-"""Change of the rotation that a joint gets in addition, from one frame to the next, above which a run is incoherent."""
+"""Largest angle, in radians, between the changes that the solver makes to a joint in two successive frames.
+
+If a joint exceeds this angle, it jumps, and the run of frames is solved again.
+"""
 
 
 def solve_in_order(
     kernel: Callable[..., None], problem: IkProblem, options: SolverOptions, room: Any, found: SolverResult,
     neighbours: Neighbours | None,
 ) -> None:  # fmt: skip
-    """Solve each frame alone; then solve runs of frames in which joints jump again, each frame from its neighbour.
+    """Solve each frame alone; a run of frames in which a joint jumps is then solved a second time.
+
+    In the second pass, each frame starts with the change of its neighbour in time.
 
     Parameters
     ----------
@@ -43,10 +48,10 @@ def solve_in_order(
 
 
 def _changes_to_carry(given: Floats, solved: Floats, neighbours: Neighbours) -> tuple[Ints, Ints]:
-    """Find the frames to solve again, each starting with the change that its neighbour got.
+    """Find the frames to solve again, each starting with the change of its neighbour.
 
-    In a run with a jump, the frame with the smallest change stays as it is, and the other frames follow on it forwards
-    and backwards in time.
+    In a run with a jump, the frame with the smallest change stays as it is. From this frame on, the other frames are
+    solved one after another: first forwards in time, then backwards.
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ class Targets(NamedTuple):
     ----------
     kinds, joints : (C,) kind of each target (0 position, 1 orientation, 2 look-at), and index of the target's joint
     values : (F or 1, C, 4) position, quaternion or point to look at, in the world
-    axes : (C, 3) 1 for each coordinate of a position that counts, else 0
+    axes : (C, 3) 1 for each constrained coordinate of a target position, else 0
     directions, offsets : (C, 3) look-at axis and place of the target's point, both in the frame of the joint
     scales : (C,) factors of the errors
     """

@@ -1,10 +1,10 @@
 """Inverse kinematics: joint rotations that bring points, orientations and look-at axes to their targets.
 
-There are three solvers. Without `Neighbours`, each solves frames independently: the result for a frame does not depend
-on other frames. With them, joints move smoothly from frame to frame where the targets leave a choice. No solver returns
-a pose with a larger error than the given pose. The error is the weighted sum of the squared errors of all targets; an
-angle counts as `ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, the pose is brought within the
-limits before the comparison.
+There are three solvers. Without `Neighbours`, a solver solves frames independently: the result for a frame does not
+depend on other frames. With `Neighbours`, joints move smoothly from frame to frame, as far as the targets leave a
+choice. No solver returns a pose with a larger error than the given pose. The error is the weighted sum of the squared
+errors of all targets; an angle counts as `ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, the
+pose is brought within the limits before the comparison.
 """
 
 from __future__ import annotations
@@ -155,9 +155,9 @@ def _refuse_poles(targets: Sequence[Target]) -> None:
     for number, target in enumerate(targets):
         if isinstance(target, PositionTarget) and target.pole is not None:
             raise EditError(
-                "a pole needs the two-bone solver: a wrist or ankle whose position is constrained in all axes, no "
-                "limits, no joint above the limb that turns, and no other constraint in the same frames but an "
-                "orientation of the same joint",
+                "a pole works only with the two-bone solver; constrain the position of a wrist or ankle in all axes, "
+                "without joint limits, without turning joints above the limb, and without other constraints in the "
+                "same frames except an orientation of the same joint",
                 code="solver-unfit",
                 where=f"targets[{number}].pole",
             )

@@ -27,7 +27,10 @@ from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 @compiled
 def _far_end(limb, work):
-    """Compute the point that stays in place: the tip if the limb carries its end, otherwise the joint at its end."""
+    """Compute the position of the limb's far end, which a swivel does not move.
+
+    The far end is the target's point if the end joint keeps its local rotation, otherwise the end joint itself.
+    """
     place = vector_at(work.places, limb.end)
     if limb.ending != CARRIED:
         return place

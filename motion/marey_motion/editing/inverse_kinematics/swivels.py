@@ -2,8 +2,8 @@
 
 The closed form for two bones turns a limb from its given direction to the direction of the target, on the shortest way.
 If the two directions are nearly opposite, the shortest way leads to one side in one frame and to the other side in the
-next frame, and the middle joint flips although the end of the limb stays where it is. Here the middle joint gets a
-swivel that is near the shortest way where this way is clear, and changes slowly everywhere.
+next frame, and the middle joint flips although the end of the limb stays where it is. This module therefore adds a
+swivel that is close to the shortest way if this way is unambiguous, and that changes slowly from frame to frame.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from marey_motion.editing.inverse_kinematics.problem import IkProblem
 from marey_motion.editing.inverse_kinematics.targets import Neighbours
 
 COHERENT_RAD = 0.05
-"""Change of the swivel from one frame to the next up to which all frames of a run stay as they are."""
+"""Largest change of the swivel between two frames, in radians, at which a run of frames is not corrected."""
 LEAST_CLARITY = 1e-4
 POLE_FRAMES = 2.0
-"""Number of frames over which swivels towards a pole are evened out."""
+"""Number of frames over which swivels towards a pole are smoothed."""
 
 
 def swivel_coherently(
@@ -28,7 +28,7 @@ def swivel_coherently(
 ) -> None:
     """Swivel a solved limb so that its middle joint moves smoothly; changes the rotations of `problem`.
 
-    A run of frames in which this would not slow down the fastest moves of the limb stays as it is.
+    A run of frames stays as it is if the swivels would not slow down the fastest movement of the limb in this run.
 
     Parameters
     ----------
@@ -68,9 +68,10 @@ def swivel_coherently(
 
 
 def _restlessness(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floats, Floats]:
-    """Compute how far, in radians per frame (F - 1,), the upper bone moves in the world, and its joint turns.
+    """Compute two speeds (F - 1,), in radians per frame: of the upper bone in the world, and of its joint in the limb.
 
-    The first does not see a twist of a straight limb, the second does not see a turn of the body.
+    The speed of the bone does not include a twist of a straight limb. The speed of the joint, computed from its local
+    rotation, does not include a rotation of the body.
     """
     from marey_motion.editing.inverse_kinematics import swivel_kernels
 
@@ -82,10 +83,10 @@ def _restlessness(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Flo
 
 
 def _even_swivels(wished: Floats, jumps: Floats, clear: Floats, reach: float) -> Floats:
-    """Compute swivels (n,) near the wished ones, with which the change of the limb varies slowly.
+    """Compute swivels (n,) near the wished swivels, with which the change of the limb varies slowly.
 
-    Minimises Σ c (a - w)² + reach² Σ (Δa + jump)² over the swivels a; the wished swivels w are angles on a circle, and
-    c is how clear they are. Everything is in radians.
+    Minimises Σ c (a - w)² + reach² Σ (Δa + jump)² over the swivels a. The wished swivels w are angles on a circle; the
+    weights c, from 0 to 1, are small if a wished swivel is ambiguous. All angles are in radians.
     """
     from scipy.linalg import solveh_banded
 
@@ -103,7 +104,11 @@ def _even_swivels(wished: Floats, jumps: Floats, clear: Floats, reach: float) ->
 
 
 def _unwrapped(angles: Floats, clear: Floats) -> Floats:
-    """Add full turns to angles (n,), so that each clear angle is within half a turn of the clear angle before it."""
+    """Add full turns to angles (n,), so that each angle with enough weight is within half a turn of the last such
+    angle before it.
+
+    The weights are `clear` (n,). Angles with less weight are not compared.
+    """
     told = np.flatnonzero(clear >= min(0.05, float(clear.max())))
     turns = np.round(np.diff(angles[told]) / (2.0 * np.pi))
     full = np.zeros(len(angles))

@@ -250,7 +250,7 @@ class Neighbours:
 
     @property
     def runs(self) -> tuple[tuple[int, int], ...]:
-        """Ranges [start, stop) of rows whose frames follow on each other."""
+        """Ranges [start, stop) of indices into `frames` whose frame numbers are consecutive."""
         borders = [0, *(np.flatnonzero(np.diff(self.frames) != 1) + 1).tolist(), len(self.frames)]
         return tuple(pairwise(borders))
 

@@ -52,8 +52,8 @@ def damped_bend(angle, wished, zone):
 
     Kovar et al. (2002), section 5.2; all angles are in radians.
 
-    In the last `zone` radians before the limb is straight, the change is weighted by a cubic that falls from 1 to 0; so
-    it is in the last `zone` radians before the limb is folded.
+    In the last `zone` radians before the limb is straight, and in the last `zone` radians before it is folded, the
+    change is weighted by a cubic that falls from 1 to 0.
     """
     if wished < angle and wished < zone:
         return math.pi - damped_bend(math.pi - angle, math.pi - wished, zone)

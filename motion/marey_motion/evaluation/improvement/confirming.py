@@ -1,4 +1,4 @@
-"""Confirmation of suggestions: their effects are measured in replicates that had no part in choosing them."""
+"""Confirmation of suggestions: their effects are measured in replicates from which no suggestion was chosen."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Confirmed:
-    """Effects that were measured in replicates without a part in the choice of the suggestions.
+    """Effects of suggestions, measured in replicates from which no suggestion was chosen.
 
-    The probabilities of each metric are corrected for the number of all these effects together; intervals are not.
+    The probabilities of each metric are corrected for the total number of these effects; the intervals are not.
 
     Parameters
     ----------
-    chance : standard deviation of each headline metric of the unchanged set over these replicates
+    chance : standard deviation of each headline metric over these replicates, for the unchanged set
     unused : effect of removing all unused clips; None if there are none
     ranges : effect of removing all unused clips and ranges, compared with the unchanged set; None if there are none
     plan : planned removals with their confirmed effects
@@ -67,17 +67,17 @@ def confirm(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> Confirmed | None:
-    """Measure the effects of suggestions in other replicates than those from which they were chosen.
+    """Measure the effects of suggestions in replicates from which no suggestion was chosen.
 
     Parameters
     ----------
     database : MatchingDatabase    the set
     result : EvaluationResult    its evaluation
     how : SuggestionOptions    number and seed of the replicates
-    unused : Unused    what no trial needs
+    unused : Unused    data that no trial needs
     plan : sequence of PlannedRemoval    removals from the set without its unused clips
     additions : sequence of Addition    clips to add, in order
-    collections : mapping of str to MatchingDatabase    where these clips come from, by name
+    collections : mapping of str to MatchingDatabase    collections that contain the clips to add, by name
     threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -142,14 +142,14 @@ class _Stages:
         self._report(1000 * self._ended + 1000 * done // max(total, 1), 1000 * self._count, note)
 
     def next(self, found: Value) -> Value:
-        """Report the end of the current simulation; return what it found."""
+        """Report the end of the current simulation, and return its result `found`."""
         self._ended += 1
         self._report(1000 * self._ended, 1000 * self._count, "")
         return found
 
 
 def _to_simulate(additions: Sequence[Addition], most: int) -> list[Addition]:
-    """Choose the first additions of the set's skeleton; a clip that is in two collections is simulated once."""
+    """Choose the first `most` additions that have the set's skeleton; of a clip in two collections, only the first."""
     same = {step.filling.source: step for step in reversed(additions) if not step.filling.needs_retarget}
     return [step for step in additions if same.get(step.filling.source) is step][:most]
 
@@ -157,7 +157,7 @@ def _to_simulate(additions: Sequence[Addition], most: int) -> list[Addition]:
 def _with_added(
     database: MatchingDatabase, steps: Sequence[Addition], collections: Mapping[str, MatchingDatabase]
 ) -> MatchingDatabase:
-    """Return a database of the set and of the clips that some steps add."""
+    """Return a database of the set together with the clips that `steps` add."""
     for name in dict.fromkeys(step.filling.collection for step in steps):
         wanted = {step.filling.source for step in steps if step.filling.collection == name}
         other = collections[name]
@@ -168,7 +168,7 @@ def _with_added(
 def _addition_effects(
     confirming: Resimulation, how: SuggestionOptions, steps: Sequence[Addition], outside: Sources, stages: _Stages
 ) -> list[Effect]:
-    """Measure the effect of each addition, not corrected; `outside` are the sources of all additions."""
+    """Measure the effect of each addition, with uncorrected probabilities; `outside` are the sources to be added."""
     states = [outside]
     for step in steps:
         states.append(states[-1] - {step.filling.source})
@@ -181,7 +181,10 @@ def _addition_effects(
 def _plan_effects(
     confirming: Resimulation, how: SuggestionOptions, plan: Sequence[PlannedRemoval], gone: Sources, stages: _Stages
 ) -> list[Effect]:
-    """Measure the effect of each removal of a plan, not corrected; `gone` are the sources absent before the first."""
+    """Measure the effect of each removal of a plan, with uncorrected probabilities.
+
+    `gone` are the sources that are absent before the first removal.
+    """
     effects = []
     for step in plan:
         after = gone | {step.removal.source}
@@ -191,5 +194,5 @@ def _plan_effects(
 
 
 def _with_effects(steps: Sequence[Step], effects: Iterator[Effect]) -> tuple[Step, ...]:
-    """Return the steps with the next effects, one for each."""
+    """Return copies of the steps with their confirmed effects, of which each step takes the next one of `effects`."""
     return tuple(replace(step, confirmed=next(effects)) for step in steps)

@@ -1,7 +1,7 @@
 """Effects of changes of a set of clips on its trials: estimated in some replicates, confirmed in others.
 
-The best of many candidates is also the luckiest. So an effect that was the reason for a choice says
-too much, and must be measured again in replicates that had no part in the choice.
+If the best of many candidates is chosen by its estimated effect, the estimate is probably too large (selection bias).
+So the effect is measured again in replicates that were not used for the choice.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ Replicates = Sequence[Sequence[TrialResult]]
 
 @dataclass(frozen=True)
 class Effect:
-    """Effect of one change of a set of clips, over replicates that are paired.
+    """Effect of one change of a set of clips: the differences between replicates before and after it, paired by number.
 
     Parameters
     ----------
-    objective : change of the objective, metres; its term for the amount of data is left out where a saving of data is
-        stated beside it
+    objective : change of the objective, metres; without its term for the amount of data, unless the effect was computed
+        with amounts of data
     headlines : change of each headline metric, by name, in its unit
     """
 
@@ -38,7 +38,7 @@ class Effect:
 
     @property
     def improves(self) -> bool:
-        """Whether the objective falls by more than chance explains; False, too, if there are too few replicates."""
+        """True if the objective falls by more than chance explains; False also if there are too few replicates."""
         return self.objective.verdict == "better"
 
 
@@ -57,19 +57,19 @@ def estimation_replicates(options: ConfirmedEffects) -> range:
 
 
 def confirmation_replicates(options: ConfirmedEffects, evaluation: EvaluationOptions, turn: int = 0) -> range:
-    """Return the numbers of the replicates in which effects are confirmed; they had no part in any choice.
+    """Return the numbers of the replicates in which effects are confirmed; no choice was based on these replicates.
 
-    All replicates of the evaluation have a part in choices, because unused clips are those that none of them shows.
+    All replicates of the evaluation are excluded, because unused clips are those that no replicate displays.
 
     Parameters
     ----------
     options : ConfirmedEffects    how many
     evaluation : EvaluationOptions    options of the evaluation whose set is improved
-    turn : int    0 for the first confirmation, 1 for one in yet other replicates
+    turn : int    0 for the first confirmation, 1 for a second confirmation in different replicates
 
     Returns
     -------
-    range    numbers that neither the estimate nor the evaluation uses, whatever the seeds are
+    range    numbers of replicates; neither the estimate nor the evaluation uses them
     """
     chosen_from = max(options.estimation_replicates, evaluation.replicates)
     first = chosen_from + turn * options.confirmation_replicates
@@ -152,7 +152,7 @@ def corrected_for(effect: Effect, tried: int) -> Effect:
 
     Returns
     -------
-    Effect    with all probabilities times this number, at most 1; intervals stay those of a single effect
+    Effect    with all probabilities multiplied by `tried`, at most 1; intervals are not corrected
     """
 
     def raised(change: MetricChange) -> MetricChange:

@@ -1,4 +1,4 @@
-"""Poses that a set of clips loses with its clips: those that look like no pose of the clips that remain."""
+"""Poses that a set loses if clips are removed: poses that look like no pose of the remaining clips."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from marey_motion.matching.database import MatchingDatabase
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_POSES = 4_000
-"""Number of poses of a set that are compared with all others; of a larger set, every k-th pose of each clip is."""
+"""Maximum number of poses that are compared with all other poses of a set.
+
+If the set has more poses, every k-th pose of each clip is compared.
+"""
 
 
 class LostPoses:
@@ -93,7 +96,7 @@ class LostPoses:
         Parameters
         ----------
         source : str    uid of the clip
-        removed : collection of str    uids of the clips that do not remain; the clip itself does not either
+        removed : collection of str    uids of the removed clips; the clip itself counts as removed, too
 
         Returns
         -------

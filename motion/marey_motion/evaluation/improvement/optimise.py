@@ -26,10 +26,10 @@ End = Literal["no gain", "not confirmed", "steps", "evaluations"]
 ProgressCallback = Callable[[int, int, str], None]
 
 CONFIRMED_AT_ONCE = 3
-"""Number of candidates of one step, the best first, that are simulated again until one is confirmed.
+"""Maximum number of candidates of one step that are simulated again, the best first, until one is confirmed.
 
-The best is sometimes luck, and then the next may be real. Each further one raises the bar for all, because with many
-tries chance would confirm one.
+If the gain of the best candidate was due to chance, that of the next candidate may be real. But the probabilities are
+corrected for this number, so a larger number makes every confirmation harder.
 """
 
 
@@ -46,8 +46,8 @@ class OptimisationStep:
     data_s : seconds of data after the step
     evaluations : number of candidates tried, over all steps so far
     changed_trials : trials whose result the step changes, in any replicate of the estimate
-    confirmed : effect of the step in other replicates, its probabilities corrected for the number of candidates that
-        could be confirmed; None if no step is confirmed, and for the start
+    confirmed : effect of the step in other replicates, with probabilities corrected for the number of candidates that
+        could be confirmed; None for the start, and None for all steps if the optimisation confirms no steps
     """
 
     number: int
@@ -67,7 +67,7 @@ class Unconfirmed:
     """A candidate of a step whose estimated gain was not confirmed in other replicates, so that it was not applied.
 
     The probabilities of `effect` are corrected for the number of candidates of the step that could be confirmed; its
-    interval is not. So a refused effect can have an interval without 0.
+    interval is not corrected. So the interval of a refused effect can exclude 0.
     """
 
     action: Action
@@ -111,7 +111,7 @@ def optimise(
     options : OptimisationOptions    objective and budget
     confirming : Resimulation, optional    the same trials in other replicates; without it, no step is confirmed, and
         the estimated gain decides
-    absent : collection of str    sources that may be added; all other sources are the set
+    absent : collection of str    sources that may be added; the set at the start consists of all other sources
     log : sequence of OptimisationStep    earlier steps to continue from; `absent` must then list the sources that were
         absent before the first of these steps
     made : callable, optional    called with every new step
@@ -198,7 +198,7 @@ def _require_same(simulation: Resimulation, options: OptimisationOptions, last: 
 
 
 class _Candidate(NamedTuple):
-    """A set to move to, and its estimated gain in metres."""
+    """A changed set of clips that a step can choose, and its estimated gain: the decrease of the objective, metres."""
 
     gain: float
     action: Action
@@ -273,7 +273,10 @@ class _Search:
         return corrected_for(effect, tried)
 
     def _is_certain(self, before: Sources, one: _Candidate, effect: Effect) -> bool:
-        """Check whether a candidate saves data and changes no metric of any trial, so that its gain has no chance."""
+        """Check whether a candidate lowers the objective without a change in any trial.
+
+        The gain of such a candidate does not depend on chance.
+        """
         return effect.objective.change < 0.0 and all(
             simulation.results(before) == simulation.results(one.absent)
             for simulation in (self._simulation, self._confirming)

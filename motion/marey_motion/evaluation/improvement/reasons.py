@@ -44,7 +44,7 @@ def why_unused_range(part: UnusedRange) -> str:
 
 
 def why_unused_again(effect: Effect) -> str:
-    """State what the removal of all unused data does in replicates that the evaluation did not contain.
+    """Describe the effect of removing all unused data, in replicates that the evaluation did not contain.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def why_redundant(removal: Removal, trials: int, confirmed: Effect | None = None
 
 
 def _estimate_in_words(effect: Effect) -> str:
-    """Describe an effect that was the reason for a choice, and is therefore probably too large."""
+    """Describe an estimated effect that was not confirmed in other replicates."""
     change = effect.headlines["offset_mean"]
     return (
         f"the mean distance from the path seems to change by {100 * change.change:+.2f} cm{_interval(change)}, which "

@@ -26,9 +26,10 @@ class Removal:
     harm : estimated change of the objective without its term for the amount of data, metres; negative if the removal
         helps. With a perceptual metric, the price of the poses that the removal loses is added
     harm_per_s : `harm` per second of data saved; removals are ranked by this number, the least harmful first
-    lost_s : seconds of poses, of this clip and of those removed before, that look like a pose of this clip, but of no
-        clip that remains; None without a metric
-    replaced_share : share of the clip's poses that look like a pose of the clips that remain; None without a metric
+    lost_s : seconds of poses that the removal loses, because they look like no pose of the remaining clips; poses lost
+        by earlier removals are not counted. None without a perceptual metric
+    replaced_share : share of the clip's poses that look like a pose of the remaining clips; None without a perceptual
+        metric
     """
 
     source: str
@@ -44,7 +45,10 @@ class Removal:
 
 @dataclass(frozen=True)
 class Appearance:
-    """Part of the harm of removals besides the trials: the poses that they lose, and the price of a second of them."""
+    """Comparison of poses by a perceptual metric, and the price of lost poses, in metres of the objective per second.
+
+    The price of the poses that a removal loses is added to the harm of the removal.
+    """
 
     poses: LostPoses
     price_m_per_s: float

@@ -44,7 +44,7 @@ NONE: Sources = frozenset()
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a run of a trial over some clips, and the source clips whose rows it displayed or chose."""
+    """Result of one run of a trial over some clips, and the source clips whose rows the run displayed or chose."""
 
     result: TrialResult
     needed: Sources

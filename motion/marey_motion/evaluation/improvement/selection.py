@@ -153,7 +153,7 @@ def without_rows(database: MatchingDatabase, removed: Flags) -> MatchingDatabase
 def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: Flags) -> MatchingDatabase:
     """Return a database with only `clips`; `kept` (N,) marks the rows of these clips in the given database."""
     if not clips:
-        raise MotionError("no clip is left", code="no-clips")
+        raise MotionError("no clip is left in the database; keep at least one clip", code="no-clips")
     before = np.concatenate(([0], np.cumsum(kept)))
     return replace(
         database,

@@ -60,7 +60,7 @@ class Suggestions:
     unused : data whose removal changes no trial
     redundant : all clips that were tried, ranked by the harm of their removal per second saved
     plan : a sequence of removals from the set without its unused clips, with confirmed effects
-    confirmed : effects that were measured in replicates without a part in the choice
+    confirmed : effects, measured in replicates from which no suggestion was chosen
     spared : near-duplicates to remove, each with the pair to which it belongs; the other clip of the pair stays
     fillings, additions : clips of other collections that fill holes. In `fillings`, each is measured alone; `additions`
         is a sequence in which each is measured after all earlier clips were added
@@ -165,7 +165,7 @@ def _simulation(
     threads: int | None,
     cancelled: CancelCallback | None,
 ) -> Resimulation:
-    """Return a simulation of the replicates in which effects are estimated; it knows the records of the evaluation."""
+    """Make a simulation of the replicates in which effects are estimated; the evaluation's records are reused."""
     return Resimulation(
         database,
         result.options,
@@ -178,7 +178,7 @@ def _simulation(
 
 
 def _unused(simulation: Resimulation, result: EvaluationResult) -> Unused:
-    """Find what no trial needs. Records are those of the first replicates only; the usage is that of all."""
+    """Find the data that no trial needs, from the records of the first replicate and the usage over all replicates."""
     shown = np.concatenate([use.popularity > 0 for use in result.usage])
     return find_unused(
         simulation.database,
@@ -193,14 +193,14 @@ def _unused(simulation: Resimulation, result: EvaluationResult) -> Unused:
 def _spared(
     database: MatchingDatabase, result: EvaluationResult, duplicates: NearDuplicates, metric: MetricDocument | None
 ) -> tuple[tuple[str, NearDuplicate], ...]:
-    """Choose the clip of each pair of near-duplicates that may be removed, by its use."""
+    """Choose the clip that can be removed from each pair of near-duplicates: the one that the trials use less."""
     ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
     most = np.inf if metric is None else indistinguishable(metric)
     return spared_sources(database, duplicates, ticks, most_perceived=most)
 
 
 def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: PerceivedRows | None) -> float:
-    """Return the greatest distance of poses that can be blended: in metres, or that of the metric."""
+    """Return the greatest distance of poses that can be blended: in metres or, if there is a metric, in its unit."""
     if seen is None:
         return how.blendable_m or accepted_distance(result.records) or USUAL_BLENDABLE_M
     return how.blendable_distance or seen.transitions(result.switches).median or indistinguishable(seen.document)
@@ -213,7 +213,7 @@ def _appearance(
     threshold: float,
     stages: _SuggestionStages,
 ) -> Appearance | None:
-    """Compare the poses of all clips by the metric, if one was chosen."""
+    """Compare the poses of all clips by the perceptual metric; None if no metric was chosen."""
     if seen is None:
         return None
     return Appearance(LostPoses(database, seen, threshold, **stages.watch("lost poses")), how.lost_pose)

@@ -99,7 +99,7 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
 
 
 def _unused_effects(confirmed: Confirmed | None) -> Tree:
-    """Describe what the removal of unused clips, and of unused ranges as well, does in other replicates."""
+    """Convert two confirmed effects: of removing all unused clips, and of removing all unused clips and ranges."""
     effects = (
         {"clips": None, "ranges": None}
         if confirmed is None
@@ -125,7 +125,7 @@ def _duplicates_to_tree(suggestions: Suggestions) -> Tree:
 
 
 def _pair_to_tree(pair: NearDuplicate) -> Tree:
-    """Convert a pair; without a metric, it has no perceptual distance."""
+    """Convert a pair of near-duplicates; without a perceptual metric, the field `perceived` is left out."""
     tree = asdict(pair)
     if pair.perceived is None:
         del tree["perceived"]
@@ -162,7 +162,7 @@ def _redundant_to_tree(suggestions: Suggestions) -> Tree:
 
 
 def _removal_to_tree(removal: Removal) -> Tree:
-    """Convert a removal; without a metric, it has no lost poses."""
+    """Convert a removal; without a perceptual metric, the fields about lost poses are left out."""
     tree: Tree = _plain(removal)
     return {name: value for name, value in tree.items() if value is not None}
 
@@ -170,7 +170,8 @@ def _removal_to_tree(removal: Removal) -> Tree:
 def _similarity_to_tree(similarity: PoseSimilarity) -> Tree:
     """Convert a similarity to plain values. NaN, in cells without frames or with only one source, is written as 0.
 
-    The names of distances in metres say so; distances of a metric come with its name and digest.
+    Distances in metres have names that end in `_m`. Distances of a perceptual metric have names without this ending,
+    and the field `metric` contains the metric's name and digest.
     """
     values = {field.name: getattr(similarity, field.name) for field in fields(similarity)}
     metric = values.pop("metric")

@@ -102,15 +102,16 @@ def sweep_weights(
 ) -> tuple[SweepRow, ...]:
     """Run the suite with each setting of the weights; the features and their standard deviations stay the same.
 
-    Each setting also runs in the replicates of the confirmation, because the best settings are known only when all have
-    ended, which may be in other tasks. Progress counts runs of trials over all settings.
+    Each setting also runs in the replicates of the confirmation, because the best settings are known only after all
+    settings have run, and settings may be divided among several tasks. Progress counts runs of trials over all
+    settings.
 
     Parameters
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     settings : sequence of FeatureWeights    weights to try
-    how : SweepOptions    measure of the result, and replicates
+    how : SweepOptions    objective that rates each setting, and replicates
     trials : sequence of Trial, optional    trials to run; all trials of the suite if None
     threads : int, optional    number of trials to run at once
     progress : callable, optional    called as progress(done, total, name)

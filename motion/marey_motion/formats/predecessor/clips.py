@@ -106,7 +106,7 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
     if clip.translated_joints:
         raise FormatError(
             "clips in the predecessor's format contain only rotations, but this joint also moves relative to "
-            "its parent",
+            "its parent; choose another format",
             code="translations-unsupported",
             joint=skeleton.joint_names[clip.translated_joints[0]],
         )
@@ -162,7 +162,7 @@ def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArra
         frame_time_s = field_of(document, "frameTime", (int, float), file)
     repeated = next((name for name, count in Counter(names).items() if count > 1), None)
     if repeated is not None:
-        raise FormatError("the joint sequence contains the joint twice", file=file, joint=repeated)
+        raise FormatError("the joint sequence contains this joint twice; remove one entry", file=file, joint=repeated)
     width = 3 + 4 * len(names)
     if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < width:
         raise FormatError(
@@ -170,7 +170,9 @@ def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArra
         )
     # Some writers counted the tips of chains as joints and filled their columns with zeros.
     if poses[:, width:].any():
-        raise FormatError(f"the poses have {poses.shape[1]} columns, but {len(names)} joints need {width}", file=file)
+        raise FormatError(
+            f"the poses have {poses.shape[1]} columns, but {len(names)} joints need {width} columns", file=file
+        )
     return names, poses[:, :width], float(frame_time_s)
 
 

@@ -1,4 +1,4 @@
-"""Credentials in records of work: found by names of fields, variables and options, which are compared word by word."""
+"""Detection of credentials in records of work, by the words in the names of fields, variables and options."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _WORDS = {
 _PAIRS = {(first, key) for first in ("api", "access", "private") for key in ("key", "keys")}
 _WHOLE = ("tokens",)  # alone, for `n_tokens` is a number of words
 _HINTS = ("token", "pass", "pwd", "secret", "credential", "auth", "key", "bearer", "@")
-"""Texts of which at least one is in each text that contains a credential, in small letters."""
+"""Every text that contains a credential contains one of these strings, if converted to lower case."""
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 # Quantifiers are possessive, so that the search takes linear time.
 _NAME = re.compile(r"-{0,2}\w[\w.-]*+")
@@ -29,7 +29,7 @@ def is_secret_name(name: object) -> bool:
 
     Parameters
     ----------
-    name : object    the name; anything but a text is none
+    name : object    the name; a value that is not a text is never the name of a credential
 
     Returns
     -------
@@ -44,7 +44,7 @@ def is_secret_name(name: object) -> bool:
 
 
 def has_text(value: Any) -> bool:
-    """Check whether a value is a text or contains one; empty texts do not count, bytes are texts.
+    """Check whether a value is, or contains at any depth, a text that is not empty; bytes count as a text.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def tells_credential(text: str) -> bool:
 
     Returns
     -------
-    bool    True if it contains one
+    bool    True if the text contains a credential
 
     Examples
     --------
@@ -90,7 +90,7 @@ def tells_credential(text: str) -> bool:
 
 
 def is_secret_list(values: Sequence[Any]) -> bool:
-    """Check whether a list contains a credential after its name, which is its first text or an option.
+    """Check whether a list contains the name of a credential, as first entry or as an option, followed by its value.
 
     Parameters
     ----------
@@ -118,7 +118,10 @@ def _is_secret(words: Sequence[str]) -> bool:
 
 
 def _is_given(name: str, value: str) -> bool:
-    """Return whether a text gives a credential; a number is one only if the name ends so, as in `PASSWORD=12`."""
+    """Return whether a name and its value are a credential.
+
+    A whole number counts only if the name ends with a word for a credential: `PASSWORD=12`, but not `TOKEN_COUNT=12`.
+    """
     words = _words_of(name)
     if value.isdigit() and words and words[-1] not in _WORDS and tuple(words[-2:]) not in _PAIRS:
         return False

@@ -56,7 +56,7 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
 
 
 def decode_content(data: bytes, file: str) -> dict[str, Any] | list[Any]:
-    """Decode a file that contains a document or, in JSON, a list; otherwise as `decode_document`.
+    """Decode a file like `decode_document`, but accept a JSON list as well as a document.
 
     Parameters
     ----------

@@ -86,7 +86,7 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
         for model_id, node in field_of(nodes, action, dict, file).items():
             place = (action, field_of(node, "name", str, file))
             if place in places:
-                raise FormatError(f"action {action}: two nodes are called {place[1]!r}", file=file)
+                raise FormatError(f"action {action}: two nodes are called {place[1]!r}; rename one", file=file)
             if len(places) == MOST_PRIMITIVES:
                 raise FormatError(f"the graph has more than {MOST_PRIMITIVES} nodes", file=file)
             places.add(place)
@@ -101,9 +101,9 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
 
 
 def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "json") -> bytes:
-    """Write a graph; the start node, an action and the name of a model, is written as `start_node` and `startNode`.
+    """Write a graph, with the action and the model name of its start node.
 
-    Some programs read the one field, others the other.
+    The start node is written twice, as `start_node` and as `startNode`, since programs read different fields.
 
     Parameters
     ----------

@@ -256,10 +256,17 @@ def _animated(parts: ModelParts, basis: SplineBasis, mean: Floats, skeleton: Ske
         raise FormatError(message, code="joints-mismatch", file=file)
     repeated = next((name for name, count in Counter(animated).items() if count > 1), None)
     if repeated is not None:
-        raise FormatError("field 'animated_joints' contains the joint twice", file=file, joint=repeated)
+        raise FormatError(
+            "field 'animated_joints' contains this joint twice; remove one entry", file=file, joint=repeated
+        )
     unknown = next((name for name in animated if name not in skeleton), None)
     if unknown is not None:
-        raise FormatError("the skeleton has no joint of this name", code="joints-mismatch", file=file, joint=unknown)
+        raise FormatError(
+            "the skeleton has no joint of this name; use the skeleton of this model",
+            code="joints-mismatch",
+            file=file,
+            joint=unknown,
+        )
     if (np.linalg.norm(basis.at_frames @ mean[:, 3:], axis=1) == 0).any():
         raise FormatError("the mean motion has frames whose rotations are all zero", code="model-invalid", file=file)
     return animated

@@ -104,9 +104,9 @@ def _layered_document(
 def _flat_document(
     primitive: MotionPrimitive, animated_joints: tuple[str, ...], time: PredecessorTime | None
 ) -> dict[str, Any]:
-    """Convert a primitive to layout 2; its time function has the form `increments`, unless one of the other is given.
+    """Convert a primitive to layout 2, with the time function `time` or, if it is None, one in the form `increments`.
 
-    The form follows from the components: they are columns of the form `increments`, and rows of the form
+    Readers recognise the form by the layout of the components: columns in the form `increments`, rows in the form
     `coefficients`.
     """
     mean, vectors = _space(primitive, animated_joints)

@@ -1,6 +1,7 @@
 """Records of work with Marey's predecessor: jobs, runs of data transforms, histories of edits, and synthesis inputs.
 
-Marey carries none of them out. It keeps the files, and shows their fields. The forms are
+Marey only stores these files and shows their fields; it does not run the jobs, transforms, edits or syntheses. A record
+has one of four forms:
 
 * a job on a cluster, `{"image_name", "job_name", "job_desc", "resources", "user", "token"}`;
 * a run of a data transform, `{"data_transform_id", "exp_name", "input_data", "hparams", ...}`;
@@ -25,7 +26,7 @@ _MEMBERS: dict[RecordForm, tuple[str, ...]] = {
     "transform run": ("data_transform_id", "input_data"),
     "synthesis input": ("elementaryActions",),
 }
-"""Members by which a document of each form is recognised; a history of edits is a list."""
+"""Members that identify the form of a document; the fourth form, a history of edits, is identified as a list."""
 _GREATEST_WHOLE = 2**53  # greater ones are not exact in all readers of JSON
 
 
@@ -35,9 +36,9 @@ class RecordFields:
 
     Parameters
     ----------
-    shown : values by their JSON Pointers; a list of plain values is one text
-    left_out : number of further values
-    credentials : JSON Pointers of the values that are hidden
+    shown : values by their JSON Pointers; a list of plain values is shown as one text
+    left_out : number of values that are not shown, because there are too many or their pointer is too long
+    credentials : JSON Pointers of the values that are hidden, because they contain credentials
     """
 
     shown: Mapping[str, FieldValue]
@@ -72,7 +73,7 @@ def fields_of_record(content: Any) -> RecordFields:
 
     Returns
     -------
-    RecordFields    what is shown of it
+    RecordFields    the fields to show
     """
     shown: dict[str, FieldValue] = {}
     credentials: list[str] = []
@@ -92,7 +93,7 @@ def _is_command(entry: Any) -> bool:
 
 
 def _values(content: Any) -> Iterator[tuple[str, Any, bool]]:
-    """Yield pointer and value of each field in the order of the document, and whether it is a credential."""
+    """Yield, in the order of the document, each field's pointer, its value, and whether the value is a credential."""
     waiting: list[tuple[str, Any, bool | None]] = [("", content, False)]
     while waiting:
         pointer, value, is_named = waiting.pop()
@@ -111,14 +112,14 @@ def _values(content: Any) -> Iterator[tuple[str, Any, bool]]:
 
 
 def _secrets_of(value: Mapping[str, Any]) -> set[str]:
-    """Return the keys of credentials; in `{"name": "DB_PASSWORD", "value": ...}`, it is the value."""
+    """Return the keys whose values are credentials; for `{"name": "DB_PASSWORD", "value": ...}`, this is "value"."""
     names = {key.lower(): one for key, one in value.items() if isinstance(one, str)}
     is_variable = is_secret_name(names.get("name")) or is_secret_name(names.get("key"))
     return {key for key in value if is_secret_name(key) or (is_variable and key.lower() == "value")}
 
 
 def _is_secret(value: Any) -> bool:
-    """Return whether a text, or a list of plain values or of a name and values, contains a credential."""
+    """Return whether a value contains a credential: in a text, or in a list as a text or after its name."""
     if isinstance(value, str):
         return tells_credential(value)
     if not isinstance(value, list):
@@ -133,13 +134,13 @@ def _is_row(value: Any) -> bool:
 
 
 def _pointer_to(pointer: str, key: object) -> str:
-    """Return the pointer of a member; it is cut off where it is too long to be shown."""
+    """Return the JSON Pointer of a member; a pointer that is too long to be shown is cut off."""
     name = plain_text(str(key)[:LONGEST_TEXT]).replace("~", "~0").replace("/", "~1")
     return f"{pointer}/{name}"[: LONGEST_TEXT + 1]
 
 
 def _shown(value: Any) -> FieldValue:
-    """Return a value as JSON can contain it; a value that it cannot contain is shown as text."""
+    """Return a value that JSON can represent exactly; any other value is converted to text."""
     if value is None or isinstance(value, bool):
         return value
     if isinstance(value, int) and abs(value) <= _GREATEST_WHOLE:

@@ -9,7 +9,7 @@ from marey_schemas.formats import EndIndex
 
 SECTIONS = "sections"
 LAST_FRAME = -1
-"""Number by which documents name the last frame of a clip or model, whatever its number is."""
+"""Number that documents write for the last frame of a clip or model, instead of the number of this frame."""
 
 
 def section_range(section: Any, frame_count: int, end_index: EndIndex, file: str) -> tuple[int, int]:
@@ -18,7 +18,7 @@ def section_range(section: Any, frame_count: int, end_index: EndIndex, file: str
     Parameters
     ----------
     section : mapping    the section
-    frame_count : int    frames of the clip, where a section ends whose `end_idx` is -1
+    frame_count : int    frames of the clip; a section whose `end_idx` is -1 extends to the end of the clip
     end_index : str    "inclusive" if the last frame of a section is `end_idx`, else "exclusive"
     file : str    name of the file, for messages
 
