@@ -108,9 +108,9 @@ def refusal_of(error: MotionError) -> Refusal:
 
 
 def _storable(found: ImportedFile) -> ImportedFile:
-    """Give the messages the form in which they can be stored; documents are checked where they are encoded.
+    """Shorten the messages of an import, and replace characters in them that UTF-8 cannot encode.
 
-    Raises `UnicodeError` if the graph contains a name that cannot be stored.
+    Raises `UnicodeError` if the graph contains a name that UTF-8 cannot encode.
     """
     if found.graph is not None:
         for (action, name), node in found.graph.graph.nodes.items():

@@ -1,6 +1,6 @@
 """Skeleton documents of Marey's predecessor: the form in the database, and the form inside files and models.
 
-The database form lists joints (`jointDescs`) and is mirrored in x, like the clips in the data base. The file form
+The database form lists joints (`jointDescs`) and is mirrored in x, like the predecessor's clips. The file form
 nests nodes under `root` and is right-handed. Both are in centimetres. Nodes without children are tips of chains, not
 joints.
 """

@@ -138,8 +138,8 @@ def _inner(document: Mapping[str, Any]) -> Mapping[str, Any]:
 def _known(joint: Any, skeleton: Skeleton, name: str, file: str) -> str:
     if not isinstance(joint, str) or joint not in skeleton:
         raise FormatError(
-            f"field {name!r} of the skeleton model names a joint that the skeleton does not have; import it with the "
-            "skeleton that it was made for",
+            f"field {name!r} of the skeleton model names a joint that the skeleton does not have; import the skeleton "
+            "model with the skeleton for which it was made",
             code="joints-mismatch",
             file=file,
             joint=str(joint),
