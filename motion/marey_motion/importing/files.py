@@ -45,9 +45,7 @@ _LONGEST_MESSAGE = 4000
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
-    """Make the entry, in the result of the import, for a file that is not read on its own.
-
-    Such a file is the companion of another file, or is refused by the plan.
+    """Make the result entry of a file that is not read on its own, because it is a companion or refused by the plan.
 
     Parameters
     ----------

@@ -88,7 +88,7 @@ class ImportedItem:
 
 @dataclass(frozen=True)
 class ImportedGraph:
-    """Graph whose models are not looked up yet; looking them up requires the project (see `importing.graphs`)."""
+    """Graph whose nodes are not linked to models of the project yet (`importing.graphs` links them)."""
 
     name: str
     collection: str
@@ -165,7 +165,7 @@ def _skeleton_name(anatomy: Anatomy) -> str:
 
 
 def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str, Tree]) -> ImportedItem:
-    """Make the main item of a file, with the file's name, in the user's collection, with the user's tags.
+    """Make the main item of a file, with the collection and the tags that the import options determine.
 
     Parameters
     ----------

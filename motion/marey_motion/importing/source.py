@@ -140,7 +140,7 @@ class SourceInfo:
 
 @dataclass(frozen=True, eq=False)
 class ImportedMotion:
-    """A file in Marey's convention: metres, Y up, right-handed.
+    """Content of a file, converted to Marey's convention: metres, Y up, right-handed.
 
     Parameters
     ----------
