@@ -116,7 +116,7 @@ def _imported_record(file: FileToImport, document: Mapping[str, Any]) -> Importe
 
 
 def model_checks(found: PredecessorModel) -> tuple[Tree, ...]:
-    """List what was changed in a model.
+    """List the changes that the import made to a model.
 
     Parameters
     ----------

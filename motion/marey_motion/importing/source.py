@@ -96,7 +96,7 @@ class SourceDocument:
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """Record of the findings and changes of an import, kept with the clip.
+    """Record of the findings and changes of an import, stored with the clip.
 
     Parameters
     ----------

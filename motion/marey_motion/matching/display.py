@@ -75,7 +75,7 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
 def displayed_points(
     database: MatchingDatabase, rows: NDArray[np.int32], chain: JointChain, options: ControllerOptions
 ) -> Floats:
-    """Compute where joints are displayed, with the remaining offsets of earlier switches.
+    """Compute the displayed positions of joints, including the remaining offsets of earlier switches.
 
     Parameters
     ----------

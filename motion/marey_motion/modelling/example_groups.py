@@ -51,7 +51,7 @@ class ExampleGroups:
 
     @classmethod
     def alone(cls, count: int) -> ExampleGroups:
-        """Make groups of examples that were all recorded in takes of their own.
+        """Make groups in which each example is a take of its own.
 
         Parameters
         ----------

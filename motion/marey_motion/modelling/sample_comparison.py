@@ -50,7 +50,7 @@ def compare_samples(
     Parameters
     ----------
     primitive : MotionPrimitive    the model
-    poses : (m, N, D) float64    poses of the examples, with consistent signs
+    poses : (m, N, D) float64    poses of the examples; their quaternions have consistent signs
     durations_s : (m,) float64    durations of the examples
     takes : (m,) int64    number of the take of each example
     sampled : (n, L) float64    latent vectors of the samples, n at least 1

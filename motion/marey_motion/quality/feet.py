@@ -131,8 +131,8 @@ def skate_by_height(feet: Feet, options: QualityOptions) -> float | None:
 
     Notes
     -----
-    As `FootSkateFromHeight` of the Kimodo benchmark (NVIDIA, 2026): speeds in space, and all steps of both toes that
-    begin near the floor count equally.
+    As `FootSkateFromHeight` of the Kimodo benchmark (NVIDIA, 2026): the mean of the speeds in space over all steps of
+    both toes that begin near the floor.
     """
     near = near_floor(feet, options)[:-1]
     return float(feet.speeds[:, _TOES][near].mean()) if near.any() else None

@@ -1,4 +1,4 @@
-"""Plans for retargeting: which joints of two skeletons belong together, with the constant rotations between them."""
+"""Plans for retargeting: pairs of corresponding joints of two skeletons, with the constant rotations between them."""
 
 from __future__ import annotations
 

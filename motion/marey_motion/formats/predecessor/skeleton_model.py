@@ -3,7 +3,7 @@
 A document is `{"joints": {standard joint: joint or null}, "cos_map": {joint: {"x": swing or null, "y": twist or null}},
 ...}`, often inside `{"name", "model"}`. Its names of standard joints are those of Marey, and its axes are directions in
 the joint's local frame, too. Other members, such as limits of joints and shapes of feet, have no counterpart in Marey;
-they are kept as they are.
+they are stored unchanged.
 """
 
 from __future__ import annotations

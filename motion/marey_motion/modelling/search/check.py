@@ -56,7 +56,7 @@ def check_search(
 ) -> SearchCheck | None:
     """Train a model without every fifth take, and search for the positions of hands and feet in these takes.
 
-    If three performers are known, the same is done without each performer.
+    If at least three performers are known, also train a model without each performer, and search for their positions.
 
     Parameters
     ----------
