@@ -76,8 +76,7 @@ def import_file(file: FileToImport) -> ImportedFile:
     try:
         if len(file.collection) > _LONGEST_COLLECTION:
             raise FormatError(
-                f"the path of the file's collection is longer than {_LONGEST_COLLECTION} characters; choose a "
-                "shorter one",
+                f"the path of the file's collection is longer than {_LONGEST_COLLECTION} characters; shorten the path",
                 code="name-invalid",
             )
         return _storable(_imported(file))

@@ -163,8 +163,8 @@ def _compare_with_body(given: UpAxis, body: BodyMeasures, *, trusted: bool) -> N
     reason = f"from feet to head, the body points along {axis} (mean cosine {cosine:.2f}), not along {given}"
     if axis in others and not trusted:
         raise ContradictedOption(
-            f"the up axis {given} contradicts the motion: {reason}; name the right one with --up-axis (up_axis), "
-            "or confirm this one with --trust-options (trust_options)",
+            f"the up axis {given} contradicts the motion: {reason}; set the right axis with --up-axis (up_axis), "
+            "or confirm the given axis with --trust-options (trust_options)",
             file=body.file,
         )
     body.warnings.append(CheckWarning("up-axis-doubtful", reason, values={"up_axis": axis, "cosine": cosine}))

@@ -106,7 +106,7 @@ def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArra
 
     Returns
     -------
-    (T,) int64    -1 for ticks at which the clip was continued
+    (T,) int64    row to which the search at each tick switched; -1 for ticks at which the clip was continued
     """
     successors = database.root_motion.successors
     following = rows[1:].astype(np.int64)

@@ -108,7 +108,7 @@ def near_floor(feet: Feet, options: QualityOptions) -> Mask:
     Parameters
     ----------
     feet : Feet    F frames
-    options : QualityOptions    the height
+    options : QualityOptions    options, of which `near_height_m` is used
 
     Returns
     -------
@@ -181,7 +181,7 @@ def skate_ratio(feet: Feet, options: QualityOptions) -> float | None:
 
 
 def contact_consistency(feet: Feet, options: QualityOptions) -> float:
-    """Compute how often labelled contacts agree with contacts by height and speed.
+    """Compute the share of labels of contact that agree with contacts determined by height and speed.
 
     Parameters
     ----------

@@ -136,8 +136,8 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
     """List the samples of each node and its number of children, level by level from the root.
 
     `count` is the number of samples in the document. The samples of a node include those of its children. The
-    predecessor's tree builder leaves the samples of the root out (`indices: null`); there, and in any other node with
-    children, they follow from the children.
+    predecessor's tree builder does not list the samples of the root (`indices: null`). A node with children that lists
+    no samples has the samples of its children.
     """
     indices: list[Ints | None] = []
     children: list[int] = []

@@ -1,4 +1,4 @@
-"""Refinement of latent vectors by Levenberg and Marquardt (Herrmann et al. 2019, Equation 2, as a posterior).
+"""Refinement of latent vectors by the Levenberg-Marquardt method (Herrmann et al. 2019, Equation 2, as a posterior).
 
 The cost is ½ Σ w (e / σ)² - λ Σ ln p(s), with errors e, their tolerances σ and weights w, and the likelihood p of each
 latent vector s. To compute a step, the mixture is replaced by its component that is most likely at the current vector
