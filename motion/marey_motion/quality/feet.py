@@ -18,7 +18,7 @@ from marey_motion.editing.annotations.contacts import contact_labels
 from marey_schemas.options.quality import QualityOptions
 
 PLANTED_PERCENTILE = 5.0
-"""Percentile of a joint's heights that is taken as its height while the foot stands; few frames are lower, by noise."""
+"""Percentile of a joint's heights that is used as its height while the foot stands, so that outliers are ignored."""
 
 Mask = NDArray[np.bool_]
 

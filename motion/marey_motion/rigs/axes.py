@@ -237,7 +237,7 @@ class _PosedBody:
     def up(self) -> Floats:
         """Upward unit directions (K, 3) of the trunk, perpendicular to the hip line.
 
-        They point from the hips to the shoulders, or else between the nearest mapped joints.
+        They point from the pelvis to the middle of the shoulders, or else between the nearest mapped joints.
         """
         levels = [level for level in map(self._level, _LEVELS) if level is not None]
         if len(levels) < 2:
