@@ -73,7 +73,7 @@ def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom,
     If `about` is "shoulders", the vector from the middle of the shoulders to a hand is that of the source, times a
     constant scale. The scale is the smaller of two ratios of target to source: the ratio of the arm lengths, and the
     ratio of the sideways reaches. So hands are within reach in front of the body and beside it. If `about` is "world",
-    the positions of the source's hands in the world are scaled like the path of the pelvis; they may be out of reach.
+    the world positions of the source's hands are scaled like the path of the pelvis; they may be out of reach.
 
     Shoulders and elbows turn; hands keep their orientations in the world. Elbows that nearly stretch are damped, so
     that they do not snap. Hands that would be below the floor are lifted to the floor.

@@ -334,7 +334,7 @@ def _trunk(skeleton: Skeleton, pelvis: int, up: NDArray[np.float64]) -> NDArray[
 def _shows_drop(skeleton: Skeleton, joints: Mapping[str, int], up: NDArray[np.float64], side: str) -> bool:
     """Return whether the rest pose shows how far a hip is below the pelvis.
 
-    This is so if the hip is a child of the pelvis, or if the body stands in the rest pose. Otherwise, joints between
+    This is so if the hip is a child of the pelvis, or if the rest pose is a standing pose. Otherwise, joints between
     pelvis and hip may be bent in any way in the rest pose.
     """
     pelvis, hip = joints["pelvis"], joints[f"{side}_hip"]
