@@ -176,7 +176,7 @@ def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
 def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _PosedBody:
     if not same_hierarchy(skeleton, motion.skeleton):
         raise ClipError(
-            "the motion has a different skeleton from the one whose axes are computed; give a motion of this skeleton",
+            "the skeleton of this motion differs from the skeleton whose axes are computed; use a motion of the latter",
             where="motion",
         )
     count = min(motion.frame_count, FRAMES_READ)
