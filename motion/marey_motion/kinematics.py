@@ -419,7 +419,7 @@ def without_flicker(flags: NDArray[np.bool_], frame_rate_hz: float, window_s: fl
 
     Returns
     -------
-    (F, k) bool    the flags; the first and the last are continued beyond the ends
+    (F, k) bool    the filtered flags; windows that extend beyond the ends contain copies of the first or last flag
     """
     reach = max(0, (int(window_s * frame_rate_hz + 1e-9) - 1) // 2)
     padded = np.pad(flags, ((reach + 1, reach), (0, 0)), mode="edge")

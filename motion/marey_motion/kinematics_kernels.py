@@ -1,4 +1,4 @@
-"""Compiled forward kinematics, kept apart so that importing the rest of the package does not load numba.
+"""Compiled forward kinematics, in a separate module so that importing other modules does not load numba.
 
 The memory layout determines the speed. A block of frames is transposed from one row per pose to one contiguous row of
 frames per component. Each step along the joint chain then consists of the same few vector instructions for all frames

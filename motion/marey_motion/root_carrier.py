@@ -16,7 +16,7 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 STILL = 1e-5
-"""A rotation whose components vary by less than this counts as constant; rounding to float32 causes less variation."""
+"""A rotation whose components vary by less than this is constant; rounding to float32 causes less variation."""
 
 
 def carried_at(motion: Motion, skeleton: Skeleton, carrier: int, places: Floats, spins: Floats) -> Motion:

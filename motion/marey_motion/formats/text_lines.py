@@ -122,7 +122,7 @@ def read_number(word: bytes) -> float | None:
 
     Returns
     -------
-    float or None    the number; None if the word is anything else
+    float or None    the number; None if the word is not such a number
     """
     if not word or not _NUMBER.fullmatch(word):
         return None

@@ -1,4 +1,4 @@
-"""Texts of files in messages: what JSON can name but UTF-8 cannot contain is replaced, and long ones are cut off."""
+"""Preparation of texts from files for messages: replacement of characters that UTF-8 cannot encode, and shortening."""
 
 from __future__ import annotations
 

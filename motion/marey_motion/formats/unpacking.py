@@ -1,4 +1,4 @@
-"""Limit of the motion that a small file may describe."""
+"""Limit of the memory that the motion of a small file may need."""
 
 from __future__ import annotations
 

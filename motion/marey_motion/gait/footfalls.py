@@ -118,7 +118,8 @@ class FootMotion:
     ----------
     balls : (n, 3)    position of the ball joint, metres
     yaws, pitches, toe_pitches : (n,)    radians; toes up is positive
-    freedom : (n,)    0 while the foot is loaded, rising to 1 in the middle of its swing
+    freedom : (n,)    0 while the foot is loaded, rising to 1 in the middle of its swing; the greater it is, the more
+        gradually a foot that is out of reach is moved towards the hip
     heel_planted, ball_planted : (n,) bool    True where the heel, or the ball, is fixed on the floor
     """
 

@@ -106,7 +106,7 @@ class RootPath:
     def __post_init__(self) -> None:
         object.__setattr__(self, "segments", tuple(self.segments))
         if not self.segments:
-            raise MotionError("a path to walk needs at least one segment", code="gait-invalid", where="segments")
+            raise MotionError("a path needs at least one segment", code="gait-invalid", where="segments")
 
     @property
     def duration_s(self) -> float:

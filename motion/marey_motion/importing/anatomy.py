@@ -22,7 +22,7 @@ from marey_schemas.documents.standard_joints import SIDES
 from marey_schemas.lru import LruCache
 
 LEG_OF_STATURE = 0.491
-"""Part of the stature that thigh and shank make together (Drillis and Contini, 1966)."""
+"""Length of thigh and shank together, as a share of the stature (Drillis and Contini, 1966)."""
 
 
 class Anatomy:

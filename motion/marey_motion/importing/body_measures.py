@@ -26,8 +26,8 @@ class BodyMeasures:
     """Measures of the body in a file, in the unit and axes of the file.
 
     `positions` (J, F, 3) are joint positions in sampled frames, `rest` (J, 3) joint positions in the rest pose. `leg`
-    is the length of a leg, None if there are not two feet. What is inferred from the measures adds its `evidence` and
-    `warnings`; `axis_is_clear` becomes true if the body stands along the upward axis that was inferred.
+    is the length of a leg, None if there are not two feet. Functions that infer the unit or the upward axis append to
+    `evidence` and `warnings`, and set `axis_is_clear` if the body stands along the inferred axis.
     """
 
     file: str

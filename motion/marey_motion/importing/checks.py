@@ -76,7 +76,7 @@ SKATE_SPEED_M_S = 0.6
 IN_PLACE_FOOT_SPEED_M_S = 0.4
 TELEPORT_SPEED_M_S = 15.0
 REST_JUMP_M_S = 8.0
-"""Speed at which a point of the body leaves a rest pose that is no part of the motion."""
+"""Speed of the fastest point of the body above which a step between rest pose and motion is a jump."""
 JUMP_RAD = np.radians(60.0)
 # Cosine of half an angle a little smaller, beyond any rounding of the one that is compared.
 _SURELY_NO_JUMP = np.cos(JUMP_RAD / 2) + 1e-3
@@ -220,9 +220,9 @@ def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
 
 
 def rest_pose_jumps(clip: Clip) -> tuple[int, int]:
-    """Count the frames of a rest pose at either end that are no part of the motion: the body jumps out of them.
+    """Count the frames of a rest pose at each end of a clip, if the body jumps between rest pose and motion.
 
-    A motion that begins in a rest pose and moves on from there does not jump.
+    A rest pose from which the body moves smoothly is a part of the motion, and is not counted.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def rest_pose_jumps(clip: Clip) -> tuple[int, int]:
 
     Returns
     -------
-    (int, int)    frames at the start and at the end; 0 if there is no such pose, or nothing else
+    (int, int)    frames at the start and at the end; 0 where there is no such pose, and if the whole clip is one
     """
     tracks = track(clip)
     start, end = _rest_pose_frames(clip, tracks)

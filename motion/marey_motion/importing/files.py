@@ -45,9 +45,7 @@ _LONGEST_MESSAGE = 4000
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
-    """Make the entry, in the result of the import, for a file that is not read on its own.
-
-    Such a file is the companion of another file, or is refused by the plan.
+    """Make the result entry of a file that is not read on its own, because it is a companion or refused by the plan.
 
     Parameters
     ----------
@@ -78,8 +76,7 @@ def import_file(file: FileToImport) -> ImportedFile:
     try:
         if len(file.collection) > _LONGEST_COLLECTION:
             raise FormatError(
-                f"the path of the file's collection is longer than {_LONGEST_COLLECTION} characters; choose a "
-                "shorter one",
+                f"the path of the file's collection is longer than {_LONGEST_COLLECTION} characters; shorten the path",
                 code="name-invalid",
             )
         return _storable(_imported(file))
@@ -108,9 +105,9 @@ def refusal_of(error: MotionError) -> Refusal:
 
 
 def _storable(found: ImportedFile) -> ImportedFile:
-    """Give the messages the form in which they can be stored; documents are checked where they are encoded.
+    """Shorten the messages of an import, and replace characters in them that UTF-8 cannot encode.
 
-    Raises `UnicodeError` if the graph contains a name that cannot be stored.
+    Raises `UnicodeError` if the graph contains a name that UTF-8 cannot encode.
     """
     if found.graph is not None:
         for (action, name), node in found.graph.graph.nodes.items():

@@ -73,7 +73,7 @@ class ImportedItem:
     """An item to store: its name, collection, tags and documents.
 
     `name` identifies the item within the import: other items refer to it as `{"output": name}` until it is stored.
-    With `same_skeleton`, it is not stored if an item of this name has another skeleton.
+    If `same_skeleton` is true, the item is not stored when the project's item with this name has another skeleton.
     """
 
     name: str
@@ -88,7 +88,7 @@ class ImportedItem:
 
 @dataclass(frozen=True)
 class ImportedGraph:
-    """Graph whose models are not looked up yet; looking them up requires the project (see `importing.graphs`)."""
+    """Graph whose nodes are not linked to models of the project yet (`importing.graphs` links them)."""
 
     name: str
     collection: str
@@ -104,13 +104,13 @@ class ImportedFile:
 
     Parameters
     ----------
-    items : a skeleton, a clip or a model, or else a skeleton followed by a clip or model that uses it. The skeleton has
-        no document `mapping` yet, except that of a file of the predecessor's: see `mapping_part`. A zipped graph has
-        its skeleton and several models
+    items : a skeleton, a clip or a model, or else a skeleton followed by a clip or model that uses it. A zipped graph
+        gives a skeleton and several models. A skeleton has no document `mapping` yet (see `mapping_part`), unless it
+        comes from a file of the predecessor
     checks : findings about the motion, as documents
     frames : number of frames of the clip
     graph : graph in the file, whose item is made after `items` are stored
-    axis : what the file shows about its upward axis; None if the axis was given or fixed by the format
+    axis : evidence of the file about its upward axis; None if the axis was given or fixed by the format
     """
 
     name: str
@@ -165,7 +165,7 @@ def _skeleton_name(anatomy: Anatomy) -> str:
 
 
 def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str, Tree]) -> ImportedItem:
-    """Make the main item of a file, with the file's name, in the user's collection, with the user's tags.
+    """Make the main item of a file, with the collection and the tags that the import options determine.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ _NEEDED: dict[str, str] = {
     "skeleton model": "a skeleton model must be imported together with its skeleton, and be called like it: for "
     "example, body_skeleton_model.json needs body_skeleton.json or body.skeleton",
 }
-"""What to do with files that are only read together with others, by subject."""
+"""Error for a file that can only be read together with another file, by the subject of the file."""
 
 
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
@@ -93,7 +93,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
 
 
 def _imported_record(file: FileToImport, document: Mapping[str, Any]) -> ImportedFile:
-    """Make the item of a record, whose file is kept as it is; `document` has its form and its decoded content."""
+    """Make the item of a record; `document` has the members `form` (kind of record) and `content` (decoded file)."""
     fields = fields_of_record(document["content"])
     record: Tree = {
         "schema": "marey/predecessor-record@1",
@@ -116,7 +116,7 @@ def _imported_record(file: FileToImport, document: Mapping[str, Any]) -> Importe
 
 
 def model_checks(found: PredecessorModel) -> tuple[Tree, ...]:
-    """List what was changed in a model.
+    """List the changes that the import made to a model.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def model_checks(found: PredecessorModel) -> tuple[Tree, ...]:
 
 
 def _parts_of_file(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[str, Tree]:
-    """Make the documents of a model with a file of its own; its companion may be its tree."""
+    """Make the documents of a model that was read from `file`; the companion of the file may be the model's tree."""
     name, companion = file.planned.name, str(file.planned.companion)
     beside = None if file.companion is None or is_skeleton_name(companion) else bytes(file.companion)
     tree = None if beside is None else (beside, companion)
@@ -184,7 +184,7 @@ def model_parts(
 
 
 def _time(time: PredecessorTime, model: Tree) -> Tree:
-    """Make the record of the time function of a file, from which the one in the document `model` was converted."""
+    """Record a time function of the predecessor, from which the time function in the document `model` was converted."""
     return {
         "form": time.form,
         "knots": time.basis.knots,

@@ -25,8 +25,8 @@ class PlannedFile:
     Parameters
     ----------
     name : name of the file, as given
-    role : `motion` for a file to import, `skeleton` for one with which other files are read, too, `companion` for a
-        file that is only read with another file, or `refused`
+    role : `motion` for a file to import; `skeleton` for a file of a skeleton, which is imported and also read together
+        with other files; `companion` for a file that is only read together with another file; or `refused`
     companion : name of the companion file that this file needs; None if it needs none
     notes : name of the file with the annotation or the alignment of this file's motion; None if there is none
     folder, item_name : path below the collection that receives the import, and name of the clip
@@ -49,10 +49,10 @@ class PlannedFile:
 
 
 def reading_order(plan: Sequence[PlannedFile]) -> list[int]:
-    """Return the places of the files of a plan in the order in which they must be imported.
+    """Return the indices of the files of a plan in the order in which they must be imported.
 
-    Skeletons come first. The file of a skeleton says more about it than a clip of the skeleton does, and the first file
-    that contains a skeleton creates its item.
+    Files of skeletons come first: they may contain joint mappings and axes, which clips do not contain. The first file
+    with a skeleton creates the item of the skeleton.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def reading_order(plan: Sequence[PlannedFile]) -> list[int]:
 
     Returns
     -------
-    list of int    every place once
+    list of int    each index into the plan once
     """
     return sorted(range(len(plan)), key=lambda place: plan[place].role != "skeleton")
 

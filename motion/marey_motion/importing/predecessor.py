@@ -1,7 +1,7 @@
-"""Import of what files of the predecessor say about skeletons and motions, besides hierarchies and poses.
+"""Import of joint mappings, axes, annotations and alignments from files of the predecessor.
 
-A skeleton may have a skeleton model (joint mapping and axes). A motion may have notes: an annotation, or the alignment
-that makes it an aligned clip. The predecessor is the system that Marey replaces.
+A skeleton may have a skeleton model (joint mapping and axes). A motion may have notes: an annotation, or an alignment,
+with which the motion becomes an aligned clip. The predecessor is the system that Marey replaces.
 """
 
 from __future__ import annotations
@@ -72,13 +72,13 @@ def described_skeleton(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
             original["model"] = original_of("mapping", mapping, place, file.companion_digest)
     elif place != name:
         raise FormatError(
-            "the file is no skeleton model: it has no field 'joints'", code="document-unknown", file=place
+            "the file is not a skeleton model: it has no field 'joints'", code="document-unknown", file=place
         )
     return replace(item, parts={**item.parts, "mapping": {**mapping, "predecessor": original}})
 
 
 def _as_json(rest: Mapping[str, Any], file: str) -> Tree:
-    """Return members of a skeleton model as JSON can contain them; BSON also knows values that JSON does not."""
+    """Convert members of a skeleton model to JSON types; raise `FormatError` for BSON values that JSON lacks."""
     try:
         kept: Tree = json.loads(json.dumps(dict(rest), allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
@@ -89,7 +89,8 @@ def _as_json(rest: Mapping[str, Any], file: str) -> Tree:
 def _mapping_of(model: PredecessorSkeletonModel, guessed: Tree) -> Tree:
     """Return the members of a document `mapping` that a skeleton model replaces.
 
-    If the model contains only one axis of a joint, the other one is the guessed axis, made perpendicular to it.
+    If the model contains only one of the two axes of a joint (twist and swing), the second axis is computed from the
+    guessed axis: its component perpendicular to the first axis.
     """
     axes: dict[str, Tree] = dict(guessed["axes"])
     for joint in {**model.twists, **model.swings}:
@@ -134,7 +135,7 @@ def noted_items(file: FileToImport, imported: ImportedMotion, motion: Tree, clip
 
 
 def _annotation(file: FileToImport, notes: str, layer: Layer, label: str | None) -> ImportedItem:
-    """Make the item of an annotation; `label` is the only label of its segments, if there is one item for each."""
+    """Make the item of an annotation; `label` is the label of all segments of `layer`, or None for all labels."""
     ref = OutputRef(output=file.planned.name)
     named = IMPORTED_LAYER if label is None else label
     part = layer_to_document(layer, ref, named).model_dump(mode="json", by_alias=True, exclude_none=True)
@@ -147,7 +148,7 @@ def _annotation(file: FileToImport, notes: str, layer: Layer, label: str | None)
 def _aligned_item(
     file: FileToImport, document: Mapping[str, Any], motion: Tree, imported: ImportedMotion
 ) -> ImportedItem:
-    """Make the item of an aligned clip; the number of frames of its source is known from its time function alone."""
+    """Make the item of an aligned clip; the number of frames of the source clip is taken from the time function."""
     name = str(file.planned.notes)
     found = alignment_of_document(document, name)
     if len(found.frames) != len(motion["poses"]):
@@ -174,7 +175,7 @@ def _aligned_item(
 
 
 def motion_content(file: FileToImport, imported: ImportedMotion, motion: Tree) -> str | None:
-    """Return the digest of what a motion took from a file of the predecessor; None if the import changed the motion.
+    """Return the digest of a motion that was imported unchanged from a file of the predecessor.
 
     Parameters
     ----------
@@ -184,7 +185,7 @@ def motion_content(file: FileToImport, imported: ImportedMotion, motion: Tree) -
 
     Returns
     -------
-    str or None    the digest
+    str or None    the digest; None if the format is another one, or if frames, floor, unit, axes or rate were changed
     """
     options, source = file.options, imported.source
     unchanged = source.format == FORMAT and source.trimmed_frames == (0, 0) and source.floor_shift_m == 0.0

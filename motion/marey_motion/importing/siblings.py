@@ -1,4 +1,4 @@
-"""Files of one import with the same skeleton: where one does not show which axis points up, the others may."""
+"""Inference of the upward axis of a file from other files of the same import that have the same skeleton."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ def axis_of_siblings(finding: AxisFinding | None, axes: dict[str, UpAxis]) -> Up
 
     Returns
     -------
-    str or None    axis of the other files with this skeleton; None if the file is clear, or if they show nothing else
+    str or None    axis of the other files with this skeleton; None if the file shows its axis clearly, if the axis of
+        the other files is unknown, or if it is the axis already inferred
     """
     if finding is None or finding.is_clear:
         return None

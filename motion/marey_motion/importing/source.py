@@ -64,7 +64,8 @@ class SourceMotion:
     def rig_digest(self) -> str:
         """Digest of names, hierarchy and bones; equal for all takes of one rig.
 
-        The root's offset and offsets that positions of the motion replace differ from take to take, and do not count.
+        The digest ignores the root's offset, and the offsets of joints whose positions the motion contains, because
+        these offsets differ from take to take. It also ignores the size of the body.
         """
         bones = self.offsets.copy()
         bones[[0, *self.translated_joints]] = 0.0
@@ -85,8 +86,8 @@ class SourceMotion:
 class SourceDocument:
     """A decoded file that holds no motion: a model, a tree over the samples of a model, or a graph of models.
 
-    Other subjects are notes about a motion (an annotation or an alignment), the skeleton model of a skeleton, a graph
-    zipped together with its models, whose file is not decoded yet, and records of work, with their form and content.
+    Other subjects are an annotation or an alignment of a motion, a skeleton model, a zipped graph (a graph with its
+    models in an archive, not decoded yet), and a record of work, with its form and content.
     """
 
     subject: Subject
@@ -95,7 +96,7 @@ class SourceDocument:
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """Record of the findings and changes of an import, kept with the clip.
+    """Record of the findings and changes of an import, stored with the clip.
 
     Parameters
     ----------
@@ -139,7 +140,7 @@ class SourceInfo:
 
 @dataclass(frozen=True, eq=False)
 class ImportedMotion:
-    """A file in Marey's convention: metres, Y up, right-handed.
+    """Content of a file, converted to Marey's convention: metres, Y up, right-handed.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ class Tracks:
 
         Parameters
         ----------
-        joints : int    landmarks or joints of the feet
+        joints : int    indices of landmarks or of joints of the feet
 
         Returns
         -------

@@ -128,14 +128,14 @@ def _choose_unit(source: SourceMotion, body: BodyMeasures, options: ImportOption
     if body.leg is None:
         raise AmbiguousUnits(
             "the unit of length is not clear, because no two legs were found whose length could be measured; "
-            "name the unit with --unit (unit_scale_m), such as cm",
+            "set the unit with --unit (unit), such as cm, or with --unit-scale-m (unit_scale_m), in metres",
             file=body.file,
         )
     return _unit_of_leg(body, hip_height, up_axis, stated)
 
 
 def _compare_with_legs(given: float, body: BodyMeasures, *, trusted: bool) -> None:
-    """Refuse a given unit with which no body has such legs; warn if only an adult has no such legs."""
+    """Refuse a given unit in which the legs have an impossible length; warn if the length is not that of an adult."""
     if body.leg is None:
         return
     legs_m = body.leg * given
@@ -144,7 +144,7 @@ def _compare_with_legs(given: float, body: BodyMeasures, *, trusted: bool) -> No
         reading = "".join(f"; with {name}, they are {body.leg * UNITS_M[name]:.2f} m long" for name in fitting)
         raise ContradictedOption(
             f"the unit of {given:.5g} m contradicts the body: its legs would be {legs_m:.3g} m long{reading}; name the "
-            "right unit with --unit (unit), or confirm this one with --trust-options (trust_options)",
+            "right unit with --unit (unit), or confirm the given unit with --trust-options (trust_options)",
             file=body.file,
         )
     if body.landmarks.by_names and not _within(LEG_LENGTH_M, legs_m):
@@ -156,7 +156,7 @@ def _doubtful_unit(unit_m: float, legs_m: float, origin: str) -> CheckWarning:
     return CheckWarning(
         "unit-doubtful",
         f"with the unit {origin} ({unit_m:.5g} m), the legs are {legs_m:.2f} m long (adults have {low} to "
-        f"{high} m); if the body is an adult's, name the right unit with --unit (unit_scale_m)",
+        f"{high} m); if the body is an adult's, set the right unit with --unit (unit) or --unit-scale-m (unit_scale_m)",
         values={"unit_scale_m": unit_m, "leg_length_m": legs_m},
     )
 
@@ -199,7 +199,7 @@ def _ambiguous_unit(body: BodyMeasures, hip_height: float) -> AmbiguousUnits:
     fit = f"fit {' or '.join(fitting)}, but the names of the joints are not known" if fitting else "fit no known unit"
     return AmbiguousUnits(
         f"the unit of length is not clear: legs of {body.leg:.4g} units {fit} (adults have {low} to {high} m); "
-        f"name it with --unit (unit_scale_m); candidates: {', '.join(listed)}",
+        f"set the unit with --unit (unit) or --unit-scale-m (unit_scale_m); candidates: {', '.join(listed)}",
         file=body.file,
     )
 
@@ -220,7 +220,7 @@ def _look_for_mirroring(source: SourceMotion, body: BodyMeasures, options: Impor
 
     A body that stands faces where its feet point. Left and right seem exchanged if the left leg is then on the right.
     Frames in which the body kneels, lies or crawls show nothing, because the feet point down or back in them; if the
-    body never stands, its rest pose is looked at.
+    body never stands, its rest pose is examined.
     """
     landmarks = body.landmarks
     if landmarks.feet is None or landmarks.toes is None or options.handedness == "left":

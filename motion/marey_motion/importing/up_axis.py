@@ -1,4 +1,4 @@
-"""The axis of a file that points up, inferred from the body: the head is above the feet, or feet keep to the ground."""
+"""Inference of the axis of a file that points up: the head is above the feet, or the feet stay at one height."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def choose_up_axis(
 
 
 def _infer_up_axis(body: BodyMeasures, sibling_axis: UpAxis | None) -> UpAxis:
-    """Infer the upward axis from motion, rest pose and ground; `sibling_axis` counts if the motion is not clear."""
+    """Infer the upward axis from motion, rest pose and ground; `sibling_axis` is used if the motion is not clear."""
     standing, resting = _body_axis(body.positions, body.landmarks), _body_axis(body.rest[:, None], body.landmarks)
     flat = _flat_axis(body)
     is_person = body.landmarks.by_names and resting[1] >= _CLEAR_COSINE
@@ -163,8 +163,8 @@ def _compare_with_body(given: UpAxis, body: BodyMeasures, *, trusted: bool) -> N
     reason = f"from feet to head, the body points along {axis} (mean cosine {cosine:.2f}), not along {given}"
     if axis in others and not trusted:
         raise ContradictedOption(
-            f"the up axis {given} contradicts the motion: {reason}; name the right one with --up-axis (up_axis), "
-            "or confirm this one with --trust-options (trust_options)",
+            f"the up axis {given} contradicts the motion: {reason}; set the right axis with --up-axis (up_axis), "
+            "or confirm the given axis with --trust-options (trust_options)",
             file=body.file,
         )
     body.warnings.append(CheckWarning("up-axis-doubtful", reason, values={"up_axis": axis, "cosine": cosine}))
@@ -196,7 +196,7 @@ def _settle_up_axis(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple
 
 
 def _told(standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]) -> str:
-    """Say in words what the motion and the rest pose show."""
+    """Describe the upward axes that the motion and the rest pose show, for a message."""
     motion = f"mean direction from feet to head is {standing[0]} with cosine {standing[1]:.2f}"
     if standing[1] == 0.0:
         motion = f"the motion keeps to a {_FOLDED}"
@@ -297,6 +297,6 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _stands_on_all_fours(body: BodyMeasures, up_axis: UpAxis) -> bool:
-    """Return whether hands and feet are on one ground well below the hips; not if the body lies on its side."""
+    """Return whether hands and feet are near one ground, well below the hips; False if the body lies on its side."""
     assert body.leg is not None
     return walks_on_hands(body, up_axis) and hip_height_of(body, up_axis) > 0.5 * body.leg

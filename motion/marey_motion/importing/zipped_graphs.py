@@ -94,7 +94,7 @@ def _skeleton(found: ZippedGraph, file: str) -> Skeleton:
 
 
 def _skeleton_item(file: FileToImport, found: ZippedGraph, skeleton: Skeleton) -> ImportedItem:
-    """Make the item of the skeleton; the archive is no file of the skeleton that could be given back for it."""
+    """Make the item of the skeleton, without a reference to an original file: the archive also contains models."""
     if found.skeleton_member.endswith(".bvh"):
         return skeleton_item(file, skeleton)
     item = described_skeleton(replace(file, data=found.skeleton, companion=None), skeleton)
@@ -114,7 +114,7 @@ def _read_model(model: ZippedModel, skeleton: Skeleton, member: str) -> Predeces
 
 
 def _keyframes(given: Mapping[str, Any], frames: int, member: str) -> Iterator[tuple[str, int]]:
-    """Yield the keyframes that the action of a model lists; those of the model itself are more recent."""
+    """Yield label and frame of each keyframe that the archive lists for a model; frames are limited to the motion."""
     for label, frame in given.items():
         if frame in _ENDS:
             yield label, frames - 1
@@ -131,7 +131,10 @@ def _keyframes(given: Mapping[str, Any], frames: int, member: str) -> Iterator[t
 
 
 def _model_item(file: FileToImport, model: ZippedModel, read: PredecessorModel, skeleton: Tree) -> ImportedItem:
-    """Make the item of a model; it may replace one with another skeleton, because the graph needs this one."""
+    """Make the item of a model; if the project has a model of this name, the item becomes its new revision.
+
+    This also applies to a model with another skeleton, because the graph needs the imported model.
+    """
     tree = None if model.tree is None or model.tree_member is None else (model.tree, model.tree_member)
     parts = model_parts(read, model.name, skeleton, model.member, tree)
     name = f"{file.planned.name}#{model.name}"

@@ -92,11 +92,11 @@ def with_normaliser(database: MatchingDatabase, normaliser: Normaliser) -> Match
     Parameters
     ----------
     database : MatchingDatabase    the database
-    normaliser : Normaliser    the new one
+    normaliser : Normaliser    the new normaliser
 
     Returns
     -------
-    MatchingDatabase    the same rows
+    MatchingDatabase    database with the same rows and the new normaliser
 
     Raises
     ------
@@ -179,7 +179,7 @@ def _ordered(clips: Sequence[SourceClip]) -> list[SourceClip]:
     for clip, following in pairwise(ordered):
         if clip.uid == following.uid:
             raise MotionError(
-                f"{clip.name} and {following.name} have the same uid {clip.uid}; each clip needs a different one",
+                f"{clip.name} and {following.name} have the same uid {clip.uid}; give each clip a different uid",
                 code="uid-repeated",
                 where=clip.name,
             )

@@ -153,7 +153,7 @@ def run_trial(
 
     Raises
     ------
-    MotionError    if an option is invalid, or if index, trajectory and database do not belong together
+    MotionError    if an option is invalid, or if the index or the trajectory does not fit the database
     """
     from marey_motion.matching import controller_kernels as kernels
 

@@ -1,4 +1,4 @@
-"""The compiled loop of motion matching, kept apart so that importing the rest of the package does not load numba.
+"""The compiled loop of motion matching, in a separate module so that importing other modules does not load numba.
 
 Ground positions are (x, z) in metres; headings are in radians and increase in a left turn. Parameters with the same
 name have the same meaning in all functions:

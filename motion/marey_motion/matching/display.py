@@ -75,7 +75,7 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
 def displayed_points(
     database: MatchingDatabase, rows: NDArray[np.int32], chain: JointChain, options: ControllerOptions
 ) -> Floats:
-    """Compute where joints are displayed, with the remaining offsets of earlier switches.
+    """Compute the displayed positions of joints, including the remaining offsets of earlier switches.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArra
 
     Returns
     -------
-    (T,) int64    -1 for ticks at which the clip was continued
+    (T,) int64    row to which the search at each tick switched; -1 for ticks at which the clip was continued
     """
     successors = database.root_motion.successors
     following = rows[1:].astype(np.int64)

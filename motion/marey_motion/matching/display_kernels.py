@@ -1,4 +1,4 @@
-"""Compiled inertialisation of poses, kept apart so that importing the rest of the package does not load numba.
+"""Compiled inertialisation of poses, in a separate module so that importing other modules does not load numba.
 
 A pose is a row of 3 + 4·J numbers: the position of joint 0 in metres and the rotations (w, x, y, z) of J joints, joint
 0 in the frame of the simulation root, the others in the frames of their parents. Offsets and velocities of rotations

@@ -56,8 +56,9 @@ class Explanation:
     ----------
     shown : row displayed at the tick
     chosen : row after which the motion continues at the next tick; `shown` itself if its clip was continued
-    sentence : the reason with its numbers, for a person
-    going_on : `shown` as a candidate; None at the start of a trial and at the end of a clip
+    sentence : explanation of the choice, as a sentence with numbers
+    going_on : continuation of the displayed clip (row `shown`) as a candidate; None at the start of a trial and at the
+        end of a clip
     candidates : the cheapest rows that could be chosen, cheapest first
     others : the further rows that the caller requested, in the requested order
     """

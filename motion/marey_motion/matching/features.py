@@ -144,7 +144,7 @@ def turned_to_root(vectors: Floats, root: SimulationRoot) -> Floats:
 
 
 def look_ahead(root: SimulationRoot, ticks: NDArray[np.int64], *, wraps: bool) -> SimulationRoot:
-    """Look up where the root is some frames after each frame.
+    """Look up position and heading of the root some frames after each frame.
 
     After the last frame, the root stays in place; the root of a loop that wraps continues with the next rounds.
 

@@ -91,7 +91,7 @@ class Normaliser:
             )
 
     def as_tree(self) -> dict[str, Any]:
-        """Convert to plain values and arrays for `from_tree`.
+        """Convert the normaliser to plain values and arrays, which `from_tree` reads.
 
         Returns
         -------
@@ -146,7 +146,8 @@ class Normaliser:
         result = cls(offset, scale, fitted_on, names, floored)
         if result.digest != digest:
             raise MotionError(
-                f"the numbers of the normaliser were changed: their digest is {result.digest}, not {digest}",
+                f"the numbers of the normaliser were changed: their digest is {result.digest}, not {digest}; use an "
+                "unchanged copy",
                 code="normaliser-invalid",
                 where="normaliser",
             )

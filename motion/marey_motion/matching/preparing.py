@@ -60,7 +60,7 @@ class PreparedClip:
 def prepare_clip(
     source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks
 ) -> PreparedClip:
-    """Select the frames of a source clip that belong in a database, and resample them to the database's rate.
+    """Select the frames of a source clip that a database uses, and resample them to the database's rate.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def _wanted_frames(
 
 
 def _moves(clip: Clip, skeleton: Skeleton) -> bool:
-    """Return whether a clip can move `skeleton`, because the clip's own skeleton has the same joints.
+    """Return whether the poses of a clip fit `skeleton`, because the clip's own skeleton has the same joints.
 
     End sites may differ, and so may the offsets of the root and of joints whose translations the clip contains.
     """

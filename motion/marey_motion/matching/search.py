@@ -43,7 +43,7 @@ class SearchIndex(NamedTuple):
     group_blocks : (G + 1,) int32    first block of each group, and B
     group_boxes : (⌈G / 16⌉, D', 2, 16) float32    sides of the boxes about groups
     radius : the largest norm of a row
-    boxed : whether a search uses the boxes, or goes through all blocks; the result is the same
+    boxed : True if a search uses the boxes, False if it compares the rows of all blocks; both give the same result
     """
 
     rows: NDArray[np.float64]
@@ -246,7 +246,7 @@ def find_best(
     ----------
     index : SearchIndex    N rows of D dimensions
     query : (D,) float64    normalised like the rows
-    count : int    number of rows; fewer when fewer are selectable
+    count : int    number of rows to find; fewer are returned if fewer are selectable
     weights : (D,) float64, optional    as for `find_nearest`
     skip : (int, int)    rows [start, stop) that may not be chosen
 

@@ -1,4 +1,4 @@
-"""Compiled exact search, kept apart so that importing the rest of the package does not load numba.
+"""Compiled exact search, in a separate module so that importing other modules does not load numba.
 
 `index` is a `marey_motion.matching.search.SearchIndex`; queries are normalised like its rows. Rows are database rows.
 

@@ -1,4 +1,4 @@
-"""Groups of examples that belong together, so that no test of a model uses what its training has seen."""
+"""Groups of examples from the same take or performer, so that no group is in both training and test of a model."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ class ExampleGroups:
 
     Parameters
     ----------
-    takes : (m,) int64    number of the take; steps of one take, and the mirrored copy of an example, have one number
-    subjects : (m,) int64 or None    number of the performer; None if the performer of an example is unknown, or if
-        there are fewer than three
+    takes : (m,) int64    number of each example's take; steps from one take have the same number, and so have an
+        example and its mirrored copy
+    subjects : (m,) int64 or None    number of each example's performer; None if the performer of any example is
+        unknown, or if there are fewer than three performers
     """
 
     takes: Ints
@@ -50,7 +51,7 @@ class ExampleGroups:
 
     @classmethod
     def alone(cls, count: int) -> ExampleGroups:
-        """Make groups of examples that were all recorded in takes of their own.
+        """Make groups in which each example is a take of its own.
 
         Parameters
         ----------
@@ -82,7 +83,8 @@ class ExampleGroups:
 
         Returns
         -------
-        (m,) int64 or None    number of the part of each example; None if too few examples or parts would remain
+        (m,) int64 or None    number of the part of each example; None if there would be fewer than two parts, or if too
+            few examples would remain for training
         """
         count = min(most, self.take_count)
         if count < LEAST_FOLDS:
@@ -102,7 +104,7 @@ class ExampleGroups:
 
 
 def _numbered(names: Sequence[str]) -> Ints:
-    """Number different names in the order in which they first appear."""
+    """Return a number for each name; equal names have equal numbers, which count from 0 in order of appearance."""
     numbers: dict[str, int] = {}
     return np.array([numbers.setdefault(name, len(numbers)) for name in names], dtype=np.int64)
 

@@ -29,7 +29,9 @@ Examples that vary so little are copies of one example.
 
 @dataclass(frozen=True)
 class Keep:
-    """Number of components to keep: `count`, or else the fewest that hold `share` of the variance, at most `most`.
+    """Number of components to keep: `count` if given, else the least number that explains `share` of the variance.
+
+    The number is at most `most`, unless `count` is given.
 
     If `count` exceeds the rank of the examples, all components are kept.
     """

@@ -31,8 +31,8 @@ def fit_components(
     ----------
     latents : (n, d) float64    latent vectors of unit mean variance
     count : int    number of normal distributions
-    covariance : str    "full": one covariance for each distribution; "tied": the same for all; "diagonal": one variance
-        for each distribution and dimension
+    covariance : str    "full": one covariance for each distribution; "tied": one covariance that all distributions
+        share; "diagonal": one variance for each distribution and dimension
     regularisation : float    variance that is added in every dimension
     starts : int    starts of expectation maximisation
     seed : int    the same seed gives the same mixture
@@ -48,8 +48,8 @@ def fit_components(
 
     Notes
     -----
-    The covariance of few examples in many dimensions is far from that of the distribution from which they come. It is
-    shrunk by the share of Ledoit and Wolf (2004), towards the diagonal matrix of the variances in each dimension.
+    In many dimensions, the covariance of few examples differs much from the covariance of their distribution. It is
+    therefore shrunk, by the share of Ledoit and Wolf (2004), towards the diagonal matrix of the variances.
     """
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture

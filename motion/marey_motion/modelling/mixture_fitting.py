@@ -21,12 +21,12 @@ Refusal = Literal["", "small-component", "held-out"]
 
 LEAST_EXAMPLES_PER_COMPONENT = 5
 PATIENCE = 2
-"""Numbers of components in a row that may be worse than the best before no larger number is tried."""
+"""Number of successive component counts without improvement after which no larger count is tried."""
 LOW_SHARE = 0.05
-"""Share of a mixture's own samples that are less likely than its threshold for improbable examples."""
+"""Share of the samples of a mixture that are less likely than its threshold for improbable examples."""
 THRESHOLD_SAMPLES = 2000
 WIDENINGS = tuple(float(2.0 ** (step / 8)) for step in range(17))
-"""Factors of the covariances, 1 to 4, the least of which that calibrates the likelihoods is taken."""
+"""Factors of the covariances, from 1 to 4; the least factor that calibrates the likelihoods is chosen."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,11 @@ class FittedMixture:
     ----------
     mixture : LatentMixture    the mixture
     covariance : str    kind of covariance; "point" for examples that do not vary
-    widening : float    factor of the covariances for likelihoods, at least 1: with it, about 5 % of left-out examples
-        are less likely than 95 % of the widened mixture. It applies to `held_out`, not to the candidates
-    candidates : tuple of MixtureCandidate    by kind of covariance and number of components; empty for a point
+    widening : float    factor of the covariances for likelihoods, at least 1. Unless the options set it, it is chosen
+        so that about 5 % of the left-out examples are below the threshold that 5 % of the samples of the widened
+        mixture do not reach. It applies to `held_out`, not to the candidates
+    candidates : tuple of MixtureCandidate    by kind of covariance and number of components; empty for examples that do
+        not vary
     held_out, held_out_subjects : HeldOut, optional    likelihoods of examples whose take, or whose performer, was left
         out; None if there are too few of them
     """
@@ -189,7 +191,7 @@ class _Unseen:
     def calibration(self) -> float:
         """Find the least widening with which at most 5 % of the examples (rounded up) are below the threshold.
 
-        Returns the greatest widening if there is none.
+        Returns the greatest widening if none is sufficient.
         """
         allowed = np.ceil(LOW_SHARE * len(self.folds)) / len(self.folds)
         fits = (factor for factor in WIDENINGS if self.judged(factor).low_share <= allowed)
@@ -276,7 +278,7 @@ class _Fitting:
         )
 
     def _simplest(self, tried: list[_Tried], best: _Tried) -> _Tried:
-        """Find the mixture with the fewest parameters that left-out examples cannot separate from the best one."""
+        """Find the mixture with the fewest parameters among those as good for left-out examples as the best one."""
 
         def size(one: _Tried) -> tuple[int, float]:
             candidate = one.candidate
@@ -286,9 +288,10 @@ class _Fitting:
         return min((one for one in tried if self._is_as_good(one, best)), key=size)
 
     def _is_as_good(self, one: _Tried, best: _Tried) -> bool:
-        """Return whether left-out examples are less likely than with the best by at most one standard error.
+        """Return whether a mixture is as good for left-out examples as the best one, within one standard error.
 
-        The errors of examples of one take are not independent, so the standard error is that of the takes' sums.
+        Compares the mean log-likelihoods of left-out examples. Examples of one take are not independent, so the
+        standard error is computed from sums over takes.
         """
         assert one.held_out is not None
         assert best.held_out is not None
@@ -332,7 +335,7 @@ def _score(candidate: MixtureCandidate, criterion: Criterion) -> float:
 
 
 def _with_refusals(tried: list[_Tried]) -> list[_Tried]:
-    """Refuse mixtures of several components that make left-out examples no more likely than a single one."""
+    """Refuse mixtures of several components that make left-out examples no more likely than one component does."""
     singles = [_score(one.candidate, "held_out") for one in tried if one.candidate.components == 1]
     least = max(singles, default=-np.inf)
     return [

@@ -122,8 +122,8 @@ class MotionPrimitive:
         distributions of logarithms have long tails
     log_slope_range : limits of the temporal function, or None if the examples are not known; without limits, splines
         could overshoot at their ends, so that a motion would nearly stop there
-    widening : factor of the mixture's covariances for likelihoods, at least 1. Motions of takes that the model has not
-        seen vary more than its examples, so the mixture itself would call too many of them unlikely
+    widening : factor of the mixture's covariances for likelihoods, at least 1. Motions that were not among the examples
+        vary more than the examples, so without widening, too many of them would be rated as unlikely
     """
 
     name: str

@@ -144,7 +144,11 @@ def _columns(joints: list[str], skeleton: Skeleton) -> NDArray[np.int64] | None:
         return None
     if sorted(joints) != sorted(skeleton.joint_names) or joints[0] != skeleton.joint_names[0]:
         odd = sorted(set(joints) ^ set(skeleton.joint_names)) or ["the root, or a name that appears twice"]
-        raise ModelError(f"the joints of the model and the skeleton differ: {', '.join(odd[:5])}", where="joints")
+        raise ModelError(
+            f"the joints of the model and the skeleton differ: {', '.join(odd[:5])}; use the skeleton for which the "
+            "model was made",
+            where="joints",
+        )
     places = {name: place for place, name in enumerate(joints)}
     order = np.array([places[name] for name in skeleton.joint_names])
     return np.concatenate((np.arange(3), (3 + 4 * order[:, None] + np.arange(4)).ravel()))

@@ -32,8 +32,8 @@ class ReconstructionErrors:
     left_out_cm : (c,) mean error of examples that are reconstructed from the components and the mean of the examples of
         all other takes; None if all examples come from one take
     left_out_each_cm : (m, c) the error of each of these examples; None if all examples come from one take
-    left_out_subject_cm : (c,) the same mean error if all examples of the performer are left out; None if fewer than
-        three performers are known
+    left_out_subject_cm : (c,) mean error of examples that are reconstructed from the examples of all other performers;
+        None if fewer than three performers are known
     """
 
     components: NDArray[np.int64]
@@ -59,7 +59,7 @@ def reconstruction_errors(
     ----------
     skeleton : Skeleton    J joints
     principal : PrincipalExamples    components of the examples
-    poses : (m, N, D) float64    poses with consistent signs
+    poses : (m, N, D) float64    poses; their quaternions have consistent signs
     most_components : int    largest number of components
     groups : ExampleGroups, optional    takes and performers; by default, each example is a take of its own
     threads : int    threads to use
@@ -133,7 +133,7 @@ def comparison_frames(basis: SplineBasis) -> NDArray[np.int64]:
 
 
 def _left_out(scores: Floats, members: Ints, count: int) -> Floats:
-    """Compute the scores (g, count, r) of g left-out examples, rebuilt by 0, 1, ... components of all others."""
+    """Compute the scores (g, count, r) of g left-out examples, rebuilt by 0, 1, ... components of the others."""
     own = scores[members]
     others = len(scores) - len(members)
     moved = own.sum(axis=0) / others

@@ -26,8 +26,10 @@ class SampleComparison:
     duration_gap : greatest difference, 0 to 1, of the shares of samples and of examples up to any duration (the
         statistic of Kolmogorov and Smirnov)
     nearest_cm : median distance of a sample from the nearest example
-    nearest_example_cm : median distance of an example from the nearest example of another take; None for one take
+    nearest_example_cm : median distance of an example from the nearest example of another take; None if all examples
+        come from one take
     diversity_cm, example_diversity_cm : mean distance of two samples, and of two examples; None if there is only one
+        sample, or only one example
     beyond_range_share : share of the rotations of joints in samples that are farther from the joint's mean rotation
         than any rotation of this joint in the examples
     """
@@ -48,7 +50,7 @@ def compare_samples(
     Parameters
     ----------
     primitive : MotionPrimitive    the model
-    poses : (m, N, D) float64    poses of the examples, with consistent signs
+    poses : (m, N, D) float64    poses of the examples; their quaternions have consistent signs
     durations_s : (m,) float64    durations of the examples
     takes : (m,) int64    number of the take of each example
     sampled : (n, L) float64    latent vectors of the samples, n at least 1
@@ -84,7 +86,7 @@ def _distances(motions: Floats, others: Floats) -> Floats:
 
 
 def _mean_of_pairs(distances: Floats) -> float | None:
-    """Compute the mean of distances (n, n) without those of motions from themselves; None for one motion."""
+    """Compute the mean of the distances (n, n) between different motions; None if there is only one motion."""
     count = len(distances)
     return float(distances.sum() / (count * (count - 1))) if count > 1 else None
 

@@ -12,7 +12,7 @@ LEAST_ROOT_EXTENT_M = 1e-3
 """Extent of a root axis, in metres, below which the axis is not scaled up to the size of the other axes."""
 
 LEAST_WEIGHT_M = 0.01
-"""Least weight of a joint, so that the rotation of a joint without children, such as a hand, counts a little."""
+"""Least weight of a joint, so that the rotation of a joint without children, such as a hand, is not ignored."""
 
 MOST_DIFFERENCES = 1_000_000
 """Maximum number of differences of positions in memory at once."""
@@ -47,8 +47,8 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
     Parameters
     ----------
     skeleton : Skeleton    J joints
-    poses : (F, D) float64    typical poses, such as those of the mean motion; rotations are normalised first, because
-        those of a mean are shorter than 1
+    poses : (F, D) float64    typical poses, such as those of the mean motion; quaternions are normalised first, because
+        mean quaternions are shorter than 1
 
     Returns
     -------

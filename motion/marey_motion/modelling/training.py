@@ -50,7 +50,7 @@ class TrainedPrimitive:
 
 @dataclass(frozen=True, eq=False)
 class FittedExamples:
-    """Examples prepared for the model: poses with consistent signs, and the spatial and temporal components."""
+    """Examples prepared for the model: poses (quaternions with consistent signs), spatial and temporal components."""
 
     poses: Floats
     spatial: PrincipalExamples
@@ -195,7 +195,7 @@ def channel_weights(
     ----------
     aligned : AlignedSet    the examples
     basis : SplineBasis    splines with n coefficients
-    poses : (m, N, D) float64    poses with consistent signs
+    poses : (m, N, D) float64    poses; their quaternions have consistent signs
     coefficients : (m, n, D) float64    coefficients of the poses
     keep : Keep    number of components
     options : ModelOptions    options

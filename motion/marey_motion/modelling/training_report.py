@@ -38,8 +38,8 @@ class ExampleReport:
     log_likelihood : natural logarithm of the density of the example
     held_out_log_likelihood : log-likelihood of the example under a mixture fitted without the fold (a part of the
         takes) that contains the example's take; None if it was not computed
-    left_out_error_cm : mean distance of the joints from their reconstruction by components of the other takes; the
-        number of components is that of the model. None if it was not computed, or if all examples come from one take
+    left_out_error_cm : mean distance of the joints from their reconstruction by components of the other takes, with as
+        many components as the model has. None if it was not computed, or if all examples come from one take
     outlier : whether the likelihood of the example is much lower than that of the other examples
     """
 
@@ -80,9 +80,9 @@ class TrainingReport:
     log_likelihood : mean log-likelihood of the examples
     held_out_log_likelihood : mean of the examples' `held_out_log_likelihood`; None if it was not computed
     held_out_low_share : share of the examples that are less likely, under a mixture fitted without their takes, than
-        95 % of its samples
-    held_out_subject_log_likelihood, held_out_subject_low_share : the same under mixtures fitted without the performer;
-        None if fewer than three performers are known
+        95 % of the samples of this mixture
+    held_out_subject_log_likelihood, held_out_subject_low_share : mean log-likelihood and share as above, but under
+        mixtures fitted without the performer of the example; None if fewer than three performers are known
     examples : reports of the examples, in the order of the aligned set
     time_error_frames : root mean square difference between the examples' time functions and those rebuilt by the model
     """

@@ -85,7 +85,7 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
 
 
 def _of_time_components(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> list[Warned]:
-    """Warn if the greatest number of time components was too low for the share of the variance that was asked for."""
+    """Warn if the limit of the number of temporal components is too low for the requested share of the variance."""
     kept = primitive.temporal.count
     held = float(report.temporal_energy[kept - 1]) if 0 < kept <= len(report.temporal_energy) else 0.0
     if kept < options.most_temporal_components or kept >= len(report.temporal_energy) or held >= options.temporal_share:

@@ -38,11 +38,11 @@ class ComparableClip:
 
     Parameters
     ----------
-    name : str    name for people
+    name : str    name shown to users
     recorded : MeasuredClip    the whole clip
-    compared : MeasuredClip    what is compared: a loop of one cycle, or the whole clip
-    motion : Motion    the frames of `compared`
-    period : Period, optional    where the loop was cut out of the clip; None if no loop was cut
+    compared : MeasuredClip    the part that is compared: a loop of one cycle, or the whole clip
+    motion : Motion    the motion from which `compared` was measured
+    period : Period, optional    period and start of the loop that was cut out of the clip; None if no loop was cut
     """
 
     name: str
@@ -59,7 +59,7 @@ class ClipDistances:
     Parameters
     ----------
     totals : (N, N) float64    perceptual distances, symmetric, 0 on the diagonal
-    by_component : (C, N, N) float64    the same for each component of the metric, before it is multiplied by its share
+    by_component : (C, N, N) float64    distances by each component of the metric alone, not multiplied by its share
     """
 
     totals: Floats
@@ -109,7 +109,7 @@ def prepare_comparison(
     cycles: Literal["cut", "whole"] = "cut",
     loop: bool = False,
 ) -> ComparableClip:
-    """Measure a clip at the rate of a metric, and cut a loop of one cycle out of it if asked for.
+    """Measure a clip at the rate of a metric; if `cycles` is "cut", also cut a loop of one cycle out of the clip.
 
     Parameters
     ----------
@@ -117,9 +117,9 @@ def prepare_comparison(
     body : MatchingBody    body of its skeleton
     metric : PerceptualMetric    the metric
     rate_hz : float    frame rate at which the metric measures clips
-    name : str    name for people
-    cycles : str    cut: compare a loop of one cycle; whole: compare the whole clip
-    loop : bool    whether the clip is a loop already, which is never cut
+    name : str    name shown to users
+    cycles : str    "cut" compares a loop of one cycle, "whole" compares the whole clip
+    loop : bool    True if the clip is a loop already; such a clip is never cut
 
     Returns
     -------

@@ -32,7 +32,7 @@ class Period:
     frames : int    length of the period
     start : int    best first frame of a loop that is blended from two periods
     lags : (n,) int64    lags that were tried, in frames
-    differences : (n,) float64    mean distance of frames that are the lag apart
+    differences : (n,) float64    for each lag, the mean distance between two frames that are this lag apart
     """
 
     frames: int
@@ -44,9 +44,9 @@ class Period:
 def find_period(clip: MeasuredClip, metric: PerceptualMetric) -> Period:
     """Find the period of a clip: the first significant minimum of the mean distance along diagonals of its motion map.
 
-    A minimum is significant if it is in the lowest quarter of the range of distances: half a cycle, at which left and
-    right are exchanged, is a minimum, too, but a shallow one. A loop starts in a frame that differs enough from the
-    frame half a period later; so it does not show somebody who stands still.
+    A minimum is significant if it is in the lowest quarter of the range of distances. This excludes half a cycle, which
+    gives a shallow minimum because left and right are exchanged. The loop starts at a frame that differs enough from
+    the frame half a period later. This excludes loops in which the body stands still.
 
     Parameters
     ----------
@@ -91,9 +91,9 @@ def find_period(clip: MeasuredClip, metric: PerceptualMetric) -> Period:
 def cut_loop(motion: Motion, body: MatchingBody, period: Period) -> tuple[Motion, LoopSeam]:
     """Blend two periods of a motion into a loop without a seam.
 
-    Frame k of the loop is a mixture of frames start + k and start + P + k; the share of the first grows from 0 to 1. So
-    the frame after the last would be frame start + P, with which the loop begins. Rotations are interpolated by slerp,
-    and headings and steps on the ground are mixed and then added up.
+    Frame k of a loop of P frames is a mixture of frames start + k and start + P + k of the motion. The weight of frame
+    start + k is k / P. So the loop begins with frame start + P, and frame P of the loop would be frame start + P again.
+    Rotations are interpolated by slerp. Changes of heading and steps on the ground are interpolated, then summed.
 
     Parameters
     ----------

@@ -1,4 +1,8 @@
-"""Weights of a component, fitted to a table of perceived differences by non-negative least squares."""
+"""Fit of a component of a perceptual metric to a table of perceived differences, by non-negative least squares.
+
+As in `perception.metric`, a component predicts the difference c + N · Σ w F(x): c is the constant, N the norm, w the
+weights of the joint classes, F the shaping, and x the measured differences of the joint classes.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +29,10 @@ class PairDifferences:
 
     Parameters
     ----------
-    measurement : str    what x is
-    classes : tuple of str    the K classes
+    measurement : str    measurement whose differences are given: angles, positions or velocities
+    classes : tuple of str    the K joint classes
     pairs : (R, 2) int64    the motions of each pair
-    frames : tuple of (L, K) float64    x of each pair
+    frames : tuple of (L, K) float64    for each pair, the difference x of each class in L pairs of frames
     """
 
     measurement: Measurement
@@ -37,12 +41,12 @@ class PairDifferences:
     frames: tuple[Floats, ...]
 
     def means(self, shaping: Shaping, exponent: float = 1.0) -> Floats:
-        """Average F(x) over the frames of each pair.
+        """Average the shaped differences F(x) over the frames of each pair.
 
         Parameters
         ----------
-        shaping : str    F
-        exponent : float    exponent of `power`
+        shaping : str    the shaping F
+        exponent : float    exponent of the shaping `power`
 
         Returns
         -------
@@ -57,14 +61,14 @@ class PairDifferences:
 class FitQuality:
     """The agreement of fitted with perceived differences, over pairs of motions.
 
-    The paper prints a column "difference" without saying what it is; rss, rmse_percent and l2 are candidates.
+    Pražák et al. print a column "difference" without a definition; it may be rss, rmse_percent or l2.
 
     Parameters
     ----------
     rss, rmse, rmse_percent, l2 : float    sum of squares, root mean square (also in percent), and the norm of the
         difference of the whole symmetric tables
-    r2 : float    share of the variance that the fit explains; NaN if there is none
-    spearman : float    rank correlation; NaN if a side is constant
+    r2 : float    share of the variance that the fit explains; NaN if the perceived differences do not vary
+    spearman : float    rank correlation; NaN if the fitted or the perceived differences do not vary
     """
 
     rss: float
@@ -82,7 +86,7 @@ def fit_component(
     exponent: float = 1.0,
     weights: Floats | None = None,
 ) -> Component:
-    """Fit constant, N and weights to perceived differences.
+    """Fit the constant, the norm and the weights of a component to perceived differences.
 
     The problem is convex, so the result is the global optimum.
 
@@ -90,8 +94,8 @@ def fit_component(
     ----------
     differences : PairDifferences    R pairs
     perceived : (R,) float64    perceived difference of each pair; pairs with NaN are left out
-    shaping : str    F
-    exponent : float    exponent of `power`
+    shaping : str    the shaping F
+    exponent : float    exponent of the shaping `power`
     weights : (R,) float64, optional    weights of the pairs in the sum of squares, such as shown / (p (1 - p))
 
     Returns
@@ -100,21 +104,25 @@ def fit_component(
 
     Raises
     ------
-    MotionError    if too few pairs are known, or every weight of a class is 0: then only the constant explains anything
+    MotionError    if too few pairs have a perceived difference, or if the best fit gives every class the weight 0
     """
     means = differences.means(shaping, exponent)
     raw = _solve(means, perceived, weights)
     total = float(raw[1:].sum())
     if means.mean(axis=0) @ raw[1:] <= _NOTHING:
         raise MotionError(
-            f"no {differences.measurement} explain the differences: every weight is 0", code="fit-without-weights"
+            f"{differences.measurement} do not explain the perceived differences: the best fit gives every joint class "
+            "the weight 0; use another measurement or another shaping",
+            code="fit-without-weights",
         )
     given = dict(zip(differences.classes, (raw[1:] / total).tolist(), strict=True))
     return Component(differences.measurement, shaping, float(raw[0]), total, given, exponent)
 
 
 def fit_power(differences: PairDifferences, perceived: Floats) -> Component:
-    """Fit the shaping `power`: its exponent by a search from 0.1 to 3, and the weights within each step.
+    """Fit a component with the shaping `power`.
+
+    The exponent is found by a search from 0.1 to 3; for each exponent, constant and weights are fitted.
 
     Parameters
     ----------
@@ -127,7 +135,7 @@ def fit_power(differences: PairDifferences, perceived: Floats) -> Component:
 
     Raises
     ------
-    MotionError    as `fit_component`
+    MotionError    for the same reasons as in `fit_component`
     """
     known = np.isfinite(perceived)
 
@@ -145,16 +153,16 @@ def fit_power(differences: PairDifferences, perceived: Floats) -> Component:
 
 
 def predict(component: Component, differences: PairDifferences) -> Floats:
-    """Compute the differences that a component gives pairs of motions.
+    """Compute the differences of pairs of motions that a component predicts.
 
     Parameters
     ----------
-    component : Component    component of the same measurement
+    component : Component    component with the measurement of `differences`
     differences : PairDifferences    R pairs
 
     Returns
     -------
-    (R,) float64    c + N · Σ w mean F(x)
+    (R,) float64    c + N · Σ w · mean of F(x)
     """
     means = differences.means(component.shaping, component.exponent)
     return component.constant + component.norm * means @ component.shares_of(differences.classes)
@@ -174,7 +182,8 @@ def fit_shares(predicted: Sequence[Floats], perceived: Floats) -> tuple[float, .
 
     Notes
     -----
-    Every subset of components is solved with the sum 1 alone; the best solution without negative shares is the optimum.
+    For every subset of the components, the shares with the sum 1 are fitted without bounds. The best of the solutions
+    that have no negative share is the optimum.
     """
     known = np.isfinite(perceived)
     table, target = np.column_stack(predicted)[known], perceived[known]
@@ -224,13 +233,15 @@ def fit_quality(fitted: Floats, perceived: Floats) -> FitQuality:
 def bootstrap_weights(
     differences: PairDifferences, shown: Ints, chosen: Ints, shaping: Shaping, *, draws: int = 1000, seed: int = 0
 ) -> Floats:
-    """Draw participants with replacement, and fit again: how much the weights depend on who took part.
+    """Fit the weights to random draws of participants, to estimate how much the weights depend on the participants.
+
+    Each draw contains as many participants as the study, drawn with replacement.
 
     Parameters
     ----------
     differences : PairDifferences    R pairs i < j, in the order of `numpy.triu_indices`
     shown, chosen : (N, R) int64    counts of N participants, from `judging.pair_counts_by_participant`
-    shaping : str    F
+    shaping : str    the shaping F
     draws : int    number of draws B
     seed : int    seed of the draws
 
@@ -247,23 +258,24 @@ def bootstrap_weights(
 
 
 def leave_one_motion_out(parts: Sequence[PairDifferences], perceived: Floats, shaping: Shaping) -> Floats:
-    """Predict the pairs of each motion by a fit to the pairs without it: of components, and then of their shares.
+    """Predict the differences of each motion from the others, by a fit to the pairs without this motion.
 
-    To leave out single pairs would not do: the other pairs of both motions would give them away.
+    For each left-out motion, all components and their shares are fitted. All pairs of the motion are left out, because
+    a fit to some of them would already contain information about the remaining pairs.
 
     Parameters
     ----------
     parts : sequence of PairDifferences    the same R pairs by the measurement of each component
     perceived : (R,) float64    perceived differences
-    shaping : str    F
+    shaping : str    the shaping F
 
     Returns
     -------
-    (R,) float64    mean of the two predictions of each pair
+    (R,) float64    for each pair, the mean of two predictions: one without each motion of the pair
 
     Raises
     ------
-    MotionError    if too few pairs are known without some motion
+    MotionError    if, without some motion, too few pairs have a perceived difference
     """
     means = [part.means(shaping) for part in parts]
     pairs = parts[0].pairs
@@ -282,12 +294,12 @@ def _predicted(means: Floats, raw: Floats) -> Floats:
 
 
 def _solve(means: Floats, perceived: Floats, weights: Floats | None) -> Floats:
-    """Find the non-negative (1 + K,) constant and weights with the least sum of squares over the known pairs."""
+    """Fit the constant and the weights (1 + K,), all at least 0, by least squares over pairs with known differences."""
     known = np.isfinite(perceived)
     if np.count_nonzero(known) < means.shape[1] + 1:
         raise MotionError(
-            f"{np.count_nonzero(known)} pairs of motions are known, but {means.shape[1] + 1} numbers are to be fitted; "
-            "show more motions",
+            f"only {np.count_nonzero(known)} pairs of motions have a perceived difference, but the fit has "
+            f"{means.shape[1] + 1} unknowns; show more motions",
             code="too-few-pairs",
         )
     table, target = np.column_stack((np.ones(len(means)), means))[known], perceived[known]

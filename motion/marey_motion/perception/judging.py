@@ -1,4 +1,7 @@
-"""Judgements of people about which two of four motions are most similar, and the difference table made of them."""
+"""Judgements of the participants of a study, and the table of perceived differences computed from them.
+
+In each trial, a participant sees four motions side by side, and chooses the two that look most similar.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +18,22 @@ TRIALS = 63
 _CANDIDATE_DRAWS = 24
 _FIRST, _SECOND = np.triu_indices(SHOWN, 1)
 _PAIR_OF = {(int(one), int(other)): pair for pair, (one, other) in enumerate(zip(_FIRST, _SECOND, strict=True))}
-"""Index of the chosen pair by its two places on the screen."""
+"""Index of a pair of places on the screen, by the two places."""
 Answer = tuple[int, Sequence[int], tuple[int, int]]
 """Answered trial: number of the participant, motions shown by place, and the two chosen places in ascending order."""
 
 
 @dataclass(frozen=True, eq=False)
 class Judgements:
-    """T answered trials. Trials that timed out are not among them.
+    """T answered trials, without the trials that timed out.
 
     Parameters
     ----------
     motion_count : int    number of motions n
     participants : (T,) int64    participant of each trial, from 0
     shown : (T, 4) int64    the motions shown, by place on the screen; all different
-    chosen : (T,) int64    which pair was chosen: index into the pairs of places (0, 1), (0, 2), (0, 3), (1, 2), (1, 3)
-        and (2, 3)
+    chosen : (T,) int64    the chosen pair, as an index into the pairs of places (0, 1), (0, 2), (0, 3), (1, 2), (1, 3),
+        (2, 3)
     """
 
     motion_count: int
@@ -49,20 +52,20 @@ class Judgements:
         wrong |= (self.chosen < 0) | (self.chosen >= len(_FIRST)) | (self.participants < 0)
         if wrong.any():
             raise MotionError(
-                f"the motions must be four different numbers below {self.motion_count}, and the chosen pair a number "
-                f"below {len(_FIRST)}",
+                f"the motions must be four different numbers from 0 to {self.motion_count - 1}, the chosen pair a "
+                f"number from 0 to {len(_FIRST) - 1}, and the participant a number of at least 0",
                 where=f"trial {int(np.argmax(wrong))}",
             )
 
 
 @dataclass(frozen=True, eq=False)
 class DifferenceTable:
-    """The differences of n motions that people perceived.
+    """Perceived differences between n motions.
 
     Parameters
     ----------
     differences : (n, n) float64    1 - chosen / shown; 0 on the diagonal, NaN for pairs that were never shown together
-    shown, chosen : (n, n) int64    how often each pair was shown together and chosen; symmetric
+    shown, chosen : (n, n) int64    numbers of trials in which each pair was shown together, and chosen; symmetric
     """
 
     differences: Floats
@@ -71,7 +74,7 @@ class DifferenceTable:
 
     @property
     def noise_ceiling(self) -> float:
-        """Root mean square of the pairs' binomial standard errors: no fit can be expected to be closer than this."""
+        """Root mean square of the binomial standard errors of all pairs: the least error to expect of any fit."""
         pairs = np.triu_indices(len(self.shown), 1)
         shown, p = self.shown[pairs], self.differences[pairs]
         seen = shown > 0
@@ -92,11 +95,15 @@ def judgements_of(motion_count: int, answers: Sequence[Answer]) -> Judgements:
 
     Raises
     ------
-    MotionError    if there are no answers, or an answer names other places or motions than there are
+    MotionError    if there are no answers, or if an answer names a place or a motion that does not exist
     """
     wrong = next((number for number, answer in enumerate(answers) if answer[2] not in _PAIR_OF), None)
     if wrong is not None:
-        raise MotionError(f"the places {answers[wrong][2]} are no pair", where=f"trial {wrong}")
+        raise MotionError(
+            f"the chosen places {answers[wrong][2]} must be two different numbers from 0 to {SHOWN - 1}, in ascending "
+            "order",
+            where=f"trial {wrong}",
+        )
     who = np.array([answer[0] for answer in answers], np.int64)
     shown = np.array([answer[1] for answer in answers], np.int64).reshape(len(answers), -1)
     return Judgements(motion_count, who, shown, np.array([_PAIR_OF[answer[2]] for answer in answers], np.int64))
@@ -105,10 +112,10 @@ def judgements_of(motion_count: int, answers: Sequence[Answer]) -> Judgements:
 def draw_trials(
     motion_count: int, participants: int, seed: int, trials: int = TRIALS, *, earlier: Ints | None = None
 ) -> Ints:
-    """Draw the motions of a study's trials, in balance.
+    """Draw the motions of a study's trials so that all motions, and all pairs, are shown about equally often.
 
-    Each participant sees every motion equally often, or once more or less if that is impossible. For each participant,
-    several draws are made, and the one that balances pairs best over the participants so far is kept.
+    The numbers of times that a participant sees each motion differ by at most one. For each participant, several draws
+    are made. The draw is kept with which the counts of all pairs, over the participants so far, differ least.
 
     Parameters
     ----------
@@ -116,8 +123,8 @@ def draw_trials(
     participants : int    number of participants
     seed : int    the same seed gives the same trials
     trials : int    trials per participant
-    earlier : (M, trials, 4) int64, optional    trials of the M first participants of this study, as drawn before; the
-        result contains those of the next participants, the same as if all were drawn together
+    earlier : (M, trials, 4) int64, optional    trials already drawn for the first M participants of this study; the
+        result contains the trials of the next participants, which are the same as if all were drawn together
 
     Returns
     -------

@@ -1,7 +1,8 @@
 """Compiled motion maps: weighted shaped differences between all frames of two clips.
 
-Points of joint class k are [starts[k], starts[k + 1]); x of the class is scales[k] times the sum of the distances of
-its points. Rows come from a (n, P, C), columns from b (P, C, m), so that inner loops run over adjacent numbers.
+The points of joint class k are [starts[k], starts[k + 1]). The difference x of the class is scales[k] times the sum of
+the distances of its points. Rows of a map come from a (n, P, C), columns from b (P, C, m) for P points with C
+coordinates, so that inner loops run over adjacent numbers.
 """
 
 from __future__ import annotations
@@ -53,10 +54,10 @@ def _turns(a, b, cosines, sines):
 
 @contracted
 def vectors(a, b, starts, scales, weights, shape, ground, out):
-    """Fill out (n, m) for vectors of three components; shape is (shaping, exponent).
+    """Fill out (n, m) with Σ weight · F(x), where a and b hold vectors; shape is (shaping, exponent).
 
-    ground holds ground points (n, P, 2) and (P, 2, m) by which each pair of frames is superposed; without points, the
-    vectors are compared as they are.
+    ground holds the points on the ground, (n, P, 2) and (P, 2, m), by which each pair of frames is superposed; if P is
+    0, the vectors are compared without superposition.
     """
     m = b.shape[2]
     turned = ground[0].shape[1] > 0
@@ -87,7 +88,7 @@ def vectors(a, b, starts, scales, weights, shape, ground, out):
 
 @contracted
 def rotations(a, b, starts, scales, weights, shape, measure, out):
-    """Fill out (n, m) for unit quaternions, whose sign makes no difference.
+    """Fill out (n, m) with Σ weight · F(x), where a and b hold unit quaternions of any sign.
 
     Angles are computed from the chord between quaternions: the arccosine of a dot product loses half of the digits of
     small angles, and is not 0 for equal rotations.

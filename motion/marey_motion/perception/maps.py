@@ -14,10 +14,10 @@ from marey_motion.perception.measuring import MeasuredClip, classes_measured, re
 from marey_motion.perception.metric import Component, PerceptualMetric, shaped
 
 MOST_CELLS = 50_000_000
-"""Greatest number of cells of a map that is kept whole; greater maps are computed in blocks of rows."""
+"""Maximum number of cells of a motion map in memory; larger maps are computed in blocks of rows (`map_blocks`)."""
 SHAPING_NUMBERS = {"euclid": 0, "manhattan": 1, "sigmoid": 2, "power": 3}
 ANGLE_NUMBERS = {"half_angle": 0, "log_norm": 0, "angle": 1, "one_minus_dot": 2}
-"""Numbers by which kernels know shapings and measures of angles."""
+"""Numbers of the measures of angles in kernels."""
 _BLOCK_CELLS = 4_000_000
 _NO_POINTS = np.empty((1, 0, 2))
 
@@ -97,12 +97,12 @@ def joint_differences(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric
     ----------
     a, b : MeasuredClip    n frames each
     metric : PerceptualMetric    conventions of the measurement; the weights have no influence
-    component : Component    says which measurement is compared
+    component : Component    component whose measurement is compared
 
     Returns
     -------
-    (n, K) float64    x per frame and class of `classes_measured`: radians, units of length, or units of length in
-        `velocity_interval_s`
+    (n, K) float64    x per frame and class of `classes_measured`: angles in the measure `metric.angle`, positions in
+        the metric's units of length, velocities in units of length per `metric.velocity_interval_s`
 
     Raises
     ------
@@ -148,7 +148,7 @@ def paired_distances(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric)
 
 
 def weighted_shaped(differences: Floats, component: Component, classes: tuple[str, ...]) -> Floats:
-    """Compute Σ w F(x).
+    """Compute the weighted mean Σ w F(x) of shaped differences, with weights w that are divided by their sum.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def weighted_shaped(differences: Floats, component: Component, classes: tuple[st
 
 
 def _distances(raw: Floats, component: Component, metric: PerceptualMetric) -> Floats:
-    """Compute c + N · raw; equal poses, whose weighted mean is exactly 0, get the distance of the identity rule."""
+    """Compute distances c + N · raw; equal poses (raw = 0) have the distance 0 or c, depending on `metric.identity`."""
     found = component.norm * raw
     found += component.constant * (raw > 0.0) if metric.identity == "zero" else component.constant
     return found
@@ -201,13 +201,13 @@ def _layout(clip: MeasuredClip, metric: PerceptualMetric, component: Component) 
 
 
 def _angled(clip: MeasuredClip) -> Indices:
-    """Find the points of the classes that have angles."""
+    """Return the indices of the points whose joint classes have angles."""
     kept = classes_measured(clip, "angles")
     return np.flatnonzero(np.repeat([name in kept for name in clip.classes], np.diff(clip.starts)))
 
 
 def _vectors(clip: MeasuredClip, component: Component, metric: PerceptualMetric) -> Floats:
-    """Take positions or velocities (F, P, 3) in the units of the metric."""
+    """Convert the positions or velocities (F, P, 3) of a clip to the units of the metric."""
     if component.measurement == "velocities":
         return clip.velocities * (metric.velocity_interval_s / metric.length_unit_m)
     if metric.root_alignment != "kovar2d":
@@ -218,13 +218,13 @@ def _vectors(clip: MeasuredClip, component: Component, metric: PerceptualMetric)
 
 
 def _centred(clip: MeasuredClip) -> Floats:
-    """Take the ground points (F, P, 2) relative to their mean."""
+    """Compute the points (F, P, 2) on the ground relative to their mean in each frame."""
     ground = clip.positions[..., ::2]
     return np.asarray(ground - ground.mean(axis=1, keepdims=True), dtype=np.float64)
 
 
 def _superposed(a: MeasuredClip, b: MeasuredClip, vectors: Floats) -> Floats:
-    """Rotate vectors (n, P, 3) of `b` about the vertical as the frames of `b` are rotated to superpose those of `a`."""
+    """Rotate `vectors` (n, P, 3) about the vertical as the points of `b` must be rotated to superpose those of `a`."""
     ones, others = (_centred(clip) @ (1.0, 1.0j) for clip in (a, b))
     turn = np.sum(ones * others.conj(), axis=1, keepdims=True)
     turn = np.where(np.abs(turn) > 0.0, turn / np.maximum(np.abs(turn), np.finfo(float).tiny), 1.0)

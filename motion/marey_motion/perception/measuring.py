@@ -1,4 +1,7 @@
-"""The view that the metric has of a clip: rotations, positions and velocities of joints, without place and heading."""
+"""Measurement of clips for a perceptual metric: rotations, positions and velocities of joints.
+
+Positions and velocities are relative to the place and heading of the body, so that these do not affect distances.
+"""
 
 from __future__ import annotations
 
@@ -53,15 +56,15 @@ class MeasuredClip:
         return len(self.positions)
 
     def sliced(self, start: int, stop: int) -> MeasuredClip:
-        """Take a range of frames.
+        """Select a range of frames.
 
         Parameters
         ----------
-        start, stop : int    half-open range
+        start, stop : int    first frame, and the frame after the last
 
         Returns
         -------
-        MeasuredClip    stop - start frames of a clip that is no loop, as views
+        MeasuredClip    the frames [start, stop), not cyclic; its arrays are views
         """
         frames = slice(start, stop)
         return replace(
@@ -77,7 +80,8 @@ class MeasuredClip:
 
         Parameters
         ----------
-        times : (n,) float64    fractional frames from 0 to F - 1; for a cyclic clip any, counted on over the seam
+        times : (n,) float64    fractional frame numbers from 0 to F - 1; for a cyclic clip also others, as frame F is
+            frame 0 of the next cycle
 
         Returns
         -------
@@ -108,16 +112,17 @@ class MeasuredClip:
 def measure_motion(motion: Motion, body: MatchingBody, rate_hz: float, *, seam: LoopSeam | None = None) -> MeasuredClip:
     """Measure a motion for the metric.
 
-    The ground below the hips becomes the origin of each frame. The heading that is removed is the mean over a second,
-    about a cycle of walking; so the rotation of the pelvis to and fro within a cycle stays. At both ends, the heading
-    is extrapolated from the line that fits the nearest second.
+    In each frame, the point on the ground below the hips becomes the origin, and a smoothed heading is removed. The
+    heading is smoothed by a line fitted to the second around the frame, which is about one cycle of walking. So the
+    rotation of the pelvis to and fro within a cycle is not removed. Near the ends of the clip, the line is fitted to
+    its first or last second.
 
     Parameters
     ----------
     motion : Motion    F frames
     body : MatchingBody    body of its skeleton
     rate_hz : float    frames per second
-    seam : LoopSeam, optional    movement of a loop from each round to the next; None for a clip that is no loop
+    seam : LoopSeam, optional    movement of a loop from each round to the next; None if the clip is not a loop
 
     Returns
     -------
@@ -170,7 +175,9 @@ def require_comparable(a: MeasuredClip, b: MeasuredClip) -> None:
             code="skeletons-differ",
         )
     if a.classes != b.classes:
-        raise MotionError("the joint mappings of the clips have different joints; give both the same mapping")
+        raise MotionError(
+            "the joint mappings of the clips contain different joints of the metric; give both clips the same mapping"
+        )
     if abs(a.rate_hz - b.rate_hz) > 1e-6 * a.rate_hz:
         raise MotionError(
             f"the clips have {a.rate_hz:g} and {b.rate_hz:g} frames per second; resample one of them",
@@ -188,7 +195,7 @@ def classes_measured(clip: MeasuredClip, measurement: Measurement) -> tuple[str,
 
     Returns
     -------
-    tuple of str    classes; angles have neither hand nor toe
+    tuple of str    joint classes; for angles without hand and toe
     """
     return tuple(name for name in clip.classes if measurement != "angles" or name not in WITHOUT_ANGLES)
 
@@ -202,14 +209,15 @@ def _classes(body: MatchingBody) -> tuple[tuple[str, ...], list[int], Ints]:
     found = {name: joints for name, joints in found.items() if joints}
     if not found:
         raise MotionError(
-            "the joint mapping has no joint of the metric; map head, arms and legs", code="mapping-invalid"
+            "the joint mapping contains none of the joints that a perceptual metric compares; map head, arms and legs",
+            code="mapping-invalid",
         )
     starts = np.cumsum([0, *map(len, found.values())])
     return tuple(found), [joint for joints in found.values() for joint in joints], starts
 
 
 def _line_of_a_second(values: Floats, rate_hz: float) -> Floats:
-    """Fit a line to each value's nearest second, or to the whole clip if it is shorter."""
+    """Smooth values by a line fitted to the second around each value, or to all values if they are fewer."""
     from scipy.signal import savgol_filter
 
     window = min(window_frames(DIRECTION_WINDOW_S, rate_hz), len(values) - (len(values) + 1) % 2)

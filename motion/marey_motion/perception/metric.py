@@ -36,7 +36,7 @@ JOINT_CLASSES: Mapping[str, tuple[str, ...]] = {
     "calf": ("left_knee", "right_knee"),
     "toe": ("left_toe", "right_toe"),
 }
-"""Standard joints of each class. A bone is where its upper end is, so the forearm is at the elbow."""
+"""Standard joints of each class. A class named after a bone has the joints at its upper end: forearm has the elbows."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,9 @@ class Component:
     ----------
     measurement : str    angles, positions or velocities
     shaping : str    F: euclid x², manhattan x, sigmoid x / (x + 1), power x^exponent
-    constant : float    c, which is added for poses that differ
-    norm : float    N, by which the weighted mean is multiplied
+    constant : float    c, which is added for poses that differ, and for equal poses only if the metric's `identity` is
+        "constant"
+    norm : float    N, by which the weighted mean Σ w F(x) is multiplied
     weights : mapping of str to float    weight of each joint class, with any sum; they are divided by their sum
     exponent : float    exponent of the shaping `power`
     """
@@ -69,7 +70,8 @@ class Component:
         numbers = [self.constant, self.norm, self.exponent, *self.weights.values()]
         if not (np.isfinite(numbers).all() and min(numbers) >= 0 and sum(self.weights.values()) > 0):
             raise MotionError(
-                "constant, norm, exponent and weights must be finite and at least 0, and one weight above 0",
+                "constant, norm, exponent and weights must be finite and at least 0, and at least one weight must be "
+                "above 0",
                 where=self.measurement,
             )
         if self.exponent == 0:
@@ -94,7 +96,8 @@ class Component:
         if found.sum() <= 0:
             needed = ", ".join(name for name, weight in self.weights.items() if weight > 0)
             raise MotionError(
-                f"the skeleton has none of the joints that {self.measurement} compare: {needed}; map these joints",
+                f"the joint mapping contains none of the joint classes with a weight for {self.measurement}: {needed}; "
+                "map these joints",
                 code="mapping-invalid",
             )
         return np.asarray(found / found.sum())
@@ -106,17 +109,17 @@ class PerceptualMetric:
 
     Parameters
     ----------
-    name : str    name for people, with the study that it comes from
+    name : str    name shown to users
     components : tuple of Component    at most one per measurement
-    shares : tuple of float    shares a of the components, non-negative, with the sum 1
+    shares : tuple of float    weights of the components' distances, non-negative, with the sum 1
     angle : str    measure of angles; half_angle is arccos |q · p|, angle is twice as large, one_minus_dot is
         1 - |q · p|, and log_norm, the norm of the logarithm of the rotation from q to p, equals half_angle
-    side_reduce : str    whether the difference of a class is the mean or the sum of both sides
-    identity : str    zero: equal poses have the distance 0; constant: they have the distance c
+    side_reduce : str    whether the difference of a class is the "mean" or the "sum" over left and right joint
+    identity : str    zero: equal poses have the distance 0; constant: equal poses have the distance c
     root_alignment : str    mean_heading: the hips are placed at the origin, and the mean heading of one second is
         removed; kovar2d: each pair of poses is superposed by the best rotation about the vertical and the best shift
     length_unit_m : float    metres per unit of length
-    velocity_interval_s : float    seconds in which velocities count the displacement
+    velocity_interval_s : float    seconds; velocities are compared as displacements in this time
     """
 
     name: str
@@ -132,7 +135,7 @@ class PerceptualMetric:
     def __post_init__(self) -> None:
         measured = [one.measurement for one in self.components]
         if not measured or len(set(measured)) != len(measured) or len(self.shares) != len(measured):
-            raise MotionError("a metric needs components of different measurements, and one share for each")
+            raise MotionError("a metric needs components of different measurements, and one share for each component")
         if min(self.shares) < 0 or abs(sum(self.shares) - 1.0) > 1e-9:
             raise MotionError("the shares must be at least 0 and have the sum 1", where="shares")
         units = (self.length_unit_m, self.velocity_interval_s)
@@ -153,11 +156,11 @@ def metric_of(document: MetricDocument) -> PerceptualMetric:
 
     Raises
     ------
-    MotionError    if the distances of the metric were defined by another version of the computation
+    MotionError    if the metric was fitted to distances of another version of the computation
     """
     if document.code_version != METRIC_CODE:
         raise MotionError(
-            f"the metric {document.name} is defined for {document.code_version}, and this version computes "
+            f"the metric {document.name} was made for {document.code_version}, but this version of Marey computes "
             f"{METRIC_CODE}; fit the metric again",
             code="metric-of-other-version",
         )
@@ -175,7 +178,7 @@ def metric_of(document: MetricDocument) -> PerceptualMetric:
 
 
 def published_component(measurement: Measurement, shaping: Shaping) -> Component:
-    """Make a component of the weights that the paper prints.
+    """Make a component with weights that Pražák et al. published.
 
     Parameters
     ----------
@@ -184,7 +187,7 @@ def published_component(measurement: Measurement, shaping: Shaping) -> Component
 
     Returns
     -------
-    Component    weights as printed
+    Component    component with the published constant, norm and weights
 
     Raises
     ------
@@ -192,7 +195,7 @@ def published_component(measurement: Measurement, shaping: Shaping) -> Component
     """
     if shaping not in metrics.PUBLISHED[measurement]:
         raise MotionError(
-            "the paper prints no weights for this shaping; use euclid, manhattan or sigmoid", where=shaping
+            "Pražák et al. published no weights for this shaping; use euclid, manhattan or sigmoid", where=shaping
         )
     return _component_of(metrics.published_component(measurement, shaping))
 
@@ -200,12 +203,12 @@ def published_component(measurement: Measurement, shaping: Shaping) -> Component
 def published_metric(
     shaping: Shaping = "sigmoid", shares: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3)
 ) -> PerceptualMetric:
-    """Make the metric of the paper.
+    """Make the metric of Pražák et al.
 
     Parameters
     ----------
     shaping : str    euclid, manhattan or sigmoid
-    shares : tuple of float    shares of angles, positions and velocities; the paper does not print any
+    shares : tuple of float    shares of angles, positions and velocities, which were not published
 
     Returns
     -------
@@ -220,7 +223,7 @@ def published_metric(
 
 
 def uniform_metric(shaping: Shaping = "manhattan", exponent: float = 1.0) -> PerceptualMetric:
-    """Make a metric that weights all joint classes equally, for comparison with fitted ones.
+    """Make a metric that weights all joint classes equally, for comparison with fitted metrics.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Order and two groups of motions, from a table of their differences (figures 3 and 4 of the paper)."""
+"""Order and two groups of motions, from a table of their differences (Pražák et al., figures 3 and 4)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ class MotionOrder:
     ----------
     order : (n,) int64    motions by increasing projection
     projections : (n,) float64    projection of each motion on the first principal component
-    groups : (n,) int64    0 or 1; group 0 begins the order
-    membership : (n,) float64    membership in group 1: distance to the centre of group 0, divided by the sum of both
+    groups : (n,) int64    group of each motion, 0 or 1; group 0 has the smaller mean projection
+    membership : (n,) float64    degree of membership in group 1, from 0 to 1: the distance from the centre of group 0,
+        divided by the sum of the distances from both centres
     """
 
     order: Ints
@@ -33,12 +34,13 @@ class MotionOrder:
 def order_motions(differences: Floats, seed: int = 0) -> MotionOrder:
     """Order motions and divide them into two groups by k-means.
 
-    The rows of the table are points. The sign of the first component is the one with which its largest entry is
-    positive.
+    Each motion is a point whose coordinates are its row of the table. The sign of the first principal component is
+    chosen so that its entry of largest magnitude is positive.
 
     Parameters
     ----------
-    differences : (n, n) float64    symmetric table; a missing difference is taken as the mean of those of both motions
+    differences : (n, n) float64    symmetric table; a missing difference (NaN) of two motions is replaced by the mean
+        of both motions' mean differences
     seed : int    seed of the starts of k-means
 
     Returns
@@ -66,7 +68,7 @@ def order_along_first_component(differences: Floats) -> Ints:
 
     Parameters
     ----------
-    differences : (n, n) float64    symmetric table; a missing difference is taken as the mean of those of both motions
+    differences : (n, n) float64    symmetric table; missing differences (NaN) are replaced as in `order_motions`
 
     Returns
     -------
@@ -93,6 +95,9 @@ def _filled(differences: Floats) -> Floats:
         raise MotionError(f"an order needs a square table of at least 3 motions, not {differences.shape}")
     known = np.where(np.eye(n, dtype=bool), np.nan, differences)
     if (alone := ~np.isfinite(known).any(axis=1)).any():
-        raise MotionError("a motion has no known difference to another", where=f"motion {int(np.argmax(alone))}")
+        raise MotionError(
+            "the motion has no known difference from any other motion, but an order needs at least one",
+            where=f"motion {int(np.argmax(alone))}",
+        )
     means = np.nanmean(known, axis=1)
     return np.where(np.isfinite(differences), differences, 0.5 * (means[:, None] + means))

@@ -1,7 +1,7 @@
 """Registration curves of two clips (Kovar and Gleicher 2003), and the perceptual distance of clips along them.
 
-Path and time function come from `marey_motion.alignment`: the path there has the same slope limit, and its time
-function is strictly increasing. New are costs over a neighbourhood, cyclic shifts and the spline.
+The path, with its slope limit, and the strictly increasing time function are computed by `marey_motion.alignment`. This
+module adds costs that are averaged over a neighbourhood, cyclic shifts, and smoothing of the time function by a spline.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class RegistrationCurve:
 
     Parameters
     ----------
-    path : (L, 2) int32    cheapest path: pairs of frames; in the second clip counted from `shift`
-    shift : int    frame of the second clip that corresponds to frame 0 of the first; 0 unless both are cyclic
-    times : (n,) float64    strictly increasing frame of the second clip for each of n frames of the first; for cyclic
-        clips counted on over the seam
+    path : (L, 2) int32    cheapest path, as pairs of frames; frames of the second clip are counted from `shift`
+    shift : int    frame of the second clip that corresponds to frame 0 of the first; 0 unless both clips are cyclic
+    times : (n,) float64    for each of n frames of the first clip, the corresponding frame of the second clip; strictly
+        increasing, so beyond the number of frames after the seam of a cyclic clip
     mean_cost : float    mean cost along the path
     """
 
@@ -50,8 +50,8 @@ class ClipDistance:
 
     Parameters
     ----------
-    total : float    mean frame distance along the curve, mean of both directions
-    by_component : tuple of float    the same for each component of the metric, before it is multiplied by its share
+    total : float    mean frame distance along the registration curve, averaged over both directions
+    by_component : tuple of float    distance by each component of the metric alone, not multiplied by its share
     """
 
     total: float
@@ -62,8 +62,8 @@ def registration_curve(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetri
     """Find the correspondence of the frames of two clips.
 
     The cost of two frames is the mean distance over a neighbourhood of `NEIGHBOURHOOD_S`. The path takes at most
-    `SLOPE_LIMIT` consecutive steps in one clip alone. If both clips are cyclic, every frame of the second is tried as
-    its first, and the path with the least mean cost is kept.
+    `SLOPE_LIMIT` consecutive steps in one clip alone. If both clips are cyclic, every frame of the second clip is tried
+    as the start of its cycle, and the path with the least mean cost is kept.
 
     Parameters
     ----------
@@ -124,8 +124,8 @@ def neighbourhood_costs(costs: Floats, reach: int, *, cyclic: bool = False) -> F
 def increasing_spline(times: Floats, rate_hz: float) -> Floats:
     """Smooth a time function by a strictly increasing cubic spline with a knot every `KNOT_SPACING_S`.
 
-    A spline whose coefficients increase is increasing. So the steps between coefficients are fitted, by least squares
-    with a lower bound. First and last value do not change.
+    The spline increases if its coefficients increase. Therefore, the differences between successive coefficients are
+    fitted by least squares, with a positive lower bound. The first and the last value do not change.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def clip_distance(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric) ->
 
     Raises
     ------
-    MotionError    as `registration_curve`
+    MotionError    for the same reasons as in `registration_curve`
     """
     directions = np.array([_directed(*pair, metric) for pair in ((a, b), (b, a))])
     raw = directions.mean(axis=0)
@@ -197,11 +197,12 @@ def differences_along_curve(a: MeasuredClip, b: MeasuredClip, metric: Perceptual
 
     Returns
     -------
-    tuple of (n + m, K) float64    x per frame and class, for each component of the metric
+    tuple of (n + m, K) float64    difference x per frame and class, for each component of the metric: n frames of `a`
+        with their corresponding frames of `b`, then m frames of `b` with those of `a`
 
     Raises
     ------
-    MotionError    as `registration_curve`
+    MotionError    for the same reasons as in `registration_curve`
     """
     pairs = [(one, other.at(registration_curve(one, other, metric).times)) for one, other in ((a, b), (b, a))]
     return tuple(
@@ -211,7 +212,7 @@ def differences_along_curve(a: MeasuredClip, b: MeasuredClip, metric: Perceptual
 
 
 def _directed(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric) -> list[float]:
-    """Compute the mean of Σ w F(x) along the curve from `a` to `b`, for each component."""
+    """Compute, for each component of the metric, the mean of Σ w F(x) along the registration curve from `a` to `b`."""
     there = b.at(registration_curve(a, b, metric).times)
     return [
         float(

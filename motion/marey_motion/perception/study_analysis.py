@@ -37,24 +37,24 @@ from marey_schemas.documents.metrics import MetricDocument, Shaping
 
 SHAPINGS: tuple[Shaping, ...] = ("euclid", "manhattan", "sigmoid", "power")
 INTERVAL = (0.025, 0.975)
-"""Quantiles of the intervals of weights."""
+"""Quantiles of the resampled weights at the ends of their intervals."""
 
 Progress = Callable[[float, float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class ComponentFit:
-    """A component that was fitted to the table.
+    """A component that was fitted to the table of perceived differences.
 
     Parameters
     ----------
-    component : Component    constant, N and weights
+    component : Component    constant, norm and weights
     quality : FitQuality    agreement with the table
     predicted : (R,) float64    fitted differences
-    left_out : (R,) float64, optional    differences predicted without the motions of the pair; None for `power`, and if
-        there are too few motions
-    intervals : dict    95 % interval of each weight, divided by the sum of all, over resampled participants; empty for
-        `power`, and if there are too few participants
+    left_out : (R,) float64, optional    differences predicted by `leave_one_motion_out`; None for the shaping `power`,
+        and if there are too few motions
+    intervals : dict    95 % interval of each weight, as a share of the sum of all weights, over resampled participants;
+        empty for the shaping `power`, and if there are too few participants
     """
 
     component: Component
@@ -66,7 +66,7 @@ class ComponentFit:
 
 @dataclass(frozen=True, eq=False)
 class FittedMetric:
-    """A metric of several components with one shaping, whose shares were fitted to the table.
+    """A metric of several components with one shaping; components and shares were fitted to the perceived differences.
 
     Parameters
     ----------
@@ -85,16 +85,16 @@ class FittedMetric:
 
 @dataclass(frozen=True, eq=False)
 class StudyAnalysis:
-    """Everything that the judgements of a study say.
+    """Results of the analysis of a study's judgements.
 
     Parameters
     ----------
     judgements : Judgements    answered trials
     table : DifferenceTable    perceived differences
-    violated, checked : int    triangle inequalities that the table violates, and all of them
-    order : MotionOrder, optional    order and groups; None if some motion has no known difference
+    violated, checked : int    numbers of triangle inequalities that the table violates, and that were checked
+    order : MotionOrder, optional    order and groups; None if they could not be computed
     fits : tuple of FittedMetric    one for each shaping that could be fitted, best first
-    refusals : tuple of str    why something could not be computed
+    refusals : tuple of str    for each result that could not be computed, its name and the reason
     """
 
     judgements: Judgements
@@ -112,7 +112,7 @@ class StudyAnalysis:
 
     @property
     def chosen_share(self) -> float:
-        """Share of the shown pairs that were chosen; one of six for any answers."""
+        """Share of the shown pairs that were chosen; always 1/6, because one of the six pairs of a trial is chosen."""
         return float(self.table.chosen.sum() / self.table.shown.sum())
 
     @property
@@ -128,7 +128,7 @@ def measure_pairs(clips: Sequence[MeasuredClip], progress: Progress) -> list[Pai
     Parameters
     ----------
     clips : sequence of MeasuredClip    n clips of one skeleton
-    progress : function    called with the number of pairs done, the number of all, and a note
+    progress : function    called with the number of pairs done, the number of all pairs, and a note
 
     Returns
     -------
@@ -158,13 +158,13 @@ def measure_pairs(clips: Sequence[MeasuredClip], progress: Progress) -> list[Pai
 def analyse_study(
     judgements: Judgements, pairs: Sequence[PairDifferences], *, name: str, draws: int, seed: int
 ) -> StudyAnalysis:
-    """Analyse judgements.
+    """Analyse the judgements of a study: compute the table, order the motions, and fit metrics.
 
     Parameters
     ----------
     judgements : Judgements    answered trials
-    pairs : sequence of PairDifferences    differences of all pairs of motions by each measurement; without any, no
-        metric is fitted
+    pairs : sequence of PairDifferences    differences of all pairs of motions by each measurement; if empty, no metric
+        is fitted
     name : str    name of the study, for the names of the metrics
     draws : int    number of draws of participants for the intervals of weights
     seed : int    seed of these draws and of the groups
@@ -251,7 +251,7 @@ def _left_out(parts: Sequence[PairDifferences], perceived: Floats, shaping: Shap
 def _intervals(
     judgements: Judgements, differences: PairDifferences, shaping: Shaping, draws: int, seed: int
 ) -> dict[str, tuple[float, float]]:
-    """Return the 95 % interval of each weight, divided by the sum of all, over draws of participants."""
+    """Return the 95 % interval of each weight, as a share of the sum of all weights, over draws of participants."""
     if not draws:
         return {}
     shown, chosen = pair_counts_by_participant(judgements)
@@ -274,7 +274,7 @@ def metric_to_tree(analysis: StudyAnalysis, fit: FittedMetric, study: Mapping[st
 
     Parameters
     ----------
-    analysis : StudyAnalysis    the analysis that made it
+    analysis : StudyAnalysis    the analysis to which the metric belongs
     fit : FittedMetric    the metric
     study : mapping    reference to the revision of the study
 

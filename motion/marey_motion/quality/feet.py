@@ -1,7 +1,8 @@
-"""Feet of a clip: foot skate after three published definitions, skate ratio, and consistency of contacts.
+"""Feet of a clip: foot skate by three published definitions, skate ratio, and consistency of contacts.
 
-Positions are in the world, Y up, in metres. A step is the interval from one frame to the next; it has the speed of the
-straight line between them, and, if nothing else is said, the height of its first frame.
+Positions are in the world, Y up, in metres. A step is the interval from one frame to the next. The speed in a step is
+the distance between the two positions of the point, divided by the interval. The height in a step is the height in its
+first frame, unless a function states otherwise.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from marey_motion.editing.annotations.contacts import contact_labels
 from marey_schemas.options.quality import QualityOptions
 
 PLANTED_PERCENTILE = 5.0
-"""Percentile of the heights of a joint that is its height while it stands; lower ones are noise or a pose of tests."""
+"""Percentile of a joint's heights that is used as its height while the foot stands, so that outliers are ignored."""
 
 Mask = NDArray[np.bool_]
 
@@ -43,15 +44,15 @@ class Feet:
     def of(
         cls, ankles: Floats, toes: Floats, rate_hz: float, options: QualityOptions, contacts: Mask | None = None
     ) -> Feet:
-        """Measure heights from the floor of the options, and label the contacts.
+        """Measure the heights of ankles and toes above the floor that `options` selects, and label their contacts.
 
         Parameters
         ----------
         ankles, toes : (F, 2, 3) float64    left and right, metres
         rate_hz : float    frames per second
-        options : QualityOptions    the floor
-        contacts : (F, 2) bool, optional    labelled contacts of the left and the right foot; None to detect those of
-            each point by its speed
+        options : QualityOptions    options, of which the floor is used
+        contacts : (F, 2) bool, optional    labelled contacts of the left and the right foot; if None, the contacts of
+            each point are detected by its speed
 
         Returns
         -------
@@ -84,7 +85,7 @@ def weighted_skate(feet: Feet, options: QualityOptions) -> float:
     Parameters
     ----------
     feet : Feet    at least 2 frames
-    options : QualityOptions    the height H
+    options : QualityOptions    options, of which the height H (`weighted_height_m`) is used
 
     Returns
     -------
@@ -107,7 +108,7 @@ def near_floor(feet: Feet, options: QualityOptions) -> Mask:
     Parameters
     ----------
     feet : Feet    F frames
-    options : QualityOptions    the height
+    options : QualityOptions    options, of which `near_height_m` is used
 
     Returns
     -------
@@ -130,8 +131,8 @@ def skate_by_height(feet: Feet, options: QualityOptions) -> float | None:
 
     Notes
     -----
-    As `FootSkateFromHeight` of the Kimodo benchmark (NVIDIA, 2026): speeds in space, and all steps of both toes that
-    begin near the floor count equally.
+    As `FootSkateFromHeight` of the Kimodo benchmark (NVIDIA, 2026): the mean of the speeds in space over all steps of
+    both toes that begin near the floor.
     """
     near = near_floor(feet, options)[:-1]
     return float(feet.speeds[:, _TOES][near].mean()) if near.any() else None
@@ -180,7 +181,7 @@ def skate_ratio(feet: Feet, options: QualityOptions) -> float | None:
 
 
 def contact_consistency(feet: Feet, options: QualityOptions) -> float:
-    """Compute how often labelled contacts agree with contacts by height and speed.
+    """Compute the share of labels of contact that agree with contacts determined by height and speed.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Bends of knees and elbows, and how far they exceed a range.
+"""Bending angles of knees and elbows, and the angles by which they exceed an allowed range.
 
-These are the joints whose bend can be measured on any skeleton, because it is an angle between two bones. Bends of
-other joints depend on the pose in which a rig calls them 0.
+Knees and elbows can be measured on any skeleton, because their bending angle is the angle between two bones. The angles
+of other joints depend on the pose in which a rig defines them as 0.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Hinge(NamedTuple):
     Parameters
     ----------
     joint : "knee" or "elbow"
-    start, middle, end : indices of the joints at which the upper bone begins, the hinge is, and the lower bone ends
-    axis : (3,) float64    direction in the frame of `start` about which the hinge bends in its natural direction; None
-        if it is not known, so that only the size of a bend can be measured
+    start, middle, end : joint indices of hip, knee and ankle, or of shoulder, elbow and wrist
+    axis : (3,) float64    axis, in the frame of `start`, about which the hinge bends in its natural direction; None if
+        the axis is not known, so that the sign of the bending angle cannot be measured
     """
 
     joint: str
@@ -49,8 +49,8 @@ def find_hinges(skeleton: Skeleton, mapping: JointMapping, axes: Mapping[str, Jo
 
     Returns
     -------
-    tuple of Hinge    knees know the direction of their bend if the rest pose shows it; elbows do not, since forearms
-        of rigs turn about their own axis in different joints
+    tuple of Hinge    the hinges; knees have an axis if the rest pose shows it; elbows have none, because rigs twist the
+        forearm in different joints
     """
     doubtful = rest_pose_doubts(skeleton, mapping)
     found = []

@@ -25,9 +25,9 @@ from marey_schemas.documents.quality import SPEED_EDGES_M_S, TURN_EDGES_DEG_S
 from marey_schemas.options.quality import QualityOptions
 
 JERK_FRAMES = 4
-"""Least number of frames: the third derivative needs four."""
+"""Least number of frames of a measured clip, because the third derivative needs four frames."""
 RATE_TOLERANCE = 0.01
-"""Share by which a clip's rate may be below the wanted one, so that 29.97 Hz counts as 30 Hz."""
+"""Share by which a clip's frame rate may be below the required rate, so that 29.97 Hz is accepted as 30 Hz."""
 _NOT_JUDGED = ("finger", "thumb", "hold_point")
 
 
@@ -38,7 +38,7 @@ class QualityBody:
     Parameters
     ----------
     body : MatchingBody    feet, hips and shoulders
-    judged : tuple of int    joints whose jerk counts: the standard joints without fingers
+    judged : tuple of int    joints whose jerk is measured: the standard joints without fingers
     hinges : tuple of Hinge    knees and elbows
     """
 
@@ -92,7 +92,8 @@ class ClipQuality:
     ----------
     values : value of each measure of `marey_schemas.documents.quality.MEASURES`; None if it is undefined
     frames : number of measured frames
-    speed_seconds, turn_seconds : (bins,) float64    seconds of windows by bins of speed and of turn rate
+    speed_seconds, turn_seconds : (bins,) float64    duration, in seconds, of the motion in each bin of speed, and in
+        each bin of turn rate
     """
 
     values: Mapping[str, float | None]
@@ -162,7 +163,8 @@ def measure_quality(
 def _beyond_limits(clip: Clip, body: QualityBody, options: QualityOptions) -> tuple[Floats, Floats | None]:
     """Compute depth below the floor (F,) and excess of joint limits (F,) in every frame of the clip.
 
-    They are compared with fixed limits, so they need no common rate, and no frame may be left out.
+    The clip is not resampled: these measures are compared with fixed limits, so they do not depend on the frame rate,
+    and a frame that resampling leaves out might be the worst one.
     """
     motion, skeleton = Motion.of(clip), clip.skeleton
     points = _points(clip, motion)
@@ -221,5 +223,5 @@ def _points(clip: Clip, motion: Motion) -> Floats:
 
 
 def _seconds(values: Floats, edges: tuple[float, ...]) -> Floats:
-    """Count values in bins; values beyond the outermost edges count in the outermost bins."""
+    """Count values in bins; values beyond the outermost edges are counted in the outermost bins."""
     return np.histogram(np.clip(values, edges[0], edges[-1]), bins=edges)[0].astype(np.float64)

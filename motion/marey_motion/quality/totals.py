@@ -14,7 +14,7 @@ from marey_schemas.documents.evaluations import CONFIDENCE
 from marey_schemas.documents.quality import LEAST_TAKES
 
 DRAWN_AT_ONCE = 4_000_000
-"""Greatest number of counts of drawn takes that are held at a time."""
+"""Maximum size of the table of draws by takes that is in memory at a time."""
 
 
 class MeanOverClips(NamedTuple):
@@ -30,12 +30,12 @@ class MeanOverClips(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DrawnTotals:
-    """Totals of M measures, with what the draws of takes gave.
+    """Totals of M measures over clips, and the same totals for B bootstrap draws of takes.
 
     Parameters
     ----------
-    totals : total of each measure, by its name
-    draws : (B, M) float64    totals of the drawn takes, NaN where no drawn clip has a value; B is 0 without draws
+    totals : total of each measure, by the name of the measure
+    draws : (B, M) float64    totals of the draws, NaN where no drawn clip has a value; B may be 0
     """
 
     totals: Mapping[str, MeanOverClips]
@@ -54,7 +54,7 @@ def total_over_clips(
 
     Parameters
     ----------
-    values : mapping of str to sequence    N values of each of M measures; None where it is undefined
+    values : mapping of str to sequence    N values of each of M measures; None where a measure is undefined for a clip
     seconds : sequence of float    durations of the N clips
     takes : sequence of str    take of each clip
     draws : int    number of bootstrap draws; takes are drawn with replacement, with all their clips
@@ -62,7 +62,7 @@ def total_over_clips(
 
     Returns
     -------
-    DrawnTotals    M totals; clips without a value are left out of the total of that measure
+    DrawnTotals    M totals; the total of a measure leaves out clips for which the measure is undefined
     """
     table = np.array([[np.nan if one is None else one for one in column] for column in values.values()]).T
     known = np.isfinite(table)
@@ -92,8 +92,8 @@ def changes_from(one: DrawnTotals, reference: DrawnTotals) -> dict[str, tuple[fl
 
     Returns
     -------
-    dict of str to (float, float or None, float or None)    difference and ends of its interval; without the measures
-        that one of both lacks. The ends are None if a total has no interval.
+    dict of str to (float, float or None, float or None)    difference and ends of its interval, by measure; measures
+        that are undefined in `one` or in `reference` are left out. The ends are None if a total has no interval.
     """
     found: dict[str, tuple[float, float | None, float | None]] = {}
     for column, (name, total) in enumerate(one.totals.items()):
@@ -116,7 +116,7 @@ def interval(drawn: Floats) -> tuple[float | None, float | None]:
 
     Returns
     -------
-    (float or None, float or None)    None without values
+    (float or None, float or None)    lower and upper end; None if there are no values
     """
     held = drawn[np.isfinite(drawn)]
     if not len(held):
@@ -134,7 +134,7 @@ def _drawn(sums: Floats, masses: Floats, draws: int, seed: int) -> Floats:
 
 
 def _counts(takes: int, draws: int, seed: int) -> Iterator[NDArray[np.float64]]:
-    """Yield how often each take is drawn, (b, takes) for b draws at a time."""
+    """Yield the number of times that each take is drawn, as tables (b, takes) for b draws at a time."""
     rng = np.random.default_rng(seed)
     at_once = max(1, DRAWN_AT_ONCE // takes)
     for start in range(0, draws, at_once):

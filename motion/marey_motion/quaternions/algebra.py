@@ -19,7 +19,7 @@ def identity(*leading: int) -> Floats: ...
 @overload
 def identity(*leading: int, dtype: type[np.floating[Any]]) -> AnyFloats: ...
 def identity(*leading: int, dtype: type[np.floating[Any]] = np.float64) -> AnyFloats:
-    """Make rotations that change nothing.
+    """Make identity rotations.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def conjugate(q: ArrayLike) -> AnyFloats:
 
 
 def normalise(q: ArrayLike) -> AnyFloats:
-    """Bring quaternions to unit length.
+    """Scale quaternions to unit length.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Retargeting of clips: the transfer of poses, and corrections of what the transfer leaves wrong."""
+"""Retargeting of clips: transfer of the poses, then corrections of trunk, floor height, feet and hands."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class RetargetedClip:
     Parameters
     ----------
     clip : Clip    the motion
-    checks : tuple of CheckWarning    what differs from the poses of the source, and how far
+    checks : tuple of CheckWarning    differences from the poses of the source, with their sizes
 
     Examples
     --------
@@ -50,10 +50,10 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
     translated bones; if the target is the source skeleton itself, the clip keeps its translations. The path of the
     pelvis is the source's path times the plan's scale; a root above the pelvis moves with the pelvis without turning.
 
-    Three corrections change this. Pelvis, spine and neck turn where the rotations of the source would put the hips or
-    the ends of the spine's bones elsewhere than its joint positions do. The middle of the hips travels instead of the
-    pelvis if a rest pose does not show how far the hips are below the pelvis. The whole clip is moved up or down if
-    its soles would not stand on the floor of the source.
+    There are three corrections. Pelvis, spine and neck are turned where the rotations of the source alone would not
+    give the hip line and the spine the directions that they have in the source. The middle of the hips, instead of the
+    pelvis, follows the scaled path of the source if a rest pose does not show how far the hips are below the pelvis.
+    The whole clip is moved up or down if its soles would not stand on the floor of the source.
 
     Parameters
     ----------
@@ -82,13 +82,13 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
 
 
 def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOptions | None = None) -> RetargetedClip:
-    """Retarget a clip as `retarget` does, and report what was changed.
+    """Retarget a clip as `retarget` does, and report the corrections.
 
     Parameters
     ----------
     clip : Clip    motion of the plan's source skeleton
     plan : RetargetPlan    result of `plan_retarget`
-    options : RetargetOptions, optional    what is kept beside the poses: feet, hands
+    options : RetargetOptions, optional    whether planted feet, and the positions of hands, are kept in addition
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Feet of a retargeted clip: they stay in place, with their soles on the floor, while those of the source touch it."""
+"""Feet of a retargeted clip: they stay in place on the floor while the feet of the source touch the floor."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from marey_schemas.wording import counted
 
 _OPTIONS = PlantOptions()
 FAST_KNEES = 1.25
-"""Speed of a knee, as a multiple of the greatest in the source, above which the result has a warning."""
+"""Greatest knee speed in the result, divided by the greatest in the source, above which the result has a warning."""
 
 
 class KeptFeet(NamedTuple):
-    """A clip whose feet stay in place, and checks of what was moved."""
+    """A clip whose feet stay in place, and findings about the changes."""
 
     clip: Clip
     checks: tuple[CheckWarning, ...]
@@ -38,8 +38,8 @@ class KeptFeet(NamedTuple):
 def keep_feet(source: Clip, result: Clip, plan: RetargetPlan, floor: Floor | None) -> KeptFeet:
     """Keep the feet of a retargeted clip in place while those of the source touch the floor.
 
-    Touching soles get the height over the floor that they have in the source, times the scale. The feet are planted
-    (`editing.foot_plants`), which lowers the root where legs are too short, and damps stretching knees.
+    While a sole touches the floor, its height is the height of the source's sole times the scale. The feet are planted
+    by `editing.foot_plants`, which lowers the root where the legs are too short, and damps knees that nearly stretch.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def keep_feet(source: Clip, result: Clip, plan: RetargetPlan, floor: Floor | Non
 
     Returns
     -------
-    KeptFeet    F frames, with the feet moved, and checks
+    KeptFeet    F frames, with the feet moved, and findings
 
     Raises
     ------

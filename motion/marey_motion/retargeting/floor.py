@@ -1,4 +1,4 @@
-"""The floor of a retargeted clip: how far hands and feet are below it, although those of the source are not."""
+"""The floor of a retargeted clip: depths of hands and feet below the floor that the source does not have."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _KINDS = {"ankle": ("foot", "keep_feet"), "wrist": ("hand", "keep_hands")}
 
 
 class Floor(NamedTuple):
-    """Height of the soles where the source stands, in the source and in the result, metres."""
+    """Height of the floor in source and result, in metres: the height of the soles while the source stands."""
 
     source_m: float
     result_m: float
 
 
 def depths_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, floor: Floor, end: str) -> Floats:
-    """Compute how far hands or feet of a result are below the floor.
+    """Compute how much deeper hands or feet of a result are below the floor than those of the source.
 
-    Soles are below the lowest joints, so hands on the ground may be a little below the soles' height. Therefore a hand
-    or foot may be as far below it as that of the source, times the scale.
+    The height of the floor is that of the soles, and a hand on the ground may be a little lower. Therefore, the depth
+    of the source's hand or foot, times the scale, is allowed and subtracted.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def depths_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, 
 
     Returns
     -------
-    (F, 2) float64    left and right, metres; 0 above the floor
+    (F, 2) float64    depths of left and right, metres; 0 if not deeper than allowed
     """
     ends = [[joints[f"{side}_{end}"] for side in SIDES] for joints in (plan.source_joints, plan.target_joints)]
     allowed = np.maximum(floor.source_m - sole_heights(before, plan.source, ends[0]), 0.0)
@@ -48,7 +48,7 @@ def depths_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, 
 
 
 def warn_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, floor: Floor) -> CheckWarning | None:
-    """Say how far hands and feet are below the floor.
+    """Warn if hands or feet are below the floor.
 
     Parameters
     ----------

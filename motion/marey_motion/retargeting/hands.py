@@ -1,4 +1,4 @@
-"""Hands of a retargeted clip: they are where those of the source are, in proportion to the reach of the arms."""
+"""Hands of a retargeted clip: they are moved to the positions of the source's hands, scaled to the target."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from marey_motion.rigs.standard import SIDES
 from marey_schemas.options.retargeting import HandsFrom
 
 ELBOW_DAMPING_RAD = math.radians(10.0)
-"""Angle before the full stretch of an arm at which the damping of its elbow begins."""
+"""Bend of an elbow, in radians, below which the stretching of the arm is damped."""
 
 
 class KeptHands(NamedTuple):
-    """A clip whose hands have the positions of the source's hands, scaled, and what was moved."""
+    """A clip whose hands have the scaled positions of the source's hands, and a finding about the changes."""
 
     clip: Clip
     check: CheckWarning
@@ -57,24 +57,26 @@ class _Arms(NamedTuple):
 
     @property
     def arm_m(self) -> float:
-        """Mean length of the arms."""
+        """Mean length of the two arms, in metres."""
         bones = ((self.shoulders, self.elbows), (self.elbows, self.wrists))
         return sum(float(np.linalg.norm(a - b, axis=-1).mean()) for a, b in bones)
 
     @property
     def reach_m(self) -> float:
-        """Distance of a hand from the middle of the shoulders when both arms are stretched out sideways."""
+        """Distance, in metres, of a hand from the middle of the shoulders if the arms are stretched out sideways."""
         return self.arm_m + 0.5 * float(np.linalg.norm(self.shoulders[:, 0] - self.shoulders[:, 1], axis=-1).mean())
 
 
 def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom, floor: Floor | None) -> KeptHands:
-    """Move the hands of a retargeted clip to the positions of the source's hands, in proportion.
+    """Move the hands of a retargeted clip to the scaled positions of the source's hands.
 
-    About the shoulders, a hand gets the vector that it has in the source from the middle of the shoulders, times a
-    constant scale. The scale is the ratio of the lengths of the arms, or that of the reaches to the side if this is
-    smaller, so that hands are within reach in front of the body and beside it. In the world, positions are scaled like
-    the path of the pelvis, and can be out of reach. Shoulders and elbows turn; hands keep their orientations in the
-    world. Stretching elbows are damped, so that they do not snap. Hands that would be below the floor are lifted to it.
+    If `about` is "shoulders", the vector from the middle of the shoulders to a hand is that of the source, times a
+    constant scale. The scale is the smaller of two ratios of target to source: the ratio of the arm lengths, and the
+    ratio of the sideways reaches. So hands are within reach in front of the body and beside it. If `about` is "world",
+    the world positions of the source's hands are scaled like the path of the pelvis; they may be out of reach.
+
+    Shoulders and elbows turn; hands keep their orientations in the world. Elbows that nearly stretch are damped, so
+    that they do not snap. Hands that would be below the floor are lifted to the floor.
 
     Parameters
     ----------
@@ -120,7 +122,7 @@ def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom,
 
 
 def _reached(motion: Motion, targets: Floats, plan: RetargetPlan, limbs: Sequence[TwoBoneLimb]) -> Motion:
-    """Bring both wrists to their targets (F, 2, 3), as far as the arms reach."""
+    """Move both wrists to their targets (F, 2, 3), or towards targets that the arms do not reach."""
     for side, limb in enumerate(limbs):
         motion = solve_two_bone(
             plan.target,

@@ -1,4 +1,4 @@
-"""Plans for retargeting: which joints of two skeletons belong together, with the constant rotations between them."""
+"""Plans for retargeting: pairs of corresponding joints of two skeletons, with the constant rotations between them."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ class RetargetPlan:
             start, middle = ("hip", "knee") if end == "ankle" else ("shoulder", "elbow")
             raise MappingError(
                 f"to keep {'feet' if end == 'ankle' else 'hands'}, {start}, {middle} and {end} of both sides must be "
-                f"mapped in both skeletons; this is not so for {' and '.join(missing)}; map these joints, or leave the "
-                "option out",
+                f"mapped in both skeletons; the limb that ends at {' or '.join(missing)} is incomplete; map these "
+                "joints, or leave the option out",
                 code="limbs-not-mapped",
                 where=missing[0],
             )
@@ -334,7 +334,8 @@ def _trunk(skeleton: Skeleton, pelvis: int, up: NDArray[np.float64]) -> NDArray[
 def _shows_drop(skeleton: Skeleton, joints: Mapping[str, int], up: NDArray[np.float64], side: str) -> bool:
     """Return whether the rest pose shows how far a hip is below the pelvis.
 
-    Joints between pelvis and hip may be bent in any way at rest, unless that pose stands.
+    This is so if the hip is a child of the pelvis, or if the rest pose is a standing pose. Otherwise, joints between
+    pelvis and hip may be bent in any way in the rest pose.
     """
     pelvis, hip = joints["pelvis"], joints[f"{side}_hip"]
     if skeleton.parents[hip] == pelvis:
@@ -348,10 +349,10 @@ def _shows_drop(skeleton: Skeleton, joints: Mapping[str, int], up: NDArray[np.fl
 
 
 def _anchors(pairs: tuple[JointPair, ...], bodies: tuple[_Upright, ...]) -> tuple[JointPair, ...]:
-    """Choose the joints whose middle travels as in the source.
+    """Choose the joints whose middle follows the scaled path of the source: the pelvis, or else both hips.
 
-    A drop from the pelvis to the hips that a rest pose does not show is not part of the scale, so the pelvis would be
-    too high or too low by its share of that drop.
+    If a rest pose does not show how far the hips are below the pelvis, the scale cannot include this distance. The hips
+    would then be too high or too low if the pelvis followed the path.
     """
     paired = {pair.standard: pair for pair in pairs}
     hips = [paired[f"{side}_hip"] for side in SIDES if f"{side}_hip" in paired]

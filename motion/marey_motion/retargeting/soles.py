@@ -1,4 +1,4 @@
-"""Soles of a retargeted clip: they stand on the source's floor, whatever the shape of the feet of both skeletons."""
+"""Soles of a retargeted clip: the whole clip is moved up or down so that they stand on the floor of the source."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from marey_motion.rigs.standard import SIDES
 from marey_schemas.options.annotations import ContactOptions
 
 SOLES_OFF_M = 0.01
-"""Distance between soles and floor up to which a clip is left as it is."""
+"""Distance between soles and floor, in metres, up to which a clip is not moved."""
 
 
 class LevelledClip(NamedTuple):
-    """A clip whose soles are on the floor, a warning if it was moved for this, and the floor if it is known.
+    """A clip whose soles are on the floor, a warning if the clip was moved, and the floor if it is known.
 
     `points` are the positions (F, n, 3) of joints and end sites in the source and in the clip; None without a floor.
     """
@@ -37,7 +37,8 @@ class LevelledClip(NamedTuple):
 def level_soles(source: Clip, result: Clip, plan: RetargetPlan) -> LevelledClip:
     """Move a retargeted clip up or down, so that its soles stand as high as those of the source, times the scale.
 
-    The whole clip is moved by one distance. The heights are compared where the lower foot of the source stands.
+    All frames are moved by the same distance. The heights of the soles are compared in the frames in which the lower
+    foot of the source stands.
 
     Parameters
     ----------
@@ -69,9 +70,10 @@ def level_soles(source: Clip, result: Clip, plan: RetargetPlan) -> LevelledClip:
 
 
 def _feet_on_the_floor(points: AnyFloats, heights: Floats, plan: RetargetPlan, frame_rate_hz: float) -> Flags:
-    """Find the frames and feet (F, 2) that show where the floor of the source is.
+    """Find the frames and feet (F, 2) that show the height of the source's floor.
 
-    They are the lower foot while it is in stance; if it never is, the lower foot in the frames in which it is lowest.
+    A frame and foot is chosen if the foot is the lower one and in stance. If there is none, soles are chosen that are
+    not above the `LOWEST_SHARE` quantile of the heights of the lower sole.
     `points` (F, n, 3) are the joints of the source, and `heights` (F, 2) the heights of its soles.
     """
     joints = plan.source_joints

@@ -1,4 +1,4 @@
-"""Compiled retargeting, kept apart so that importing the rest of the package does not load numba."""
+"""Compiled retargeting, in a separate module so that importing other modules does not load numba."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from marey_motion.skeleton import Skeleton
 
 
 def transfer(clip: Clip, plan: RetargetPlan, rotations: NDArray[np.float32]) -> Clip:
-    """Give the target's joints the orientations of the source's joints, and its anchor the path of the source's.
+    """Transfer the orientations of the source's joints to the target, and the scaled path of the source's anchors.
 
     Parameters
     ----------

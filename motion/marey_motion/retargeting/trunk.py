@@ -1,9 +1,10 @@
-"""Pelvis, spine and neck of a retargeted clip: they follow joint positions where the rotations of joints mislead.
+"""Pelvis, spine and neck of a retargeted clip: corrections by joint positions where the rotations are not sufficient.
 
-The pelvis of a source may say something else than the line between its hips, for example because joints between pelvis
-and hips turn. The legs of the target would cross, so its pelvis follows the line. And a skeleton may have joints in the
-spine or neck that the other one does not have. Their rotations would be lost, so the bone that stands for them points
-from its first joint to its last one.
+The rotation of the source's pelvis may disagree with the line between the hips, for example because joints between
+pelvis and hips turn. The legs of the target would then cross, so the pelvis of the target follows the line. Also, one
+of the skeletons may have joints in the spine or neck that the other skeleton lacks. The rotations of these joints would
+be lost. So the part of the target's spine or neck that corresponds to them gets the direction that it has in the
+source, from its first to its last joint.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from marey_motion.retargeting.planning import RetargetPlan
 from marey_motion.rigs.axes import bone_end
 
 HIP_LINE_DEG = 10.0
-"""Angle between pelvis and hip line up to which the pelvis is believed."""
+"""Largest angle between the source's pelvis and hip line, in degrees, that is not corrected."""
 DROPPED_DEG = 1.0
-"""Angle up to which a bone with dropped joints is left as its first joint has it."""
+"""Largest angle, in degrees, between a bone with dropped joints and its source direction that is not corrected."""
 _PELVIS = "pelvis"
 _SPINE = ("spine", "spine_1", "spine_2", "neck")
 
@@ -35,8 +36,8 @@ class TrunkTurns:
 
     Parameters
     ----------
-    rotations : (F, 4·J) float32    local rotations; the given ones if nothing has to be corrected
-    checks : tuple of CheckWarning    what was corrected, and how far
+    rotations : (F, 4·J) float32    local rotations; the input rotations if nothing has to be corrected
+    checks : tuple of CheckWarning    the corrections, with their sizes
     """
 
     rotations: NDArray[np.float32]
@@ -45,7 +46,7 @@ class TrunkTurns:
 
 @dataclass(frozen=True, eq=False)
 class _TrunkLine:
-    """A line between two standard joints, whose direction in the target one joint determines.
+    """A line from the standard joint `start` to `end`, whose direction depends on the rotation of the joint `turned`.
 
     `direction` (3,) is the line's direction in the target, in the frame of the source's joint `turned`.
     """
@@ -61,7 +62,7 @@ class _TrunkLine:
 
 
 def follow_trunk(clip: Clip, plan: RetargetPlan, rotations: NDArray[np.float32]) -> TrunkTurns:
-    """Turn pelvis, spine and neck so that hips and dropped joints of the target are where the source has them.
+    """Turn pelvis, spine and neck so that the target's hip line and spine have the directions of the source.
 
     Each joint is turned by the shortest rotation in each frame; the other joints keep their orientations in the world.
 
@@ -104,7 +105,8 @@ def follow_trunk(clip: Clip, plan: RetargetPlan, rotations: NDArray[np.float32])
 def _lines(plan: RetargetPlan) -> list[_TrunkLine]:
     """List the hip line, and the bones of spine and neck that have joints between their ends in one of the skeletons.
 
-    Joints between the ends of a line are at rest in the target. If they copy rotations, there is nothing to correct.
+    The corrections assume that joints between the ends of a line keep their rest rotations in the target. If the plan
+    has joints that copy rotations (`carried`), the list is empty.
     """
     if plan.carried:
         return []
@@ -136,7 +138,7 @@ def _drops(plan: RetargetPlan, start: str, end: str) -> bool:
 
 
 def _checks(turned: list[tuple[_TrunkLine, float]], plan: RetargetPlan) -> tuple[CheckWarning, ...]:
-    """Make the checks from the lines that were followed, with the largest angle of each in degrees."""
+    """Make findings about the corrected lines, with the largest angle of each line in degrees."""
     pelvis = {_source_name(plan, line): most for line, most in turned if line.turned == _PELVIS}
     spine = {_source_name(plan, line): most for line, most in turned if line.turned != _PELVIS}
     found = (

@@ -176,7 +176,7 @@ def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
 def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _PosedBody:
     if not same_hierarchy(skeleton, motion.skeleton):
         raise ClipError(
-            "the skeleton of this motion differs from the one whose axes are computed; give a motion of that skeleton",
+            "the skeleton of this motion differs from the skeleton whose axes are computed; use a motion of the latter",
             where="motion",
         )
     count = min(motion.frame_count, FRAMES_READ)
@@ -235,7 +235,10 @@ class _PosedBody:
 
     @cached_property
     def up(self) -> Floats:
-        """Direction from the pelvis up to the shoulders, or to the nearest known joints, perpendicular to the hips."""
+        """Upward unit directions (K, 3) of the trunk, perpendicular to the hip line.
+
+        They point from the pelvis to the middle of the shoulders, or else between the nearest mapped joints.
+        """
         levels = [level for level in map(self._level, _LEVELS) if level is not None]
         if len(levels) < 2:
             raise MappingError(

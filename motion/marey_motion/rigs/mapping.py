@@ -157,9 +157,9 @@ def require_trust(mapping: JointMapping) -> JointMapping:
     MappingError    if the confidence of the mapping is below `LEAST_CONFIDENCE`
     """
     if mapping.confidence < LEAST_CONFIDENCE:
-        found = f"its joints were recognised with a confidence of {mapping.confidence:.2f} only"
+        found = f"the joints of the skeleton were recognised with a confidence of {mapping.confidence:.2f} only"
         reasons = f" ({'; '.join(mapping.notes)})" if mapping.notes else ""
-        advice = "correct them with `marey skeleton map`, or confirm them with its --confirm"
+        advice = "correct the mapping with `marey skeleton map`, or confirm it with `marey skeleton map --confirm`"
         raise MappingError(f"{found}{reasons}; {advice}", code="mapping-uncertain")
     return mapping
 

@@ -1,4 +1,4 @@
-"""Standard joints: which of them a body needs, how they follow each other, and which are mirror images."""
+"""Standard joints: the essential joints of a body, the chains that the joints form, and pairs of left and right."""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
 """Kernels of searches by example: lower bounds of the distances of poses and windows from an example.
 
-A ball holds a few consecutive rows: a centre for each vector and rotation, and a radius. By the triangle inequality,
-the distance of a joint from a pose to any row in the ball is at least the distance to the centre less the radius. For
-rotations, this holds for the chord of quaternions, which is never longer than half of the angle. The shapings increase,
-so the bounds of joints give a bound of the metric. Likewise, several samples of the example can be enclosed in a ball,
-whose reach is subtracted, too: then one bound holds for all of them.
+A row holds the features of one pose. A ball encloses a few consecutive rows of a clip: it has a centre and a radius for
+each vector and each rotation. By the triangle inequality, the distance of a vector of a pose from that of any row in
+the ball is at least its distance from the centre minus the radius. For rotations, this holds for the chord of
+quaternions, which is never longer than half of the angle. The shapings F increase, so the bounds of single vectors and
+rotations give a bound of the metric. Several samples (compared poses) of the example can be enclosed in a ball, too. If
+the radius of this ball is also subtracted, one bound holds for all these samples.
 
 All arithmetic is in single precision. Inner loops run over adjacent numbers of one-dimensional arrays, so that the
 compiler uses vector instructions.
@@ -20,16 +21,16 @@ from marey_motion.kernels import compiled, contracted
 from marey_motion.perception.map_kernels import ANGLE, EUCLID, MANHATTAN, ONE_MINUS_DOT, SIGMOID
 
 _CHUNK = 512
-"""Balls that are computed at a time: enough that calls cost little, and few enough for the processor's cache."""
+"""Number of balls that are computed at a time: large, for few calls, but small enough for the processor's cache."""
 _GAP = 32
-"""Balls between two ranges that are computed rather than skipped."""
+"""Largest number of balls between two ranges with which the ranges are joined."""
 _RANGE_COST, _STEP_COST = 60, 15
-"""Time for each range, and for the rows of a step, relative to the time for a ball."""
+"""Time to process a range of balls, and time to compare the rows of a step, relative to the time for a ball."""
 
 
 @contracted
 def _add_rotation_bounds(w, u, v, z, cw, cu, cv, cz, radii, reach, factor, measure, x):
-    """Add factor · lower bound of the distance from a rotation to those in n balls with centres (cw, cu, cv, cz)."""
+    """Add to x (n,) factor · lower bound of the distance from a rotation to the rotations in each of n balls."""
     if measure == ANGLE:
         factor = factor * np.float32(2.0)
     for j in range(x.shape[0]):
@@ -42,7 +43,7 @@ def _add_rotation_bounds(w, u, v, z, cw, cu, cv, cz, radii, reach, factor, measu
 
 @contracted
 def _add_vector_bounds(u, v, z, cu, cv, cz, radii, reach, factor, x):
-    """Add factor · lower bound of the distance from a vector to those in n balls with centres (cu, cv, cz)."""
+    """Add to x (n,) factor · lower bound of the distance from a vector to the vectors in each of n balls."""
     for j in range(x.shape[0]):
         du, dv, dz = u - cu[j], v - cv[j], z - cz[j]
         x[j] += factor * max(np.float32(math.sqrt(du * du + dv * dv + dz * dz)) - (radii[j] + reach), np.float32(0.0))
@@ -50,7 +51,7 @@ def _add_vector_bounds(u, v, z, cu, cv, cz, radii, reach, factor, x):
 
 @contracted
 def _add_shaped(x, weight, shaping, exponent, raw):
-    """Add weight · F(x)."""
+    """Add weight · F(x) to raw (n,), where F is the shaping."""
     if shaping == SIGMOID:
         for j in range(x.shape[0]):
             raw[j] += weight * (x[j] / (x[j] + np.float32(1.0)))
@@ -67,16 +68,16 @@ def _add_shaped(x, weight, shaping, exponent, raw):
 
 @contracted
 def _add_constant(constant, always, raw, total):
-    """Add a component and its constant."""
+    """Add the distances by a component, raw (n,) and the constant, to total (n,)."""
     for j in range(raw.shape[0]):
         total[j] += raw[j] + (constant if always or raw[j] > np.float32(0.0) else np.float32(0.0))
 
 
 @contracted
 def bounds_within(q, reaches, centres, radii, begin, end, tables, vectors, x, raw, total):
-    """Fill total (n,) with lower bounds of the distances from a ball of poses to the rows in the balls [begin, end).
+    """Fill total (n,) with lower bounds of the distances from a ball of samples to the rows in the balls [begin, end).
 
-    q (width,) and reaches (41,) are centre and radii of the ball of poses; x and raw (n,) are scratch arrays.
+    q (width,) and reaches (41,) are the centre and the radii of the ball of samples; x and raw (n,) are scratch arrays.
     """
     rotated, places, factors, weights, starts, constants, shapings, exponents, measure, always = tables
     total[:] = np.float32(0.0)
@@ -105,10 +106,10 @@ def bounds_within(q, reaches, centres, radii, begin, end, tables, vectors, x, ra
 
 @contracted
 def pose_bounds(query, reaches, centres, radii, ranges, tables, vectors, out):
-    """Fill out (G, balls) with lower bounds of the distances from G balls of poses to the rows in balls.
+    """Fill out (G, balls) with lower bounds of the distances from G balls of samples to the rows in each ball.
 
-    query (G, width) and reaches (G, 41) are centres and radii of the balls of poses. ranges (n, 2) lists half-open
-    ranges of balls to which the tables apply; the others are left as they are.
+    query (G, width) and reaches (G, 41) are the centres and radii of the balls of samples. ranges (n, 2) lists the
+    half-open ranges of balls to which `tables` apply; out does not change for other balls.
     """
     x, raw, total = np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.float32)
     for place in range(ranges.shape[0]):
@@ -124,18 +125,19 @@ def pose_bounds(query, reaches, centres, radii, ranges, tables, vectors, out):
 
 @contracted
 def _add_later(bounds, later, sums):
-    """Add the bounds of the balls that are `later` balls after each."""
+    """Add to each element of sums (balls,) the bound of the ball that is `later` balls after it."""
     for b in range(sums.shape[0] - later):
         sums[b] += bounds[b + later]
 
 
 @contracted
 def step_sums(poses, groups, steps, firsts, ball_firsts, per_ball, out):
-    """Fill out (S,) with lower bounds of the sums of distances of all windows that start in a step.
+    """Fill out (S,), for each of S steps, with a lower bound of the summed distances of any window that starts in it.
 
-    poses (G, balls) holds bounds of single poses. Sample t belongs to group groups[t], and is steps[t] after the start.
-    The run r has the steps [firsts[r], firsts[r + 1]), and balls of `per_ball` steps from ball_firsts[r]. Steps in
-    which no window starts that is within the run get infinity.
+    poses (G, balls) holds the bounds that `pose_bounds` computes. Sample t of the example belongs to group groups[t],
+    and is steps[t] steps after the start of the window. Run r (the rows of one clip) has the steps
+    [firsts[r], firsts[r + 1]); its first ball is ball_firsts[r], and each ball has `per_ball` steps. A step gets
+    infinity if windows that start in it exceed the run.
     """
     samples = groups.shape[0]
     # Windows that start in the same step of their balls have their samples in balls that are equally far apart.
@@ -153,7 +155,10 @@ def step_sums(poses, groups, steps, firsts, ball_firsts, per_ball, out):
 
 @compiled
 def _covering_ranges(balls, ranges):
-    """List half-open ranges that cover some balls, ascending, and return their number and the balls in them."""
+    """Fill `ranges` with ascending half-open ranges that cover the given balls.
+
+    Returns the number of ranges, and the number of balls in all of them.
+    """
     count, covered = 0, 0
     for place in range(balls.shape[0]):
         if count and balls[place] <= ranges[count - 1, 1] + _GAP:
@@ -167,15 +172,17 @@ def _covering_ranges(balls, ranges):
 
 @compiled
 def narrow_steps(query, shard, bounds, places, layout, tables, limit):
-    """Drop steps whose windows are certainly above a limit, by bounds of single samples.
+    """Drop steps whose windows certainly have a sum of distances above `limit`, by bounds of single samples.
 
-    query holds samples (T, width), offsets (T,), groups (T,), and at last the order in which samples are used. shard
-    holds rows, centres and radii. bounds holds those of groups (G, balls), room for those of samples (T, balls), and
-    the sums (n,) of the steps. places (n, 2) are the ball in which each step lies, ascending, and its number in the
-    ball. For one sample after the other, the bound of its group is replaced by its own. This ends when comparing the
-    rows of the steps that are left takes less time.
+    For one sample after the other, the bound of its group is replaced by the bound of the sample itself, which is
+    tighter. The function stops as soon as comparing the rows of the remaining steps takes less time.
 
-    Returns the steps that are left (m,), and the number of samples whose bounds have been replaced.
+    query holds the samples (T, width), their offsets (T,) and groups (T,), an order that is not used, and the order
+    (T,) in which bounds of samples are computed. shard holds rows, centres and radii. bounds holds the bounds of groups
+    (G, balls), an array (T, balls) that is filled with the bounds of samples, and the sums (n,) of the steps. places
+    (n, 2) has, for each step, its ball, ascending, and its number within the ball.
+
+    Returns the indices (m,) of the remaining steps, and the number of samples whose bounds were computed.
     """
     samples, offsets, groups, _, turns = query
     _, centres, radii = shard

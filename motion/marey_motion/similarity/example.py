@@ -1,4 +1,4 @@
-"""Example of a search: the poses of a window of a clip, and groups of them that are compared together at first."""
+"""Example of a search: the poses of a window of a clip, and groups of similar poses for a first, rough comparison."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from marey_motion.similarity.shards import STEP_ROWS
 from marey_motion.similarity.weighing import MetricTables
 
 MOST_SAMPLES = 32
-"""Greatest number of poses of a window that are compared: one in each step, or in every second step, and so on."""
+"""Maximum number of compared poses of a window: one in each step, or in every second step, every third, and so on."""
 SHORTEST_SEPARATION_ROWS = 15
-"""Hits in one clip start at least half a second apart, even if the example is a single pose."""
+"""Least distance between the starts of two hits in one clip, in rows: half a second, even for a single pose."""
 _SAMPLES_PER_GROUP = 2.5
 
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """Window of a clip that is searched for.
+    """Window of a clip for which similar windows are searched.
 
     Parameters
     ----------
@@ -35,12 +35,12 @@ class Example:
 
     @cached_property
     def order(self) -> Ints:
-        """Order in which poses are compared: first those that are far apart, which differ in different ways."""
+        """Order (T,) in which poses are compared: poses that are far apart come first, because they differ most."""
         count = len(self.offsets)
         return np.argsort([int(f"{place:05b}"[::-1], 2) for place in range(count)], kind="stable")
 
     def rows_around(self, frame: float, rate_hz: float) -> tuple[int, int]:
-        """Find the rows at which the windows start that overlap the example.
+        """Find the rows of the example's own clip at which windows start that overlap the example.
 
         Parameters
         ----------
@@ -56,19 +56,20 @@ class Example:
 
     @property
     def separation_rows(self) -> int:
-        """Least distance of the starts of two hits in one clip: the length of the window."""
+        """Least distance, in rows, between the starts of two hits in one clip: about the length of the window."""
         return max(SHORTEST_SEPARATION_ROWS, int(self.offsets[-1]) + 1)
 
 
 @dataclass(frozen=True, eq=False)
 class GroupedExample:
-    """Example whose samples are enclosed in a few balls.
+    """Example whose samples (compared poses) are enclosed in a few balls, each with a centre and radii.
 
     Parameters
     ----------
     example : Example    T samples
-    groups : (T,) int64    number of the ball that holds each sample
-    turns : (T,) int64    order of the samples; first those whose own bounds improve most on that of their ball
+    groups : (T,) int64    number of the ball that encloses each sample
+    turns : (T,) int64    order in which bounds of single samples are computed: samples in wide balls come first,
+        because their own bounds are much tighter than those of the ball
     centres : (G, WIDTH) float32    centres of the balls
     reaches : (G, 41) float32    radii of the balls: of each vector, then of each rotation
     """
@@ -96,16 +97,16 @@ def sample_offsets(duration_s: float) -> Ints:
 
 
 def grouped(example: Example, tables: MetricTables) -> GroupedExample:
-    """Enclose similar samples of an example in balls. The choice of groups changes only the time of a search.
+    """Enclose similar samples of an example in balls; this affects only the time of a search, not its result.
 
     Parameters
     ----------
     example : Example    T samples
-    tables : MetricTables    metric by which samples are similar
+    tables : MetricTables    metric by which the similarity of samples is measured
 
     Returns
     -------
-    GroupedExample    at most one ball for `_SAMPLES_PER_GROUP` samples
+    GroupedExample    T samples in at most T / `_SAMPLES_PER_GROUP` balls, rounded up
     """
     from marey_motion.similarity.similarity_kernels import balls, group_samples
 

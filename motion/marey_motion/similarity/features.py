@@ -1,9 +1,9 @@
-"""Features of poses for searches by example: what the perceptual metric compares, at one frame rate for all clips.
+"""Features of poses for searches by example: inputs of the perceptual metric, at one frame rate for all clips.
 
-A row of features holds the positions and velocities of 15 standard joints and the rotations of 11 of them. Place and
-heading are removed as the metric removes them (`perception.measuring`). Rotations are relative to the rest pose, in
-the axes of the body, so that skeletons with other joint axes can be compared; between poses of one skeleton, their
-angles are those of the metric.
+A row of features belongs to one pose. It holds the positions and velocities of 15 standard joints and the rotations of
+11 of them. Place and heading are removed as in `perception.measuring`. Rotations are relative to the rest pose, in the
+axes of the body, so that skeletons with different joint axes can be compared. For two poses of one skeleton, the angles
+between these rotations equal those of the metric.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from marey_motion.perception.metric import JOINT_CLASSES
 from marey_schemas.documents.metrics import WITHOUT_ANGLES
 
 INDEX_RATE_HZ = 30.0
-"""Frames per second of all features: the velocities of the metric are per 1/30 s, and a fist moves 0.3 m in 1/30 s."""
+"""Rows of features per second, in all clips. By default, the metric also measures velocities per 1/30 s."""
 JOINTS = tuple(joint for joints in JOINT_CLASSES.values() for joint in joints)
 ROTATED_JOINTS = tuple(joint for name in JOINT_CLASSES if name not in WITHOUT_ANGLES for joint in JOINT_CLASSES[name])
 VECTORS = 2 * len(JOINTS)
@@ -34,7 +34,7 @@ ROTATIONS_AT = 3 * VECTORS
 WIDTH = ROTATIONS_AT + 4 * len(ROTATED_JOINTS)
 """Numbers in a row of features: positions (m), velocities (m/s), rotations (unit quaternions)."""
 CONTEXT_S = 1.0
-"""Seconds around a range of frames on which the features of the range depend: the mean heading and velocities."""
+"""Seconds before and after a range of frames on which its features depend, by the mean heading and the velocities."""
 _ROUNDED_FRAMES = 1e-6
 
 Rows = NDArray[np.float32]
@@ -106,7 +106,10 @@ def features_at(motion: Motion, body: MatchingBody, rate_hz: float, times: AnyFl
             turned = _from_rest(measured.rotations[:, point], body, joint)
             turns[:, ROTATED_JOINTS.index(JOINTS[column])] = turned
     if not np.isfinite(rows).all():
-        raise MotionError("the motion has numbers that are not finite, or too large for a search", code="not-finite")
+        raise MotionError(
+            "the motion contains numbers that are not finite, or too large for float32; repair the clip",
+            code="not-finite",
+        )
     present = np.zeros(len(JOINTS), np.bool_)
     present[columns] = True
     return PoseFeatures(rows, present)
@@ -139,7 +142,7 @@ def _partners(joints: tuple[str, ...]) -> list[int]:
 
 
 def _columns(measured: MeasuredClip, body: MatchingBody) -> Ints:
-    """Find the place of each measured joint in `JOINTS`."""
+    """Return the index in `JOINTS` of each measured joint."""
     known = [joint for name in measured.classes for joint in JOINT_CLASSES[name] if joint in body.standard_joints]
     return np.array([JOINTS.index(joint) for joint in known])
 
@@ -161,7 +164,7 @@ def _from_rest(rotations: Floats, body: MatchingBody, joint: int) -> NDArray[Any
 
 
 def _rest_heading(body: MatchingBody) -> float:
-    """Compute the heading of the rest pose in radians; 0 if it faces nowhere, as a pose lying on its side."""
+    """Compute the heading of the rest pose in radians; 0 if it has no heading, such as a body that lies on its side."""
     try:
         facing = forward_directions(body.skeleton.rest_global_positions[None], body.lefts, body.rights)
     except MotionError:

@@ -1,12 +1,13 @@
 """Exact search for the windows of many clips that resemble a window of a clip.
 
-Every step of rows has a lower bound of the distances of the windows that start in it. The steps with the lowest bounds
-are compared first, and give a limit: the distance of the worst hit. Then all windows are found whose distance is not
-above the limit. So the result is that of comparing all windows. If too few of them are hits, because overlapping
-windows are dropped, more steps are compared for a greater limit.
+The rows of all clips (the features of their poses) are divided into steps of a few rows. For each step, a lower bound
+of the distances of all windows that start in it is computed. The windows in the steps with the lowest bounds are
+compared first. The distance of the worst hit among them is a limit: next, all windows are found whose distance is at
+most the limit. So the result is the same as if all windows were compared. Of windows that overlap, only the nearest one
+is a hit. If too few hits remain, more steps are compared, which gives a greater limit.
 
-Windows overlap only if they lie in one clip, so the best windows of a shard do not depend on other shards. Those of the
-shards searched so far lower the limit for the next ones.
+Windows can only overlap within a clip, so the best windows of a shard do not depend on other shards. The best windows
+of the shards searched so far lower the limit for the next shards.
 """
 
 from __future__ import annotations
@@ -32,7 +33,10 @@ _MORE_STEPS = 8
 
 
 class Hit(NamedTuple):
-    """Window that resembles the example: its shard, run and first row in the run, and its distance."""
+    """Window that resembles the example: indices of shard, run (clip) and first row in the run, and its distance.
+
+    `mirrored` is True if the mirrored example is nearer than the example itself.
+    """
 
     shard: int
     run: int
@@ -52,11 +56,12 @@ def search_windows(
 ) -> list[Hit]:
     """Find the windows with the least mean distance from an example, without overlaps.
 
-    The hit with the least distance is taken first; the hits that overlap it are dropped, and so on.
+    The nearest window is the first hit, and all windows that overlap it are dropped. The nearest of the remaining
+    windows is the next hit, and so on.
 
     Parameters
     ----------
-    shards : sequence of SearchedShard    what is searched
+    shards : sequence of SearchedShard    shards to search
     example : Example    window to search for
     metric : PerceptualMetric    metric of poses
     count : int    greatest number of hits
@@ -65,7 +70,7 @@ def search_windows(
 
     Returns
     -------
-    list of Hit    in ascending order of distance; the same as without bounds, for any number of threads
+    list of Hit    in ascending order of distance; the result is exact, and does not depend on the number of threads
 
     Raises
     ------
@@ -92,17 +97,17 @@ def search_clips(
 
     Parameters
     ----------
-    shards : sequence of SearchedShard    what is searched
+    shards : sequence of SearchedShard    shards to search
     example : Example    window to search for
     metric : PerceptualMetric    metric of poses
     distance : float    greatest distance
-    count : int    greatest number of clips; the search ends when so many are found
-    below : bool    exclude the distance itself
+    count : int    greatest number of clips; the search ends when this number is found
+    below : bool    find only windows whose distance is less than `distance`, not equal to it
     threads : int    number of threads
 
     Returns
     -------
-    list of tuple of int    shard and run of each clip, ascending; the same as without bounds
+    list of tuple of int    indices of shard and run of each clip, ascending; the result is exact
 
     Raises
     ------
@@ -119,13 +124,15 @@ def _tables_for(example: Example, metric: PerceptualMetric) -> MetricTables:
     tables = metric_tables(metric, example.poses.present)
     if tables is None:
         raise MotionError(
-            "the skeleton of the example has none of the joints that the metric compares", code="mapping-invalid"
+            "the joint mapping of the example's skeleton contains none of the joints that a component of the metric "
+            "compares; map these joints, or use another metric",
+            code="mapping-invalid",
         )
     return tables
 
 
 _Found = list[tuple[RankedWindow, int]]
-"""Windows, each with the number of its shard."""
+"""Windows, each with the index of its shard."""
 
 
 class _Searches:
@@ -147,7 +154,7 @@ class _Searches:
         self._lock = Lock()
 
     def best(self) -> _Found:
-        """Find the hits."""
+        """Find the hits in all shards, in ascending order of distance."""
         wanted = max(_FIRST_STEPS, _STEPS_PER_HIT * self._count)
         while True:
             self._search_steps(wanted)
@@ -158,12 +165,12 @@ class _Searches:
             wanted *= _MORE_STEPS
 
     def clips_within(self, most: float) -> list[tuple[int, int]]:
-        """Find shard and run of the clips that have a window up to a distance."""
+        """Find the indices of shard and run of the clips that have a window with a distance of at most `most`."""
         found = self._pool.map(lambda search: search.clips_within(most, self._count), self._searches)
         return [(number, run) for number, runs in enumerate(found) for run in runs][: self._count]
 
     def _search_steps(self, wanted: int) -> None:
-        """Search the steps of all shards with the lowest bounds."""
+        """Search, over all shards, the `wanted` steps with the lowest bounds."""
         lowest = [
             one.least if len(one.least) <= wanted else np.partition(one.least, wanted)[:wanted]
             for one in self._searches
@@ -173,9 +180,9 @@ class _Searches:
         self._search_all(lambda search: search.best_in_steps(limit, wanted, self._count))
 
     def _search_up_to(self, most: float) -> None:
-        """Search all windows up to a limit, which falls when the shards searched so far have enough of them.
+        """Find the best windows with distances up to a limit, which falls as soon as enough windows have been found.
 
-        The windows found are those of a search without bounds, so they can be a limit for the other shards.
+        Each shard gives its exact best windows, so the worst of them is a valid limit for the remaining shards.
         """
         self._search_all(lambda search: search.best_up_to(min(most, self._worst()), self._count))
 
@@ -194,7 +201,7 @@ class _Searches:
         return best[-1][0].distance if len(best) == self._count else np.inf
 
     def told(self, searched: SearchedShard, number: int, window: RankedWindow) -> Hit:
-        """Describe a hit, and find whether the example or its mirrored copy is nearer."""
+        """Convert a window to a hit, and find whether the example or its mirrored copy is nearer to the window."""
         hit = Hit(number, window.run, window.row, window.distance, False)
         if len(self._examples) == 1:
             return hit

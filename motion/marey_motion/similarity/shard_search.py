@@ -16,7 +16,7 @@ from marey_motion.similarity.shards import STEP_ROWS, STEPS_PER_BALL, Shard, joi
 from marey_motion.similarity.weighing import MetricTables, metric_tables
 
 _CLIP_STEPS = 4_096
-"""Number of steps that are compared together when clips are searched for."""
+"""Number of steps whose windows are compared at a time in a search for clips."""
 
 Windows = Mapping[int, tuple[int, int]]
 """Half-open ranges of rows, by run, in which no hit may start."""
@@ -24,14 +24,15 @@ Windows = Mapping[int, tuple[int, int]]
 
 @dataclass(frozen=True, eq=False)
 class SearchedShard:
-    """Shard, and what of it is searched.
+    """Shard to search, with the runs and windows that are excluded from the search.
 
     Parameters
     ----------
-    load : function    returns the shard; called whenever its arrays are needed, so that not all need be mapped
-    ranks : (R,) int64    place of each run in an order of all clips, which decides between equal distances
-    closed : (R,) bool    runs that are not searched
-    closed_windows : mapping of int to tuple of int    ranges of rows of a run in which no hit may start
+    load : function    returns the shard; called whenever the arrays of the shard are needed, so that not all shards
+        must be mapped into memory at once
+    ranks : (R,) int64    rank of each run among all clips; of windows with equal distances, the lowest rank comes first
+    closed : (R,) bool    True for runs that are not searched
+    closed_windows : mapping of int to tuple of int    by run, a half-open range of rows in which no hit may start
     """
 
     load: Callable[[], Shard]
@@ -50,14 +51,14 @@ class RankedWindow(NamedTuple):
 
 
 class ComparedRuns(NamedTuple):
-    """Skeletons with the same joints: how they are compared with the example, and where they are in a shard.
+    """Runs of a shard whose skeletons have the same joints, with the tables by which they are compared.
 
     Parameters
     ----------
     tables : MetricTables    tables of the metric
     columns : (n,) int64    columns of features that the tables use
-    chosen : (R,) bool    runs of these skeletons
-    ranges : (n, 2) int64    half-open ranges of their balls
+    chosen : (R,) bool    True for the runs with these joints
+    ranges : (n, 2) int64    half-open ranges of the balls of these runs
     """
 
     tables: MetricTables
@@ -67,23 +68,23 @@ class ComparedRuns(NamedTuple):
 
 
 class Weighing:
-    """Tables of a metric between the examples of a search and the skeletons of clips; equal ones are computed once."""
+    """Tables of a metric for the joints that the examples and a clip have in common, cached by the clip's joints."""
 
     def __init__(self, metric: PerceptualMetric, examples: Sequence[PoseFeatures]) -> None:
         self._metric, self._present = metric, np.logical_and.reduce([one.present for one in examples])
         self._known: dict[int, tuple[MetricTables, Ints] | None] = {}
 
     def tables(self, joints: int) -> tuple[MetricTables, Ints] | None:
-        """Return how clips with some joints are compared.
+        """Return the tables by which clips with certain joints are compared with the examples.
 
         Parameters
         ----------
-        joints : int    `presence` of the clips
+        joints : int    joints of the clips, as encoded by `shards.presence`
 
         Returns
         -------
         MetricTables and (n,) int64, or None    tables, and the columns of features that they use; None if the clips
-            cannot be compared
+            lack joints that the metric needs
         """
         if joints not in self._known:
             tables = metric_tables(self._metric, joints_of(joints) & self._present)
@@ -91,12 +92,12 @@ class Weighing:
         return self._known[joints]
 
     def kinds(self, searched: SearchedShard, shard: Shard) -> list[ComparedRuns]:
-        """List the skeletons in a shard that are searched.
+        """Group the searched runs of a shard by the joints that their skeletons have.
 
         Parameters
         ----------
-        searched : SearchedShard    what is searched
-        shard : Shard    the shard
+        searched : SearchedShard    the shard, with the runs that are not searched
+        shard : Shard    content of the shard
 
         Returns
         -------
@@ -118,14 +119,15 @@ class Weighing:
 class ShardSearch:
     """Search of a shard: computes bounds of all steps, and then the distances of windows in some of them.
 
-    The bounds of poses are kept, because they are needed again as soon as a limit is known: 4 bytes for each ball and
-    group of samples. The shard is not kept.
+    The bounds of poses stay in memory, because later calls need them again: 4 bytes for each ball and group of samples.
+    The arrays of the shard do not stay in memory.
 
     Parameters
     ----------
-    searched : SearchedShard    what is searched
-    examples : sequence of GroupedExample    example, and perhaps its mirrored copy; the lesser distance counts
-    weighing : Weighing    metric
+    searched : SearchedShard    the shard to search
+    examples : sequence of GroupedExample    the example, or the example and its mirrored copy; the distance of a window
+        is the lesser of the distances from both
+    weighing : Weighing    tables of the metric
     """
 
     def __init__(self, searched: SearchedShard, examples: Sequence[GroupedExample], weighing: Weighing) -> None:
@@ -145,7 +147,7 @@ class ShardSearch:
         Parameters
         ----------
         limit : float    greatest bound of a step
-        most : int    greatest number of steps
+        most : int    greatest number of steps to search
         count : int    greatest number of windows
 
         Returns
@@ -173,19 +175,19 @@ class ShardSearch:
         return self._best(np.flatnonzero(self.least <= np.float32(limit)), most, count)
 
     def clips_within(self, most: float, count: int) -> list[int]:
-        """Find the runs that have a window with a distance up to a limit.
+        """Find the runs that have a window with a distance of at most `most`.
 
-        For each run, the step with the lowest bound comes first, then its next two, its next four, and so on. The steps
-        of runs that were found are not compared any more.
+        The step with the lowest bound of every run is compared first, then the next two steps of every run, then the
+        next four, and so on. As soon as a run has been found, its other steps are skipped.
 
         Parameters
         ----------
         most : float    greatest distance
-        count : int    greatest number of runs; the search ends when so many are found
+        count : int    greatest number of runs; the search ends when this number is found
 
         Returns
         -------
-        list of int    ascending
+        list of int    indices of runs, ascending
         """
         from marey_motion.similarity.similarity_kernels import loosened
 
@@ -205,7 +207,7 @@ class ShardSearch:
         return sorted(found)[:count]
 
     def _runs_within(self, steps: Ints, most: float) -> list[int]:
-        """Find the runs that have a window up to a distance in some steps."""
+        """Find the runs that have a window, starting in one of `steps`, with a distance of at most `most`."""
         runs, rows, distances = self._windows(steps, most)
         near = distances <= most
         for run, (low, high) in self._searched.closed_windows.items():
@@ -224,7 +226,7 @@ class ShardSearch:
         return poses, sums
 
     def _best(self, steps: Ints, most: float, count: int) -> list[RankedWindow]:
-        """Find the best windows that start in some steps, ascending: take the best, drop those that overlap it, etc."""
+        """Find the nearest windows without overlaps that start in `steps`, in ascending order of distance."""
         if not len(steps):
             return []
         runs, rows, distances = self._windows(steps, most)
@@ -242,16 +244,16 @@ class ShardSearch:
         return hits
 
     def _windows(self, steps: Ints, most: float) -> tuple[Ints, Ints, Floats]:
-        """Return run, first row and distance of the windows that start in some steps, as far as they are near."""
+        """Return run, first row and distance of windows in `steps`; windows farther than `most` may be left out."""
         runs = np.searchsorted(self._runs.firsts, steps, side="right") - 1
         places, columns, distances = self._distances(steps, runs, most)
         runs = runs[places]
         return runs, (steps[places] - self._runs.firsts[runs]) * STEP_ROWS + columns, distances
 
     def _distances(self, steps: Ints, runs: Ints, most: float) -> tuple[Ints, Ints, Floats]:
-        """Compute the distances of the windows in some steps, as far as they are at most `most`.
+        """Compute the distances of windows that start in `steps`; windows farther than `most` may be left out.
 
-        Returns the place of the step of each window, its row in the step, and its distance.
+        Returns, for each window, the index of its step in `steps`, its first row within the step, and its distance.
         """
         from marey_motion.similarity.similarity_kernels import step_distances
 

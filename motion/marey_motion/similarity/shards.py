@@ -1,7 +1,9 @@
-"""Shards: files with the features of many clips, in the form in which searches map them into memory.
+"""Shards: files with the features of many clips, which searches map into memory.
 
-A ball is a centre and radii around a few consecutive rows. A file begins with a mark and the numbers of its rows and
-balls. The centres and radii of all balls follow, and then the rows. A search reads all balls, and few of the rows.
+A row holds the features of one pose, a run the rows of one clip. A step consists of `STEP_ROWS` consecutive rows of a
+run. A ball encloses the rows of `STEPS_PER_BALL` consecutive steps: it has a centre, and a radius for each vector and
+rotation. A file begins with a magic number and the numbers of rows and balls. The centres and radii of all balls
+follow, then the rows. A search reads all balls, but only a few of the rows.
 """
 
 from __future__ import annotations
@@ -22,11 +24,11 @@ from marey_motion.errors import MotionError
 from marey_motion.similarity.features import JOINTS, ROTATED_JOINTS, VECTORS, WIDTH, PoseFeatures, Rows
 
 STEP_ROWS = 3
-"""Rows of a step, 0.1 s. The compared poses of a window are whole steps apart."""
+"""Number of rows of a step (0.1 s). The compared poses of a window are a whole number of steps apart."""
 STEPS_PER_BALL = 2
-"""Steps in a ball. Larger balls are compared in less time, and exclude fewer windows."""
+"""Number of steps of a ball. Larger balls are fewer and take less time to compare, but exclude fewer windows."""
 FULL_SHARD_ROWS = 65_536
-"""Rows of a full shard: 36 minutes of motion, about 41 MB."""
+"""Number of rows of a full shard: 36 minutes of motion, about 41 MB."""
 _MARK = b"mareyix1"
 _HEAD = struct.Struct("<8sQQ")
 _RADII = VECTORS + len(ROTATED_JOINTS)
@@ -48,7 +50,7 @@ class Runs(NamedTuple):
 
     @classmethod
     def of(cls, lengths: Ints) -> Self:
-        """Find where runs begin.
+        """Compute where runs of given lengths begin and end.
 
         Parameters
         ----------
@@ -56,7 +58,7 @@ class Runs(NamedTuple):
 
         Returns
         -------
-        Runs    firsts and ends
+        Runs    first row, step and ball of each run, and the ends of the last run
         """
         counts = np.concatenate(([0], lengths)).astype(np.int64)
         each = (counts, -(-counts // STEP_ROWS), -(-counts // (STEP_ROWS * STEPS_PER_BALL)))
@@ -73,7 +75,7 @@ class Shard:
     centres : (WIDTH, B) float32    centres of the balls
     radii : (41, B) float32    radii of the balls: of each vector, then of each rotation
     runs : Runs    where each run begins and ends
-    joints : (R,) int64    which joints the skeleton of each clip has: `presence` of its features
+    joints : (R,) int64    joints of the skeleton of each clip, as encoded by `presence`
     """
 
     rows: Rows
@@ -90,7 +92,7 @@ class Shard:
         ----------
         path : Path    file that `write_shard` has written
         lengths : (R,) int64    numbers of rows of the runs
-        joints : (R,) int64    `presence` of each run
+        joints : (R,) int64    joints of the skeleton of each clip, as encoded by `presence`
 
         Returns
         -------
@@ -98,7 +100,7 @@ class Shard:
 
         Raises
         ------
-        MotionError    if the file is no shard with these runs
+        MotionError    if the file is not a shard, or if its runs have other lengths
         """
         with path.open("rb", buffering=0) as file:
             mapped = mmap(file.fileno(), 0, access=ACCESS_READ) if os.fstat(file.fileno()).st_size else b""
@@ -106,7 +108,11 @@ class Shard:
         mark, rows, balls = _HEAD.unpack(mapped[: _HEAD.size]) if len(mapped) >= _HEAD.size else (b"", 0, 0)
         size = _HEAD.size + 4 * (balls * (WIDTH + _RADII) + rows * WIDTH)
         if (mark, rows, balls, size) != (_MARK, runs.starts[-1], runs.balls[-1], len(mapped)):
-            raise MotionError(f"the file of {len(mapped)} bytes is no shard of a motion index", code="shard-damaged")
+            raise MotionError(
+                f"the file of {len(mapped)} bytes is no shard of a motion index with {runs.starts[-1]} rows; build the "
+                "index again",
+                code="shard-damaged",
+            )
         numbers: NDArray[np.float32] = np.frombuffer(mapped, "<f4", offset=_HEAD.size)
         table = numbers[: balls * (WIDTH + _RADII)].reshape(-1, balls)
         return cls(numbers[table.size :].reshape(-1, WIDTH), table[:WIDTH], table[WIDTH:], runs, joints)
@@ -131,7 +137,7 @@ def joints_of(presence: int) -> Flags:
 
     Parameters
     ----------
-    presence : int    bits of `presence`
+    presence : int    result of the function `presence`
 
     Returns
     -------

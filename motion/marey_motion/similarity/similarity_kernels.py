@@ -11,18 +11,18 @@ from marey_motion.perception.map_kernels import ANGLE, EUCLID, MANHATTAN, ONE_MI
 from marey_motion.similarity.bounding_kernels import bounds_within, narrow_steps
 
 _TILE = 128
-"""Windows whose rows are compared at a time."""
+"""Number of windows that are compared at a time."""
 
 
 @compiled
 def loosened(most, samples):
-    """Compute the sum of distances up to which bounds in single precision may belong to a mean of at most `most`."""
+    """Compute a limit for sums of bounds in single precision: above it, the mean distance certainly exceeds `most`."""
     return (most + 1e-5) * samples / (1.0 - 1e-4)
 
 
 @inlined
 def _shaped(x, shaping, exponent):
-    """Apply a shaping F."""
+    """Apply a shaping F to a difference x."""
     if shaping == SIGMOID:
         return x / (x + 1.0)
     if shaping == MANHATTAN:
@@ -43,7 +43,7 @@ def _angle(square, measure):
 
 @inlined
 def _apart(a, b, rotated, place, rotations_at, measure):
-    """Compute the distance of one vector or rotation in two rows."""
+    """Compute the distance between two rows in one vector or rotation, which is selected by `rotated` and `place`."""
     if rotated:
         at = rotations_at + 4 * place
         minus = 0.0
@@ -62,7 +62,7 @@ def _apart(a, b, rotated, place, rotations_at, measure):
 
 @compiled
 def pose_distance(a, b, tables, rotations_at):
-    """Compute the distance of two rows."""
+    """Compute the distance between two rows by the metric."""
     rotated, places, factors, weights, starts, constants, shapings, exponents, measure, always = tables
     distance = 0.0
     for c in range(constants.shape[0]):
@@ -80,10 +80,10 @@ def pose_distance(a, b, tables, rotations_at):
 
 @compiled
 def group_samples(query, tables, rotations_at, most, groups, distances):
-    """Fill groups (T,) with numbers of groups of similar samples, and return their count, at most `most`.
+    """Divide samples into at most `most` groups of similar samples, and return the number of groups.
 
-    Each group is started by the sample that is farthest from the samples that have started a group so far. distances
-    (T,) are those of the samples from the sample that has started their group.
+    The first sample of each new group is the one farthest from the first samples of all earlier groups. Fills groups
+    (T,) with the group of each sample, and distances (T,) with its distance from the first sample of this group.
     """
     distances[:] = np.inf
     first = 0
@@ -100,8 +100,10 @@ def group_samples(query, tables, rotations_at, most, groups, distances):
 
 @compiled
 def _places_of(steps, runs, length, layout, places, rows):
-    """Fill places (n, 2) with the ball in which each step lies and its number in it, and rows (n, 2) with the rows at
-    which windows of `length` start in it, a half-open range.
+    """Locate the given steps in a shard, for windows whose last compared pose is `length` rows after the start.
+
+    Fills places (n, 2) with the ball of each step and its number within the ball, and rows (n, 2) with the half-open
+    range of rows in the step at which windows can start.
     """
     starts, firsts, ball_firsts = runs
     size, per_ball = layout[0], layout[1]
@@ -117,7 +119,7 @@ def _places_of(steps, runs, length, layout, places, rows):
 
 @compiled
 def _windows_in(left, rows, windows):
-    """List the windows (n, 2) that start in some steps: their step and first row. Return their number."""
+    """Fill windows (n, 2) with step and first row of windows that start in the steps `left`; return their number."""
     count = 0
     for place in left:
         for row in range(rows[place, 0], rows[place, 1]):
@@ -128,10 +130,11 @@ def _windows_in(left, rows, windows):
 
 @contracted
 def _still_near(query, rows, bounds, done, places, windows, layout, tables, limit):
-    """List the windows whose distance is not certainly above a limit.
+    """Return the indices of the windows whose sum of distances is not certainly above a limit.
 
-    For one sample after the other, the bound of its ball in a window's sum is replaced by that of the very row. The
-    sums contain the bounds of single samples for the first `done` of them.
+    For one sample after the other, the bound of its distance from a ball of rows is replaced, in the sum of each
+    window, by the distance from the exact row. The sums of the first `done` samples already contain bounds of single
+    samples; the sums of the others contain bounds of groups of samples.
     """
     samples, offsets, groups, _, turns = query
     by_group, by_sample, step_sums = bounds
@@ -167,14 +170,16 @@ def _still_near(query, rows, bounds, done, places, windows, layout, tables, limi
 
 @compiled
 def step_distances(query, shard, bounds, steps, runs, layout, tables, rotations_at, most, out):
-    """Fill out (n, size) with the distances of the windows that start in some steps, where they are less than out.
+    """Lower the elements of out (n, size) to the distances of the windows that start in n steps of `size` rows.
+
+    An element does not change if it is less than the distance already, if the distance is above `most`, or if the
+    window exceeds its run.
 
     query holds samples (T, width), offsets (T,), groups (T,), the order in which the distances of samples are added,
-    and the order in which their bounds are used. shard holds rows, and centres and radii of balls. bounds holds bounds
-    of groups (G, balls), room for those of samples (T, balls), and the sums (n,) of the steps. runs are the first
-    rows, steps and balls of runs. steps (n,) ascend. layout holds the rows of a step, the steps of a ball, the number
-    of vectors, and the columns that the tables use. Windows whose distance is certainly above `most`, and windows that
-    leave their run, get no distance.
+    and the order in which bounds of samples are computed. shard holds rows, and centres and radii of balls. bounds
+    holds the bounds of groups (G, balls), a scratch array (T, balls) for bounds of samples, and the sums of bounds (n,)
+    of the steps. steps (n,) are ascending. runs are the first rows, steps and balls of all runs. layout holds the
+    numbers of rows per step, of steps per ball and of vectors, and the columns of features that the tables use.
     """
     samples, offsets, _, order, _ = query
     size, count = layout[0], samples.shape[0]
@@ -204,7 +209,7 @@ def step_distances(query, shard, bounds, steps, runs, layout, tables, rotations_
 def balls(rows, starts, size, vectors, rotations, centres, radii):
     """Fill the centres (width, balls) and radii (vectors + rotations, balls) of balls of `size` rows.
 
-    The run r has the rows [starts[r], starts[r + 1]); its last ball may have fewer.
+    Run r has the rows [starts[r], starts[r + 1]). The last ball of a run may have fewer than `size` rows.
     """
     width = rows.shape[1]
     ball = 0

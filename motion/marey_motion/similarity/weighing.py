@@ -1,4 +1,4 @@
-"""Tables of numbers by which kernels compute a perceptual metric of features."""
+"""Perceptual metrics as tables of numbers, from which kernels compute distances between rows of features."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from marey_schemas.documents.metrics import classes_of
 
 
 class MetricTables(NamedTuple):
-    """A metric between skeletons of which certain joints are known, as arrays for kernels.
+    """A perceptual metric as arrays for kernels, for skeletons that have certain joints in common.
 
     The distance of two rows is the sum over components of constant + Σ weight · F(x), with a term for each class of
     joints; x is the sum of factor · distance over the joints of the class.
@@ -23,15 +23,15 @@ class MetricTables(NamedTuple):
     Parameters
     ----------
     rotated : (T,) int64    1 if the term compares rotations, 0 if vectors
-    places : (T, 2) int64    number of the rotation or vector of each side; -1: none
-    factors : (T, 2) float64    factor of each side's distance
-    weights : (T,) float64    share of the component · N · w
+    places : (T, 2) int64    number of the rotation or vector of each side; -1 for none
+    factors : (T, 2) float64    factor by which the distance of each side is multiplied
+    weights : (T,) float64    product of the share of the component, its norm N, and the weight w of the class
     starts : (C + 1,) int64    the terms of component c are [starts[c], starts[c + 1])
-    constants : (C,) float64    share of the component · c
-    shapings : (C,) int64    F of each component
-    exponents : (C,) float64    exponent of F
-    angle : int    measure of angles
-    always : bool    whether equal poses get the constants, too
+    constants : (C,) float64    product of the share and the constant c of each component
+    shapings : (C,) int64    shaping F of each component, as a number (`maps.SHAPING_NUMBERS`)
+    exponents : (C,) float64    exponent of the shaping `power`
+    angle : int    measure of angles, as a number (`maps.ANGLE_NUMBERS`)
+    always : bool    whether the constants are added for equal poses, too
     """
 
     rotated: Ints
@@ -116,7 +116,7 @@ _Term = tuple[bool, list[int], list[float], float]
 
 
 def _terms(metric: PerceptualMetric, share: float, component: Component, known: set[str]) -> list[_Term]:
-    """List the terms of a component: whether rotations are compared, places, factors and weight."""
+    """List the terms of a component: for each class, whether rotations are compared, places, factors and weight."""
     turned = component.measurement == "angles"
     names = ROTATED_JOINTS if turned else JOINTS
     first = len(JOINTS) if component.measurement == "velocities" else 0

@@ -1,6 +1,6 @@
 """Skeleton documents of Marey's predecessor: the form in the database, and the form inside files and models.
 
-The database form lists joints (`jointDescs`) and is mirrored in x, like the clips in the data base. The file form
+The database form lists joints (`jointDescs`) and is mirrored in x, like the predecessor's clips. The file form
 nests nodes under `root` and is right-handed. Both are in centimetres. Nodes without children are tips of chains, not
 joints.
 """
@@ -195,7 +195,7 @@ def source_of_skeleton(skeleton: Skeleton) -> SourceMotion:
 
 
 def _tips(skeleton: Skeleton) -> list[tuple[str, int, NDArray[np.float64]]]:
-    """List (name, joint, offset in metres) of every tip; leaf joints without an end site get one at the joint."""
+    """List (name, joint, offset in metres) of every tip; a leaf joint without an end site gets a tip with offset 0."""
     sites = [(site.joint, site.offset) for site in skeleton.end_sites]
     ended = {joint for joint, _ in sites}
     sites += [(j, np.zeros(3)) for j, children in enumerate(skeleton.children) if not children and j not in ended]

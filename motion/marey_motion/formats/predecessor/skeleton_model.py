@@ -3,7 +3,7 @@
 A document is `{"joints": {standard joint: joint or null}, "cos_map": {joint: {"x": swing or null, "y": twist or null}},
 ...}`, often inside `{"name", "model"}`. Its names of standard joints are those of Marey, and its axes are directions in
 the joint's local frame, too. Other members, such as limits of joints and shapes of feet, have no counterpart in Marey;
-they are kept as they are.
+they are stored unchanged.
 """
 
 from __future__ import annotations
@@ -138,8 +138,8 @@ def _inner(document: Mapping[str, Any]) -> Mapping[str, Any]:
 def _known(joint: Any, skeleton: Skeleton, name: str, file: str) -> str:
     if not isinstance(joint, str) or joint not in skeleton:
         raise FormatError(
-            f"field {name!r} of the skeleton model names a joint that the skeleton does not have; import it with the "
-            "skeleton that it was made for",
+            f"field {name!r} of the skeleton model names a joint that the skeleton does not have; import the skeleton "
+            "model with the skeleton for which it was made",
             code="joints-mismatch",
             file=file,
             joint=str(joint),

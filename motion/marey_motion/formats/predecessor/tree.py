@@ -136,8 +136,8 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
     """List the samples of each node and its number of children, level by level from the root.
 
     `count` is the number of samples in the document. The samples of a node include those of its children. The
-    predecessor's tree builder leaves the samples of the root out (`indices: null`); there, and in any other node with
-    children, they follow from the children.
+    predecessor's tree builder does not list the samples of the root (`indices: null`). A node with children that lists
+    no samples has the samples of its children.
     """
     indices: list[Ints | None] = []
     children: list[int] = []
@@ -175,7 +175,10 @@ def _held(node: Node, place: str, count: int, file: str) -> Ints:
 
 
 def _completed(indices: list[Ints | None], children: list[int]) -> list[Ints]:
-    """Give nodes that do not list their samples the samples of their children, level by level from the root."""
+    """Return the samples of each node; a node that lists none gets the samples of its children.
+
+    `indices` has one element for each node, level by level from the root, and None for a node that lists no samples.
+    """
     firsts = _first_children(children)
     complete: list[Ints] = [np.zeros(0, np.int64)] * len(indices)
     for node in range(len(indices) - 1, -1, -1):
@@ -186,7 +189,7 @@ def _completed(indices: list[Ints | None], children: list[int]) -> list[Ints]:
 
 
 def _first_children(children: list[int]) -> list[int]:
-    """Return the number of the first child of each node, whose children would come there if it has none."""
+    """Return the number of the first child of each node; for a node without children, the number means nothing."""
     return list(accumulate(children[:-1], initial=1))
 
 

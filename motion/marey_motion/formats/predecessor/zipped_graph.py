@@ -250,14 +250,14 @@ class _Nodes:
             self._meta[action] = {} if found is None else _document(members, found, file)
 
     def type_of(self, place: Place) -> str:
-        """Return the type of a node; nodes of which nothing is said are standard."""
+        """Return the type of a node: "standard" if the archive does not state the type."""
         action, mp = place
         if action not in self._types:
             self._types[action] = self._types_of(action)
         return self._types[action].get(mp, "standard")
 
     def _types_of(self, action: str) -> dict[str, str]:
-        """Return the types of the primitives of an action; the first one that is found counts."""
+        """Return the type of each primitive of an action; if the archive states several types, the first is used."""
         found: dict[str, str] = {}
         for field, kind in _STATES.items():
             for mp in _list_of(self._meta[action], field, self._file):

@@ -1,4 +1,4 @@
-"""Check of searches: the errors in reaching hand and foot positions of examples that were left out of training."""
+"""Check of searches by hand and foot positions of examples that were left out of the training of the model."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SearchCheck:
 
     Parameters
     ----------
-    left_out : (n,) "take" or "subject": what the model had not seen of the example, its take or its performer
+    left_out : (n,) "take" if the example's take was left out of training, "subject" if its performer was
     examples, joints : (n,) uid of the example and standard name of the joint whose position is the target
     frames : (n,) canonical frame at which the positions of that joint differ most between the examples
     searched_cm, refined_cm : (n,) error of the best sample of the tree, before and after refinement
@@ -56,7 +56,7 @@ def check_search(
 ) -> SearchCheck | None:
     """Train a model without every fifth take, and search for the positions of hands and feet in these takes.
 
-    If three performers are known, the same is done without each performer.
+    If at least three performers are known, also train a model without each performer, and search for their positions.
 
     Parameters
     ----------
@@ -100,7 +100,9 @@ class _Checking:
     seed: int
 
     def search(self, without: Flags, most: int) -> Iterator[tuple[str, str, int, float, float]]:
-        """Train a model without the examples `without` (m,), and search it for at most `most` of their positions.
+        """Train a model without some examples, and search it for at most `most` hand and foot positions of these.
+
+        `without` (m,) is True for the examples that are left out of training.
 
         Yields uid of the example, name of the joint, canonical frame, and the errors in metres before and after
         refinement. Yields nothing if too few examples remain.

@@ -62,7 +62,7 @@ def frame_at(primitive: MotionPrimitive, at: Moment) -> float:
 
     Raises
     ------
-    InvalidConstraint    naming the existing keyframes
+    InvalidConstraint    if the model lacks the keyframe or the frame; the error names the existing ones
     """
     last = primitive.frame_count - 1
     if isinstance(at, str):

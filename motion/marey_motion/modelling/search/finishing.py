@@ -26,7 +26,7 @@ from marey_schemas.search_constraints import (
 )
 
 FAR_AWAY_M = 1000.0
-"""A direction to look in is replaced by a point to look at, which is this far away, in metres."""
+"""Distance, in metres, of the point to look at that replaces a direction to look in."""
 
 
 @dataclass(frozen=True, eq=False)

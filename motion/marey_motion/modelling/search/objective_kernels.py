@@ -1,4 +1,4 @@
-"""Compiled evaluation of constraints, kept apart so that importing the rest of the package does not load numba.
+"""Compiled evaluation of constraints, in a separate module so that importing other modules does not load numba.
 
 `chains`, `clocks` and `rows` are a `tracking.Chains`, a `tracking.Clocks` and an `objective.Rows`. Latent vectors are
 handled one by one, so that results do not depend on the number of vectors evaluated at once, or on threads. A placement

@@ -1,4 +1,4 @@
-"""Refinement of latent vectors by Levenberg and Marquardt (Herrmann et al. 2019, Equation 2, as a posterior).
+"""Refinement of latent vectors by the Levenberg-Marquardt method (Herrmann et al. 2019, Equation 2, as a posterior).
 
 The cost is ½ Σ w (e / σ)² - λ Σ ln p(s), with errors e, their tolerances σ and weights w, and the likelihood p of each
 latent vector s. To compute a step, the mixture is replaced by its component that is most likely at the current vector
@@ -38,8 +38,9 @@ class Refined:
     latents : (W,) refined latent vectors, one after the other
     cost : the minimised cost at `latents`
     start_cost : the cost at the start
-    iterations, evaluations : number of steps that were tried; number of motions that were evaluated, including those
-        for derivatives. Both include those of a first try whose result was not used
+    iterations : number of steps that were tried
+    evaluations : number of motions that were evaluated, including those for derivatives. Both numbers include a first
+        minimisation whose result was discarded, if there was one
     """
 
     latents: Floats
@@ -73,7 +74,7 @@ class LeastSquares(Protocol):
 def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:
     """Improve latent vectors; the cost of the result is never above the cost of the start.
 
-    Without a given weight of the likelihood, the sum of the squared errors is not above that of the start, either.
+    If `options` gives no weight of the likelihood, the sum of the squared errors does not increase, either.
 
     Parameters
     ----------
@@ -104,9 +105,9 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
 
 
 def _minimised(problem: LeastSquares, start: Floats, weight: float, most: int) -> tuple[Refined, float, float]:
-    """Minimise the cost with a weight of the likelihood, in at most `most` iterations.
+    """Minimise the cost with `weight` as the weight of the likelihood, in at most `most` iterations.
 
-    Returns the result, and the sums of its squared residuals and of those of the start.
+    Returns the result, the sum of squared residuals at the result, and the sum of squared residuals at the start.
     """
     prior = _Prior(problem.priors, weight)
     here = np.array(start, dtype=np.float64)
@@ -114,7 +115,7 @@ def _minimised(problem: LeastSquares, start: Floats, weight: float, most: int) -
     cost = start_cost = _cost(residuals, prior, here)
     if not np.isfinite(cost):
         raise MotionError(
-            "the constraints' errors are too large to compute with; use wider tolerances or smaller weights",
+            "the cost of the constraints is too large to be computed; use wider tolerances or smaller weights",
             code="refining-not-finite",
         )
     start_error = float(residuals @ residuals)

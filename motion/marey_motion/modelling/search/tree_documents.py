@@ -24,7 +24,7 @@ def sample_tree_to_tree(
     Parameters
     ----------
     tree : SampleTree    the samples
-    model_digest : str or PartDigestRef    the part `model` that the samples belong to
+    model_digest : str or PartDigestRef    digest of the part `model` from which the samples were drawn
     seed : int    seed of the samples
     options : TreeOptions    options of the tree
 

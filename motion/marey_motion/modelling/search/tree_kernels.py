@@ -1,4 +1,4 @@
-"""Compiled k-means over ranges of samples, kept apart so that importing the rest of the package does not load numba.
+"""Compiled k-means over ranges of samples, in a separate module so that importing other modules does not load numba.
 
 Everything runs in one thread and in a fixed order: the same samples and the same random numbers give the same tree.
 """
