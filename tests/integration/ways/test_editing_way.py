@@ -264,7 +264,7 @@ WRONG: tuple[tuple[tuple[str, ...], int, str], ...] = (
         "there is no clip",
     ),
     (("edit", "show", "lab/edits/none"), 2, "there is no edit at"),
-    (("edit", "apply", "lab/walks", "--do", "trim stop=99999", "--into", "x"), 1, "the frames 0:99999"),
+    (("edit", "apply", "lab/walks", "--do", "trim stop=99999", "--into", "x"), 1, "the range 0:99999"),
 )
 
 
