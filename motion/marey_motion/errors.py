@@ -213,7 +213,7 @@ class UnknownFormat(FormatError):
 
 
 class AmbiguousUnits(FormatError):
-    """The file does not state its unit of length, and the sizes in the file are plausible in more than one unit.
+    """The unit of length or the upward axis is not known: neither the file nor the body in it determines it.
 
     Examples
     --------

@@ -271,10 +271,11 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
 
 
 def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
-    """Find the frames (F,) in which a heel is kept in place: its contacts, except frames before its toe lands.
+    """Find the frames (F,) in which a heel is kept in place: its contacts, minus the frames in which it has to move.
 
-    The ankle follows the toe, so each toe contact moves the ankle. A heel that is planted over several toe contacts
-    moves to its next position during the excepted frames, at most `blend` before each contact; otherwise it would jump.
+    Each toe contact moves the ankle, because the ankle follows the toe. So a heel that stays planted from one toe
+    contact to the next would jump. It is therefore released in the last `blend` frames before the toe lands again (in
+    fewer if the toe is up for a shorter time), and moves to its next position in these frames.
     """
     heel = contacts.heel.copy()
     for (_, lifted), (landed, _) in pairwise(runs(contacts.toe)):

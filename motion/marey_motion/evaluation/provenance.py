@@ -83,7 +83,8 @@ def require_comparable(
 def differing_options(before: EvaluationOptions, after: EvaluationOptions) -> dict[str, list[str]]:
     """Describe the options that differ between two evaluations, grouped by the condition that they change.
 
-    The conditions of a comparison are "options", "scenarios" and "limits".
+    Options change the conditions "options", "scenarios" and "limits". The normaliser is a further condition of a
+    comparison.
 
     Parameters
     ----------

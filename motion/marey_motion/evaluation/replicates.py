@@ -213,7 +213,7 @@ def run_replicates(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> MeasuredReplicates | None:
-    """Simulate and measure the replicates of trials, from the second on; each record is dropped when it is measured.
+    """Simulate and measure all replicates of the trials except replicate 0, the trial itself; no record is kept.
 
     Parameters
     ----------

@@ -234,8 +234,8 @@ def evaluate_baseline(
 ) -> EvaluationResult:
     """Evaluate clips generated for every cell of the grid, without records; the last result is cached.
 
-    The baseline runs in several replicates, because chance affects its metrics like those of any other set. But it runs
-    in at most as many replicates as a confidence interval needs, because it is only compared by eye.
+    The baseline runs in as many replicates as the evaluation, because chance affects its metrics like those of any
+    other set. But it runs in at most as many as a confidence interval needs, because it is only compared by eye.
 
     Parameters
     ----------

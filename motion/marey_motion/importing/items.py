@@ -165,7 +165,9 @@ def _skeleton_name(anatomy: Anatomy) -> str:
 
 
 def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str, Tree]) -> ImportedItem:
-    """Make the main item of a file, with the collection and the tags that the import options determine.
+    """Make the main item of a file, with the tags of the import options.
+
+    The item is stored in the collection of the import options or, if the file has a folder, below this collection.
 
     Parameters
     ----------

@@ -135,7 +135,7 @@ def noted_items(file: FileToImport, imported: ImportedMotion, motion: Tree, clip
 
 
 def _annotation(file: FileToImport, notes: str, layer: Layer, label: str | None) -> ImportedItem:
-    """Make the item of an annotation; `label` is the label of all segments of `layer`, or None for all labels."""
+    """Make the item of an annotation; `label` is the only label in `layer`, or None if `layer` has all labels."""
     ref = OutputRef(output=file.planned.name)
     named = IMPORTED_LAYER if label is None else label
     part = layer_to_document(layer, ref, named).model_dump(mode="json", by_alias=True, exclude_none=True)

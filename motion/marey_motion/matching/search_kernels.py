@@ -1,23 +1,24 @@
 """Compiled exact search, in a separate module so that importing other modules does not load numba.
 
-`index` is a `marey_motion.matching.search.SearchIndex`; queries are normalised like its rows. Rows are database rows.
+`index` is a `marey_motion.matching.search.SearchIndex`; queries are normalised like its rows. Row numbers are those of
+the database.
 
 Proof that screening in float32 gives the same rows and costs as a search in float64 alone:
 
 Let c be the cost of a row in exact arithmetic, c32 the cost computed by the screening, u = 2⁻²⁴, and ‖·‖ the norm with
 the weights. Rounding row and query to float32 moves each by at most u times its norm, hence their distance √c by at
 most u (‖row‖ + ‖query‖), which is less than half of `_Query.reach`. Each of the D terms of the sum then goes through at
-most six roundings, and every addition is of nonnegative numbers, so c32 is within (1 ± u)^(D + 8) of the rounded
-vectors' cost:
+most six roundings, and every addition is of nonnegative numbers, so c32 is the rounded vectors' cost times a factor
+between (1 − u)^(D + 8) and (1 + u)^(D + 8):
 
     c32 ≤ (1 + u)^(D + 8) (√c + reach)²
 
-If a row's cost is at most `best`, its c32 is at most the right side with c = best. `_limit` returns this value, with
-four times the margin of each term. So a row above the limit is farther away than the best row and can be skipped; the
-costs of all other rows are computed again in float64, in the order of the dimensions. A box's float32 bound obeys the
-same inequality, because in exact arithmetic it is at most the cost of every rounded row in the box. This is proven for
-all magnitudes; a fixed slack of 1e-5 relative and 1e-6 absolute is enough only while the norms of row and query add up
-to less than about 40.
+If a row's cost is at most `best`, its c32 is at most the right side with c = best. `_limit` returns a greater value: it
+multiplies by 1 + 4u (D + 8) instead of (1 + u)^(D + 8), and adds `least` for numbers near 0. So a row above the limit
+is farther away than the best row and can be skipped; the costs of all other rows are computed again in float64, in the
+order of the dimensions. A box's float32 bound obeys the same inequality, because in exact arithmetic it is at most the
+cost of every rounded row in the box. The proof holds for all magnitudes. A fixed slack instead (1e-5 relative, 1e-6
+absolute) would be enough only while the norms of row and query add up to less than about 40.
 """
 
 from __future__ import annotations

@@ -85,9 +85,10 @@ class FittedMixture:
     ----------
     mixture : LatentMixture    the mixture
     covariance : str    kind of covariance; "point" for examples that do not vary
-    widening : float    factor of the covariances for likelihoods, at least 1. Unless the options set it, it is chosen
-        so that about 5 % of the left-out examples are below the threshold that 5 % of the samples of the widened
-        mixture do not reach. It applies to `held_out`, not to the candidates
+    widening : float    factor of the covariances for likelihoods, at least 1. Unless the options set it, it is the
+        least of `WIDENINGS` with which at most 5 % of the left-out examples (rounded up) are below the threshold that
+        5 % of the samples of the widened mixture do not reach; the greatest if none is sufficient, 1 if `held_out` is
+        None. It applies to `held_out` and `held_out_subjects`, not to the candidates
     candidates : tuple of MixtureCandidate    by kind of covariance and number of components; empty for examples that do
         not vary
     held_out, held_out_subjects : HeldOut, optional    likelihoods of examples whose take, or whose performer, was left

@@ -14,10 +14,10 @@ from marey_motion.perception.measuring import MeasuredClip, classes_measured, re
 from marey_motion.perception.metric import Component, PerceptualMetric, shaped
 
 MOST_CELLS = 50_000_000
-"""Maximum number of cells of a motion map in memory; larger maps are computed in blocks of rows (`map_blocks`)."""
+"""Maximum number of cells of a map that `motion_map` returns; compute a larger map by `map_blocks`."""
 SHAPING_NUMBERS = {"euclid": 0, "manhattan": 1, "sigmoid": 2, "power": 3}
 ANGLE_NUMBERS = {"half_angle": 0, "log_norm": 0, "angle": 1, "one_minus_dot": 2}
-"""Numbers of the measures of angles in kernels."""
+"""Numbers of shapings (`SHAPING_NUMBERS`) and of measures of angles (`ANGLE_NUMBERS`) in kernels."""
 _BLOCK_CELLS = 4_000_000
 _NO_POINTS = np.empty((1, 0, 2))
 

@@ -92,8 +92,8 @@ class ClipQuality:
     ----------
     values : value of each measure of `marey_schemas.documents.quality.MEASURES`; None if it is undefined
     frames : number of measured frames
-    speed_seconds, turn_seconds : (bins,) float64    duration, in seconds, of the motion in each bin of speed, and in
-        each bin of turn rate
+    speed_seconds, turn_seconds : (bins,) float64    seconds of one-second windows (1 / rate for each) by bins of speed
+        and of turn rate; their sum is about a second less than the clip, and 0 for a clip of a second or less
     """
 
     values: Mapping[str, float | None]

@@ -1,4 +1,4 @@
-"""Retargeting of clips: transfer of the poses, then corrections of trunk, floor height, feet and hands."""
+"""Retargeting of clips: transfer of the poses, with corrections of trunk, floor height, feet and hands."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ _CHUNK = 512
 _GAP = 32
 """Largest number of balls between two ranges with which the ranges are joined."""
 _RANGE_COST, _STEP_COST = 60, 15
-"""Time to process a range of balls, and time to compare the rows of a step, relative to the time for a ball."""
+"""Fixed time for each range of balls, and time to compare the rows of a step, relative to the time for a ball."""
 
 
 @contracted

@@ -16,7 +16,7 @@ from marey_motion.similarity.weighing import MetricTables
 MOST_SAMPLES = 32
 """Maximum number of compared poses of a window: one in each step, or in every second step, every third, and so on."""
 SHORTEST_SEPARATION_ROWS = 15
-"""Least distance between the starts of two hits in one clip, in rows: half a second, even for a single pose."""
+"""Least distance between the starts of two hits in a clip, in rows: half a second, even for a single pose."""
 _SAMPLES_PER_GROUP = 2.5
 
 
@@ -35,7 +35,7 @@ class Example:
 
     @cached_property
     def order(self) -> Ints:
-        """Order (T,) in which poses are compared: poses that are far apart come first, because they differ most."""
+        """Order (T,) in which poses are compared: poses far apart in time come first, because they differ most."""
         count = len(self.offsets)
         return np.argsort([int(f"{place:05b}"[::-1], 2) for place in range(count)], kind="stable")
 
@@ -56,7 +56,7 @@ class Example:
 
     @property
     def separation_rows(self) -> int:
-        """Least distance, in rows, between the starts of two hits in one clip: about the length of the window."""
+        """Least distance of the starts of two hits in a clip, in rows: the window's length, at least half a second."""
         return max(SHORTEST_SEPARATION_ROWS, int(self.offsets[-1]) + 1)
 
 

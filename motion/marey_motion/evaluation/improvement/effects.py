@@ -69,7 +69,7 @@ def confirmation_replicates(options: ConfirmedEffects, evaluation: EvaluationOpt
 
     Returns
     -------
-    range    numbers of replicates; neither the estimate nor the evaluation uses them
+    range    numbers of replicates that neither the estimate nor the evaluation uses, whatever the seeds are
     """
     chosen_from = max(options.estimation_replicates, evaluation.replicates)
     first = chosen_from + turn * options.confirmation_replicates

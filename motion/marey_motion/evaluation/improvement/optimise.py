@@ -29,7 +29,7 @@ CONFIRMED_AT_ONCE = 3
 """Maximum number of candidates of one step that are simulated again, the best first, until one is confirmed.
 
 If the gain of the best candidate was due to chance, that of the next candidate may be real. But the probabilities are
-corrected for this number, so a larger number makes every confirmation harder.
+corrected for the number of these candidates, so a larger maximum can make confirmations harder.
 """
 
 

@@ -26,8 +26,9 @@ class Removal:
     harm : estimated change of the objective without its term for the amount of data, metres; negative if the removal
         helps. With a perceptual metric, the price of the poses that the removal loses is added
     harm_per_s : `harm` per second of data saved; removals are ranked by this number, the least harmful first
-    lost_s : seconds of poses that the removal loses, because they look like no pose of the remaining clips; poses lost
-        by earlier removals are not counted. None without a perceptual metric
+    lost_s : seconds of poses that the removal loses: poses of this clip that look like no pose of the remaining clips,
+        and poses of clips removed earlier that look like a pose of this clip, but like no pose of the remaining clips.
+        None without a perceptual metric
     replaced_share : share of the clip's poses that look like a pose of the remaining clips; None without a perceptual
         metric
     """

@@ -193,14 +193,17 @@ def _unused(simulation: Resimulation, result: EvaluationResult) -> Unused:
 def _spared(
     database: MatchingDatabase, result: EvaluationResult, duplicates: NearDuplicates, metric: MetricDocument | None
 ) -> tuple[tuple[str, NearDuplicate], ...]:
-    """Choose the clip that can be removed from each pair of near-duplicates: the one that the trials use less."""
+    """Choose clips to remove, so that no near-duplicates that look alike are left.
+
+    Of each pair, the clip that the trials use less is removed.
+    """
     ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
     most = np.inf if metric is None else indistinguishable(metric)
     return spared_sources(database, duplicates, ticks, most_perceived=most)
 
 
 def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: PerceivedRows | None) -> float:
-    """Return the greatest distance of poses that can be blended: in metres or, if there is a metric, in its unit."""
+    """Return the greatest distance of poses that can be blended: in metres or, with a metric, without unit."""
     if seen is None:
         return how.blendable_m or accepted_distance(result.records) or USUAL_BLENDABLE_M
     return how.blendable_distance or seen.transitions(result.switches).median or indistinguishable(seen.document)
