@@ -138,7 +138,7 @@ def test_only_the_pod_of_a_job_claims_it(desk: Desk) -> None:
     assert [lease.job for lease in desk.claim_many()] == [small]
     assert desk.claim_many(job=large) == []
     for caller in (desk.user, SYSTEM):
-        with pytest.raises(ForbiddenProblem, match="only a pod"):
+        with pytest.raises(ForbiddenProblem, match="reserved for pods"):
             claim(desk, caller, job=large)
     pod = pod_of(desk, large)
     for fields in ({}, {"job": other}, {"job": small}):
