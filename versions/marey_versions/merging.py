@@ -198,7 +198,7 @@ class _Sides:
 
     @property
     def by_name(self) -> dict[Side, DatasetEntry | None]:
-        """The entry by the name of the version; `base` is missing if the base does not have the entry."""
+        """The entry of each version: `ours` and `theirs`, possibly None, and `base` only if the base has the entry."""
         found = {Side.OURS: self.ours, Side.THEIRS: self.theirs}
         return found if self.base is None else {**found, Side.BASE: self.base}
 

@@ -295,7 +295,7 @@ class _Import:
             self._send(some)
 
     def _bases(self, contents: list[str]) -> dict[tuple[str, str], ArrayBases]:
-        """Request the tiles of the arrays that the new arrays of revisions replace.
+        """Request the tiles of earlier revisions' arrays, so that new arrays are sent without the tiles they share.
 
         Returns the tiles by content digest and part of the new revision. Small documents are left out.
         """

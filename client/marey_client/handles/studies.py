@@ -57,7 +57,7 @@ class StudyHandle(ItemHandle):
         return pages(self.transport, StudyParticipant, f"{self.url}/participants")
 
     def withdraw(self, participant: str) -> None:
-        """Delete what is stored about a participant, named by id. Only maintainers and owners may do this."""
+        """Delete consent and trials of a participant, named by id. Only maintainers and owners may do this."""
         self.transport.send("DELETE", f"{self.url}/participants/{participant}", repeatable=True)
 
     def progress(self) -> StudyProgress:

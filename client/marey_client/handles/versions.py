@@ -91,7 +91,7 @@ class DatasetHandle:
         changes: Sequence[EntryChange] | None = None,
         expected: str | None = None,
     ) -> Commit:
-        """Record a new version: the content of the dataset's folder, or the newest version after the given `changes`.
+        """Record a new version: the content of the dataset's folder, or the newest version with `changes` applied.
 
         If the answer is lost, the request is sent again and returns the commit that was made the first time. Raises
         `Conflict` if `expected` is given and is not the newest commit of the branch.

@@ -151,7 +151,7 @@ def _key_of(token: str, keys: Sequence[SigningKey], registry: jws.JWSRegistry) -
     if not fitting:
         raise UnknownSigningKey("the token is signed with a key that the provider does not list")
     if len(fitting) > 1:
-        raise InvalidIdToken("several keys of the provider fit the header, which does not name one of them")
+        raise InvalidIdToken("several keys of the provider fit the header, so the key of the token is not clear")
     return fitting[0]
 
 

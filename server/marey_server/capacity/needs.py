@@ -34,7 +34,7 @@ class PlannedWork:
 
 @dataclass(frozen=True)
 class InstalledPart:
-    """Part of an installation, with the processor seconds that the work needs and those that are available."""
+    """Part of an installation: the seconds that its processors or workers need for the work, and those they have."""
 
     name: str
     needed_s: float

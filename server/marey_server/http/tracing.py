@@ -1,8 +1,9 @@
 """Spans of a request, kept until the request ends, because its caller may be identified only then.
 
-The header `traceparent` is untrusted input. A setting lists the callers who may continue a trace, and so decide that
-their requests are recorded. Other callers with a valid token begin new traces, of which a share is recorded. Requests
-without a valid token are recorded only if the setting allows it, because anybody can send any number of them.
+The header `traceparent` is untrusted input. A setting states whether nobody, all callers with a valid token, or
+everybody may continue a trace, and so decide that their requests are recorded. Other callers with a valid token begin
+new traces, of which a share is recorded. Requests without a valid token are recorded only if everybody may continue a
+trace, because anybody can send any number of them.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ class Keeper(Protocol):
         ...
 
     async def close(self) -> None:
-        """Close the connections of the task, and let another server become the leader."""
+        """Release the resources, stop workers that do not outlive the server, and let another server take the lead."""
         ...
 
 

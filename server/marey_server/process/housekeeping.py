@@ -177,7 +177,7 @@ async def _collect_garbage(services: Services, holder: str) -> None:
 
 
 async def _move_uploads(services: Services, holder: str, damaged: set[str]) -> None:
-    """Move finished uploads from the database to object storage, if object storage is used for blobs.
+    """Move finished uploads from the database to object storage, if the setting `blobs` stores new blobs there.
 
     The digests of uploads that cannot be moved are added to `damaged`, so that they are not tried again.
     """

@@ -29,7 +29,7 @@ from marey_server.store.transaction import Transaction, in_lists
 MOST_CHANGES = 20_000
 """Greatest number of clips that may have changed since an index was updated; a search checks each of them."""
 MOST_COPIED_BYTES = 8 * GIB
-"""Greatest total size, in bytes, of the copies of index files on one server, and so of one index."""
+"""Greatest total size, in bytes, of the copies of index files on one server. A larger index cannot be searched."""
 
 
 class FoundIndex(NamedTuple):

@@ -32,7 +32,7 @@ class RateLimit:
     interval_us: int
 
     def latest_us(self, now_us: int) -> int:
-        """Return the latest time that the row of this limit may contain if another event is to be allowed now."""
+        """Return the greatest `until_us` in this limit's row with which another event is still allowed at `now_us`."""
         return now_us + (self.burst - 1) * self.interval_us
 
 
@@ -52,7 +52,7 @@ class DailyAmount(RateLimit):
         return cls(key, burst=1, interval_us=max(1, amount * DAY_US // most))
 
     def latest_us(self, now_us: int) -> int:
-        """Return the latest time that the row of this limit may contain if the event is to be allowed now."""
+        """Return the greatest `until_us` in this limit's row with which the event is still allowed at `now_us`."""
         return now_us + DAY_US - self.interval_us
 
 

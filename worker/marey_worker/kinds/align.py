@@ -354,7 +354,8 @@ class _Job:
 def _recording(pin: PinnedInput, info: ClipInfo) -> Recording:
     """Return take and performer of a clip.
 
-    The take of a piece that was cut from a clip is this clip; otherwise, it is the take in the record of the clip.
+    The take of a piece that was cut from a clip is this clip. Otherwise, it is performer, day, action and take as the
+    clip records them; without a recorded take, it is the clip itself.
     """
     cut_from = info.source.details.get("clip") if info.source is not None and info.source.format == "cut" else None
     item = cut_from.get("item") if isinstance(cut_from, dict) else None

@@ -100,7 +100,7 @@ def _simulation(
 def _confirming(
     context: Context, params: OptimiseParams, evaluated: EvaluatedSet, database: MatchingDatabase
 ) -> list[Resimulation]:
-    """Return simulations that confirm single steps and all steps together; none if nothing is to be confirmed."""
+    """Return simulations that confirm single steps and all steps together; none if `confirmation_replicates` is 0."""
     turns = range(2 if params.confirmation_replicates else 0)
     replicates = [confirmation_replicates(params, evaluated.result.options, turn) for turn in turns]
     return [_simulation(context, evaluated, database, numbers, params.confirmation_seed) for numbers in replicates]

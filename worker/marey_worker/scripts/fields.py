@@ -18,7 +18,7 @@ from marey_worker.context import JobRefused
 MOST_FIELD_BYTES = MIB
 MOST_LINE_BYTES = 64 * KIB
 STEP = "step"
-"""Name of the member of a JSON line that contains the step of the values in this line."""
+"""Key of the step in a line of JSON; the other keys of the line are fields with their values at this step."""
 
 _FIELD_NAME: TypeAdapter[str] = TypeAdapter(FieldName)
 

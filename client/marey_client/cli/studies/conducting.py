@@ -142,7 +142,7 @@ def withdraw(
     place: StudyPlace,
     participant: Annotated[str, typer.Argument(metavar="PARTICIPANT", help="Pseudonym or id, as in the list.")],
 ) -> None:
-    """Delete everything that is stored about a participant; the link is not valid any more."""
+    """Delete consent and trials of a participant, who then counts as withdrawn; the link ends."""
     with connect(context) as marey:
         found = study_at(marey, place)
         named = [one for one in found.participants() if participant in (one.id, one.participant)]

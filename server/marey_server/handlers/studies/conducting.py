@@ -83,7 +83,7 @@ class OneStudyParticipant(Resource):
 
     @writes(access=Access.MAINTAINER)
     async def delete(self, project: str, kind: str, item: str, participant: str) -> Rendered:
-        """Delete all stored data about a participant, who is named by id; the participant's link becomes invalid."""
+        """Delete consent and trials of a participant, named by id, who then counts as withdrawn; the link ends."""
         return await self.answer(conducting.withdraw_participant, project, kind_of(kind), item, participant)
 
 

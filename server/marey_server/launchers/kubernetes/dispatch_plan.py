@@ -173,9 +173,9 @@ def _start(group: _StartGroup, numbers: Mapping[str, int]) -> Started:
 def _grouped(due: Sequence[WaitingJob], numbers: Mapping[str, int]) -> Iterable[_StartGroup]:
     """Yield the groups to start: single jobs, and tasks that start together.
 
-    Tasks start together if they had no pods before, and at least two tasks of the same parent wait. If the number of
-    running tasks is limited, a group gets only as many pods as there are waiting tasks, because further pods would
-    occupy nodes while they wait.
+    Tasks start together if they had no pods before, and at least two tasks of the same parent wait. If their project
+    has a limit of running jobs, a group gets only as many pods as it has tasks in `due`. These are the tasks that the
+    limit lets run now; further pods would occupy nodes while they wait.
     """
     fresh = [one for one in due if one.parent is not None and one.fence == 0 and one.parent not in numbers]
     counts: dict[str, int] = {}

@@ -143,7 +143,7 @@ class Dispatcher:
                 await ask(self._jobs.delete(name))
 
     async def _postpone(self, job: Manifest, reason: str, pause_s: float) -> bool:
-        """Let the queued job of a Job wait for `pause_s` seconds; return False if a worker has already claimed it."""
+        """Delay the job of a Job, or its tasks, by at least `pause_s` seconds; return False if none is queued."""
         of_job = partial(postpone, job_id=job_of(job), reason=reason, pause_s=pause_s, tasks=is_split(job))
         postponed = await asyncio.wrap_future(self._database.submit_write(SYSTEM, of_job))
         if postponed:

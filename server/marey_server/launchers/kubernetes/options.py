@@ -49,8 +49,8 @@ class ClusterOptions(BaseModel):
     ended_s: int = Field(3600, ge=0, description="Seconds for which the cluster keeps ended workers, with their logs.")
     indexed: bool = Field(
         False,
-        description="Start several workers as one Indexed Job, which Kueue admits as a whole. A single worker of this "
-        "Job can be stopped only after it has a pod.",
+        description="Combine workers that are started together in one Indexed Job, which Kueue admits as a whole. A "
+        "single worker of this Job can be stopped only after it has a pod.",
     )
     relist_s: int = Field(30, ge=1, le=600, description="Seconds between two complete lists of the workers.")
     timeout_s: float = Field(10.0, gt=0, le=300, description="Seconds that the cluster has to answer a request.")

@@ -5,8 +5,8 @@
 3. The provider sends the browser back. The state works once, and only in the browser with the cookie.
 4. The browser gets a code. The program redeems the code, once, with its verifier, and gets a token.
 
-The database contains only hashes of the verifier, the cookie, the state and the code. An error ends the sign-in; the
-person must then begin a new sign-in.
+The database contains only hashes of the verifier, the cookie, the state and the code. A state is used up even if the
+sign-in fails afterwards; the person must then begin a new sign-in.
 """
 
 from __future__ import annotations

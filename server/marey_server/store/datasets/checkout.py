@@ -73,7 +73,8 @@ def check_out(
     if len(changes) > MOST_CHANGES:
         raise InvalidProblem(
             f"{counted(len(changes), 'entry')} of the folder differ from this version; a checkout changes at most "
-            f"{MOST_CHANGES:,}. First check out versions between them, or parts of this version (`paths`).",
+            f"{MOST_CHANGES:,}. First check out a version between the folder's and this one. If the folder is almost "
+            "empty, first check out a part of this version (`paths`), then larger parts.",
             code="large-checkout",
         )
     compared = compare_entries(changes)

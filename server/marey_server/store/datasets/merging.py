@@ -252,8 +252,8 @@ def _changed(store: StoredChunks, base: str, tree: str, most: int | None = None)
     found = list(islice(difference(store, base, tree), None if most is None else most + 1))
     if most is not None and len(found) > most:
         raise InvalidProblem(
-            f"One side of the merge has changed more than {most:,} entries, so the result is not computed here; "
-            "request a preview of the merge.",
+            f"One side of the merge has changed more than {most:,} entries, so this request does not compute the "
+            "result; request a preview of the merge.",
             code=LARGE_MERGE,
         )
     return compare_entries(found)

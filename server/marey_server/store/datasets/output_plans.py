@@ -171,7 +171,7 @@ def too_many_changes(most: int, condition: str = "") -> CommitConflict:
     return CommitConflict(
         code="too-many-changes",
         detail=f"The commit of a job can change at most {most:,} entries{condition}. The outputs are in the project; "
-        "commit them by a request.",
+        "`marey dataset commit` records those in the folder of the dataset.",
     )
 
 

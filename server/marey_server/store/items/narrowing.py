@@ -143,6 +143,6 @@ def _in_range(condition: Condition, project_id: str, kind: Kind) -> Select[*tupl
 RANGES: dict[str, Comparison] = {
     "frames": frames_in_range, "created": COMPARISONS["created"], "updated": COMPARISONS["updated"],
 }  # fmt: skip
-"""Comparisons for the fields by which lists can be sorted, and which therefore are columns of an index."""
+"""Comparisons for the number and the times by which lists can be sorted; these fields are columns of an index."""
 CANDIDATES: dict[str, Candidates] = {**dict.fromkeys(INDEXED_FACTS, _with_fact), "tag": _with_tag}
 """Functions that return the candidates for a condition, by the name of the field."""

@@ -64,7 +64,7 @@ class RigDocument:
 
 
 def on_known_rigs(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
-    """Replace, in drafts of skeletons with `reuse="by_content"`, hierarchies by equal rigs that the project has."""
+    """In drafts of skeletons with `reuse="by_content"`, use an earlier hierarchy of the same rig (`is_same_rig`)."""
     moved: dict[str, set[str]] = {}
     for one in loaded:
         joints = set(one.bodies.get("motion", {}).get("translated_joints", ()))

@@ -26,8 +26,8 @@ def without_skeleton_changes(tx: Transaction, project: ProjectRow, loaded: list[
     """Prevent drafts with `same_skeleton` from changing the skeletons of existing items; return the changed drafts.
 
     If the skeleton of a draft is the same rig (`is_same_rig`) as the skeleton of the existing item, the draft refers to
-    the skeleton of the item instead. Otherwise, the draft is left out, together with the annotations of its clip, and
-    with its skeleton if no other draft uses this skeleton.
+    the skeleton of the item instead, unless that is deleted. If it is another rig, the draft is left out, together with
+    the annotations of its clip, and with its skeleton if no other draft uses this skeleton.
     """
     before = _skeletons_before(tx, project, [one for one in loaded if one.draft.same_skeleton])
     if not before:

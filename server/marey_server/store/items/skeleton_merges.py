@@ -270,7 +270,7 @@ def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonM
 
 
 def _move(tx: Transaction, project: ProjectRow, merged: _Skeleton, kept: _Skeleton) -> None:
-    """Revise the items that use the merged skeleton, so that they use the kept one, and the annotations of clips."""
+    """Use the kept skeleton in new revisions of all items that use the merged one; move clips' annotations to them."""
     reference = {"item": kept.row.id, "revision": kept.row.head}
     message = f"The skeleton {merged.named['path']} was merged into {kept.named['path']}"
     users = list(_users(tx, project, merged.row.id, lock=True))

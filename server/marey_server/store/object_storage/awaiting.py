@@ -48,7 +48,7 @@ class Carried:
     absent: set[StoredObject] = field(default_factory=set)
     """Objects that were to be read, but do not exist."""
     fault: str | None = None
-    """Reason why no object can be stored, found by `ProbeAwaited`; None if objects can be stored."""
+    """Reason why no object can be stored, set by `ProbeAwaited`; None before this check, and if there is none."""
     probed: bool = False
     looked_again: bool = False
     transfers: Counter[str] = field(default_factory=Counter)

@@ -56,7 +56,10 @@ class ObjectBlobs:
         return _InTransaction(self, carried, now_us)
 
     def new_copy(self) -> Path | None:
-        """Return a new file for the copy of an upload; None if new blobs become objects, or `local` needs no copy."""
+        """Return a new file for the copy of an upload; None if `local` needs no copy, or if new blobs become objects.
+
+        In the latter case, uploads stay in the database until they are moved.
+        """
         return None if self.stores_objects else self.local.new_copy()
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:

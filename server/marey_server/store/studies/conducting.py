@@ -156,7 +156,7 @@ def _state(row: Row[Any]) -> ParticipantState:
 
 
 def withdraw_participant(tx: Transaction, project: str, kind: Kind, item_id: str, participant: str) -> None:
-    """Delete what is stored about a participant, named by id; the link is not valid any more.
+    """Delete consent and trials of a participant, named by id, who then counts as withdrawn; the link ends.
 
     Raises `NotFoundProblem` if the study has no such participant. A repetition changes nothing.
     """

@@ -159,7 +159,7 @@ def _shown(row: Row[Any], design: StudyDocument) -> Participation:
 
 
 def withdraw_caller(tx: Transaction) -> None:
-    """Delete everything that is stored about the participant who sends the request; a repetition changes nothing."""
+    """Delete consent and trials of the participant who sends the request; a repetition changes nothing."""
     row = _caller(tx, lock=True)
     if row.withdrawn_us is None:
         withdraw(tx, row, by="participant")

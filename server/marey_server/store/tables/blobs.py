@@ -1,4 +1,4 @@
-"""Tables of stored bytes, of the users and projects that may refer to them, and of unfinished uploads."""
+"""Tables of stored bytes, of the users and attempts that may refer to them, and of unfinished uploads."""
 
 from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, LargeBinary, String, Table, false, text
 
