@@ -93,8 +93,9 @@ class User(Answer):
     created_at: datetime
     last_seen_at: datetime | None = Field(
         None,
-        description="Time when a token or an identity of the user was last used, to the hour. Uses of tokens that "
-        "were deleted later do not count. Null: there was no use, or the caller is not an administrator.",
+        description="Time when a token or an identity of the user was last used, to the hour; only in the list of "
+        "users, which administrators may read. Uses of tokens that were deleted later do not count. Null: there was "
+        "no use, or the answer is not this list.",
     )
     rev: int
 

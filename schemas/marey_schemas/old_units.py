@@ -15,7 +15,7 @@ def in_centimetres(name: str) -> Any:
         None,
         exclude=True,
         json_schema_extra={"deprecated": True},
-        description=f"Deprecated: `{name}` in centimetres, as in release 0.1.",
+        description=f"Deprecated: use `{name}`. This field of release 0.1 is in centimetres.",
     )
 
 

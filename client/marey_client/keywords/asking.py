@@ -18,8 +18,8 @@ class ImportKeywords(TypedDict, total=False):
     collection: str
     """Folder of the project that receives the clips."""
     skeleton: str | None
-    """Item id of the skeleton that the clips must use; `marey upload` and Python also accept the path of the item.
-    Absent: an equal skeleton of the project is used, or a new skeleton is created."""
+    """Item id of the skeleton that the clips must use. `marey upload` also accepts its address (project/folder/name),
+    and Python its path. Absent: an equal skeleton of the project is used, or a new skeleton is created."""
     unit: Literal["mm", "cm", "inch", "cmu", "dm", "ft", "m"] | None
     """Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."""
     unit_scale_m: float | None
@@ -106,7 +106,7 @@ class SearchKeywords(TypedDict, total=False):
     """Size of a jump between two steps that counts as an error of 1, in metres; jumps of hands, feet and the height of
     the pelvis are measured."""
     transition_tolerance_cm: float | None
-    """Deprecated: `transition_tolerance_m` in centimetres, as in release 0.1."""
+    """Deprecated: use `transition_tolerance_m`. This field of release 0.1 is in centimetres."""
     finish: bool
     """Remove the remaining errors of joint positions by inverse kinematics."""
     seed: int

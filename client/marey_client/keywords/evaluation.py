@@ -155,9 +155,9 @@ class EvaluateKeywords(TypedDict, total=False):
     switch_every_s: float
     """Seconds that each speed of a switching trial lasts."""
     replicates: int
-    """Number of replicates of each trial. Each replicate has a different phase of the stride at the start, and an
-    approach that is up to one second longer. Results are means with 95 % intervals. 1: only the trial itself, as
-    published, without intervals."""
+    """Number of replicates of each trial. The first one is the trial itself; each further one has another phase of the
+    stride at the start, and an approach that is up to one second longer. Results are means with 95 % intervals. 1: only
+    the trial itself, as published, without intervals."""
     seed: int
     """Seed of the random differences between the replicates of a trial."""
     window: Literal["circle", "all"]
@@ -217,9 +217,9 @@ class SuggestKeywords(TypedDict, total=False):
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
     estimation_replicates: int
-    """Number of replicates of each trial in which effects are estimated, in order to choose among them. They are
-    numbered from 0, like the replicates of the evaluation. Confirmations use replicates with higher numbers than
-    both."""
+    """Number of replicates of each trial in which effects are estimated, in order to choose among them. These
+    replicates are the first ones of the evaluation, and further ones if it has fewer. Confirmations use other
+    replicates, which neither the estimate nor the evaluation uses."""
     confirmation_replicates: int
     """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
     with intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose
@@ -230,8 +230,8 @@ class SuggestKeywords(TypedDict, total=False):
     removals: int
     """Number of clips whose removal is planned, in addition to the unused clips; 0: none."""
     simulated_additions: int
-    """Number of suggested additions whose effect on the trials is simulated, in their order. Each simulation takes as
-    long as an evaluation with `confirmation_replicates`."""
+    """Number of suggested additions whose effect on the trials is simulated: the first ones that have the skeleton of
+    the set. Each simulation takes as long as an evaluation with `confirmation_replicates`."""
     consider: int | None
     """Number of clips whose removal is tried, one clip at a time, beginning with the clips that the fewest trials use;
     null: all clips."""
@@ -244,8 +244,8 @@ class SuggestKeywords(TypedDict, total=False):
     """With a metric, instead of `blendable_m`: greatest perceptual distance between poses that can be blended; absent:
     the median over the transitions of the trials."""
     lost_pose: float
-    """With a metric: metres that each second of poses that look like no pose of the remaining clips adds to the harm of
-    a removal."""
+    """With a metric: weight of lost poses in the harm of a removal, in metres per second of these poses. A pose is lost
+    if it looks like no pose of the remaining clips."""
 
 
 class OptimiseKeywords(TypedDict, total=False):
@@ -254,9 +254,9 @@ class OptimiseKeywords(TypedDict, total=False):
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
     estimation_replicates: int
-    """Number of replicates of each trial in which effects are estimated, in order to choose among them. They are
-    numbered from 0, like the replicates of the evaluation. Confirmations use replicates with higher numbers than
-    both."""
+    """Number of replicates of each trial in which effects are estimated, in order to choose among them. These
+    replicates are the first ones of the evaluation, and further ones if it has fewer. Confirmations use other
+    replicates, which neither the estimate nor the evaluation uses."""
     confirmation_replicates: int
     """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
     with intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose
@@ -283,9 +283,9 @@ class SweepKeywords(TypedDict, total=False):
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
     estimation_replicates: int
-    """Number of replicates of each trial in which effects are estimated, in order to choose among them. They are
-    numbered from 0, like the replicates of the evaluation. Confirmations use replicates with higher numbers than
-    both."""
+    """Number of replicates of each trial in which effects are estimated, in order to choose among them. These
+    replicates are the first ones of the evaluation, and further ones if it has fewer. Confirmations use other
+    replicates, which neither the estimate nor the evaluation uses."""
     confirmation_replicates: int
     """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
     with intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose

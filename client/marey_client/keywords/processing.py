@@ -198,7 +198,7 @@ class ModelKeywords(TypedDict, total=False):
     report_samples: int
     """Number of samples drawn to measure foot sliding and durations."""
     name: str
-    """Name of the model and of the action."""
+    """Name of the model, and also of the action that it generates."""
     report: bool
     """Write the report and its figures."""
     search_check: bool

@@ -15,7 +15,7 @@ COSTS = ("match_cost", "continuing_cost", "pose_cost")
 """Names of the costs that the part `records` contains for each tick of a trial."""
 
 CONFIDENCE = 0.95
-"""Confidence level of the intervals for changes between two evaluations, and for means of replicates."""
+"""Confidence level of intervals: changes between two evaluations, means of replicates, and totals of quality."""
 
 
 MOST_EVALUATIONS_COMPARED = 8

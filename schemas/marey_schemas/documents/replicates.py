@@ -1,7 +1,6 @@
 """Means of replicates, which are measurements that differ only by chance, with confidence intervals.
 
-The server, the reports, and the load tests of the client use this module. It does not use numpy, because a mean has few
-replicates.
+Server, client, library and reports use this module. It does not use numpy, because a mean has few replicates.
 """
 
 from __future__ import annotations

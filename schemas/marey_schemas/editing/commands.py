@@ -124,8 +124,9 @@ class Concatenate(NamedCommand):
     blend_s: Seconds = Field(0.3, description="Duration of the blend in seconds; 0: a hard cut.")
     keep_feet: bool = Field(
         True,
-        description="Keep a foot in place if it is in contact before and after the seam, and keep all feet above their "
-        "floors. false: only rotations and the path of the root are blended.",
+        description="Keep a foot in place if it is in contact before and after the seam (only with `blend` "
+        "inertialise), and keep all feet above their floors. false: only rotations and the path of the root are "
+        "blended.",
     )
 
 

@@ -126,8 +126,8 @@ class WristContactProposal(_Proposal):
     )
     release: bool = Field(
         False,
-        description="Also add a keyframe `release` at the last frame in which the hand is still far from its "
-        "rest position.",
+        description="Also add a keyframe `release` at the last frame in which the distance of the hand from rest is "
+        "at least the share `arrived` of the farthest distance.",
     )
 
 

@@ -31,8 +31,9 @@ class ImportOptions(Options):
     collection: CollectionPath = Field("", description="Folder of the project that receives the clips.")
     skeleton: str | None = Field(
         None,
-        description="Item id of the skeleton that the clips must use; `marey upload` and Python also accept the path "
-        "of the item. Absent: an equal skeleton of the project is used, or a new skeleton is created.",
+        description="Item id of the skeleton that the clips must use. `marey upload` also accepts its address "
+        "(project/folder/name), and Python its path. Absent: an equal skeleton of the project is used, or a new "
+        "skeleton is created.",
     )
     unit: LengthUnit | None = Field(
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."

@@ -45,8 +45,8 @@ class ConfirmedEffects(ObjectiveChoice):
         ge=1,
         le=64,
         description="Number of replicates of each trial in which effects are estimated, in order to choose among "
-        "them. They are numbered from 0, like the replicates of the evaluation. Confirmations use replicates "
-        "with higher numbers than both.",
+        "them. These replicates are the first ones of the evaluation, and further ones if it has fewer. "
+        "Confirmations use other replicates, which neither the estimate nor the evaluation uses.",
     )
     confirmation_replicates: int = Field(
         8,
@@ -89,8 +89,8 @@ class SuggestionOptions(ConfirmedEffects):
         3,
         ge=0,
         le=100,
-        description="Number of suggested additions whose effect on the trials is simulated, in their order. Each "
-        "simulation takes as long as an evaluation with `confirmation_replicates`.",
+        description="Number of suggested additions whose effect on the trials is simulated: the first ones that have "
+        "the skeleton of the set. Each simulation takes as long as an evaluation with `confirmation_replicates`.",
     )
     consider: int | None = Field(
         50,
@@ -124,8 +124,8 @@ class SuggestionOptions(ConfirmedEffects):
     )
     lost_pose: _Price = Field(
         0.01,
-        description="With a metric: metres that each second of poses that look like no pose of the remaining clips "
-        "adds to the harm of a removal.",
+        description="With a metric: weight of lost poses in the harm of a removal, in metres per second of these "
+        "poses. A pose is lost if it looks like no pose of the remaining clips.",
     )
 
 

@@ -91,7 +91,7 @@ class ConnectedChild(ABC):
         return resident_bytes(self.pid)
 
     def send(self, message: bytes) -> None:
-        """Send a message. If the child has died, the next call of `receive` raises an error."""
+        """Send a message. If the child has died, `receive` raises an error after the last message of the child."""
         with self._sending:
             if self._pipe.closed:
                 return
@@ -103,8 +103,8 @@ class ConnectedChild(ABC):
     def send_socket(self, message: bytes, passed: socket.socket) -> None:
         """Send a message and then a socket, which the child receives by `recv_handle`.
 
-        If sending fails, the child is killed, because it would wait for the socket. The next call of `receive` then
-        raises an error.
+        If sending fails, the child is killed, because it would wait for the socket. `receive` then raises an error
+        after the last message of the child.
         """
         with self._sending:
             try:
@@ -147,7 +147,7 @@ class ConnectedChild(ABC):
             self._socket.close()
 
     def abort(self) -> None:
-        """Kill the process at once; any thread may call this. The next call of `receive` then raises an error."""
+        """Kill the process at once, from any thread; `receive` raises an error after the last message of the child."""
         if self.alive:
             self._signal(signal.SIGKILL)
 

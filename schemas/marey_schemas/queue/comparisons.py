@@ -84,7 +84,8 @@ class ComparedRun(Answer):
     seed: int
     created_at: datetime
     inputs: dict[str, str] = Field(
-        description="Name and revision of the item of each input, or the number of items if the input has several."
+        description="Path and revision of the item of each input, such as `raw/walk@2`. If an input does not have "
+        "exactly one item: the number of its items, and a hash of their list."
     )
     values: dict[str, Value] = Field(description="Values of the parameters.")
     fields: dict[str, Value] = Field(description="Logged fields.")

@@ -264,7 +264,7 @@ def count_sweep_tasks(params: SweepParams) -> int:
 class ModelParams(ModelOptions, TaggedResults):
     """Parameters of jobs of the kind `model`."""
 
-    name: ItemName = Field("model", description="Name of the model and of the action.")
+    name: ItemName = Field("model", description="Name of the model, and also of the action that it generates.")
     report: bool = Field(True, description="Write the report and its figures.")
     search_check: bool = Field(
         True,

@@ -281,7 +281,7 @@ class Job(Answer):
         None, description="Reason why the outputs are not on the branch to which the job was to commit them."
     )
     commit: JobCommit | None = Field(
-        None, description="Commit of the outputs; null if the submission requested no commit."
+        None, description="Commit of the outputs; null for tasks, and if the submission requested no commit."
     )
     author: str | None
     created_at: datetime

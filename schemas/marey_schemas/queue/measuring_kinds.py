@@ -96,7 +96,7 @@ DISTANCES = KindDeclaration(
 QUALITY = KindDeclaration(
     name="quality",
     description="Measures defects of any clips: foot skate, inconsistent contacts, penetration of the floor, jitter, "
-    "excess of joint limits; also speed and turn rate.",
+    "exceeded joint limits; also speed and turn rate.",
     params=job_params.QualityParams,
     implementation="marey_worker.kinds.quality:run",
     version=1,

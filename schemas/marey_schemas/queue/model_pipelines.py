@@ -20,7 +20,7 @@ class ModelPlan(Request):
     proposed or existing annotations, and aligned; a model is trained on the examples, and a tree is built for searches.
     """
 
-    name: ItemName = Field(description="Name of the model and of the action.")
+    name: ItemName = Field(description="Name of the model, and also of the action that it generates.")
     into: CollectionPath = Field(
         min_length=1, description="The collection of the model; everything else is stored below it."
     )

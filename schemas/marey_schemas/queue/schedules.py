@@ -67,8 +67,8 @@ class ScheduleCreate(Request):
 class ScheduleChange(Request):
     """Request to change a schedule; absent fields stay as they are.
 
-    After a change, the server submits jobs as the user who made the change, unless only the pause or the description
-    was changed.
+    After a change, the server submits jobs as the user who made the change, unless the change only pauses the schedule
+    or changes its description. A user who resumes the schedule becomes the user on whose behalf jobs are submitted.
     """
 
     cron: Cron | None = None

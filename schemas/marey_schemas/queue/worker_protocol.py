@@ -49,7 +49,7 @@ class ClaimRequest(Request):
         min_length=16,
         max_length=64,
         description="Random id of the claim. If a request is repeated with the same id and the same token, it gets "
-        "the leases of the first request, renewed.",
+        "those leases of the first request that are still held, renewed; it is refused if all of them have ended.",
     )
 
 

@@ -58,7 +58,7 @@ class Tracer:
         self._share = share
 
     def new_root(self) -> TraceContext:
-        """Return the context of a new trace, which has no span yet (`span_id` is 0) and may be sampled."""
+        """Return the context of a new trace without spans (`span_id` is 0); a configured share of traces is sampled."""
         trace_id = new_trace_id()
         return TraceContext(trace_id, 0, trace_id % _WANTED < self._share * _WANTED)
 
