@@ -29,7 +29,10 @@ from marey_schemas.wording import nearest
 
 MOTION_EXTRA = "motion"
 DIFFERENCE_FRAMES = 2
-"""Number of frames before and after a range on which the velocities in the range depend."""
+"""Greatest number of frames before and after a range that its velocities depend on.
+
+At the ends of a motion, the velocities are extrapolated from 2 further frames; elsewhere, they depend on 1 frame.
+"""
 FEET = tuple((f"{side}_toe", f"{side}_ankle") for side in ("left", "right"))
 """Standard joints of the left and the right foot: the toe, or the ankle if the toe is not mapped."""
 

@@ -39,7 +39,7 @@ class MotionPicture:
 
 
 def draw_poses(clip: PosedItem, frames: slice | None, moments: int) -> MotionPicture:
-    """Draw the poses at `moments` frames, evenly spaced over the range; only these frames are read."""
+    """Draw the poses at up to `moments` frames, evenly spaced over the range; only these frames are read."""
     if not 1 <= moments <= MOST_MOMENTS:
         raise BadArgument(f"moments: a picture shows 1 to {MOST_MOMENTS} moments, not {moments}")
     frames_text(frames)

@@ -68,7 +68,7 @@ def page_with(template: bytes, title: str, motions: Sequence[ShownMotion]) -> by
 
 
 def save_page(transport: Transport, target: Path, motions: Sequence[ShownMotion]) -> None:
-    """Write a page that plays motions beside each other to a file; if writing fails, no file is left."""
+    """Write a page that plays motions beside each other to a file; if writing fails, `target` stays as it was."""
     if not 1 <= len(motions) <= MOST_MOTIONS:
         raise BadArgument(f"a page plays 1 to {MOST_MOTIONS} motions, not {len(motions)}")
     title = " beside ".join(one.name for one in motions[:2]) + (" …" if len(motions) > 2 else "")

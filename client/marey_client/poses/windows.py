@@ -88,11 +88,13 @@ class MotionWindows:
         return {"motion": motion, "clip": clip.path, "id": clip.id, "first": first}
 
     def split(self, shares: Mapping[str, float], *, by: SplitBy = "subject", seed: int = 0) -> dict[str, MotionWindows]:
-        """Divide the windows into parts, such as `{"train": 0.8, "test": 0.2}`; no subject, take or clip is split.
+        """Divide the windows into parts, such as `{"train": 0.8, "test": 0.2}`, without splitting a group.
 
-        The windows of one subject form a group; with `by="take"` or `by="clip"`, those of one take or clip. The groups
-        are assigned in a random order with the seed `seed`, each to the part that lacks the most windows of its share.
-        Raises `BadArgument` if a clip has no subject or take, or if there are fewer groups than parts.
+        The windows of one subject form a group; with `by="take"` or `by="clip"`, those of one take or clip. So
+        `by="clip"` may put clips of the same subject or take into different parts. The groups are assigned in a random
+        order with the seed `seed`, each to the part that lacks the most windows of its share; no part stays empty.
+        Raises `BadArgument` if a clip lacks the subject or take of `by`, if there are fewer groups than parts, or if a
+        share is not valid.
         """
         if not shares or not all(0 < share < float("inf") for share in shares.values()):
             raise BadArgument(f"shares: every part needs a share above 0, not {dict(shares)}")

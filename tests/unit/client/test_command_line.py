@@ -535,9 +535,9 @@ def test_a_checkout_says_how_many_of_how_many_entries_were_taken(
 def test_a_conflict_cannot_be_decided_for_two_sides() -> None:
     [one, same] = resolutions_of(None, ["raw/a:clip", "raw/a:clip"], None)
     assert one == same
-    with pytest.raises(WrongUsage, match="resolved by two of --ours, --theirs and --base"):
+    with pytest.raises(WrongUsage, match="two of --ours, --theirs and --base resolve"):
         resolutions_of(["raw/a:clip"], None, ["/raw/a:clip"])
-    with pytest.raises(WrongUsage, match="resolved by two of --ours, --theirs and --base"):
+    with pytest.raises(WrongUsage, match="two of --ours, --theirs and --base resolve"):
         resolutions_of(["raw/a:clip"], ["raw/a:clip/motion"], None)
 
 

@@ -96,7 +96,7 @@ class Desk:
         return [list(one) for one in answers]
 
     def entries(self, *names: str, **query: str | int | None) -> list[dict[str, Any]]:
-        """Return the entries of one list, page by page until the deadline; arguments are those of `Question.of`."""
+        """Return the entries of a list: at most `MOST_PAGES` pages, until the deadline; arguments as `Question.of`."""
         return self.ask([replace(Question.of(*names, **query), whole=True)])[0]
 
     @property

@@ -169,7 +169,7 @@ SUBJECTS: Mapping[str, How] = {
     "view place": places(Kind.CLIP),
     "webhook webhook_id": in_project("webhooks", field="id", remark="url"),
 }
-"""Completion function of a parameter, by `parameter` or `command parameter`; the longest matching key is used."""
+"""Completion functions by `parameter`, `group parameter` or `command parameter`; the longest matching key is used."""
 
 
 def how_to_complete(command: Sequence[str], parameter: str) -> How | None:

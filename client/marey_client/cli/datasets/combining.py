@@ -192,8 +192,8 @@ def resolutions_of(
             one = _resolution(place, side)
             if any(_order_matters(one, other) for other in found):
                 raise WrongUsage(
-                    f"{place!r} is resolved by two of --ours, --theirs and --base; give only one of them for an entry "
-                    "or a part, or resolve the parts with Python or REST"
+                    f"two of --ours, --theirs and --base resolve {place!r}, a part of it, or its whole entry; give one "
+                    "of them for the whole entry, or one for each of its parts"
                 )
             found.append(one)
     return found

@@ -63,7 +63,7 @@ def table_of_runs(comparison: RunComparison, columns: Sequence[ComparedColumn]) 
 
 
 def table_of_means(comparison: RunComparison, columns: Sequence[ComparedColumn]) -> RunTable:
-    """Return a table with one row for each setting: its number of runs, and mean and interval of each logged field."""
+    """Return a table with one row for each setting: number of runs, and mean and interval of each numeric field."""
     fixed = [column for column in columns if column.of != "field"]
     fields = [column for column in columns if column.of == "field" and column.numeric]
     titles = comparison.titles(fields)

@@ -24,7 +24,7 @@ class FigureOptions:
 
     Parameters
     ----------
-    negate_errors : draw errors as reference minus simulated, as in figure 8 of the paper, not simulated minus reference
+    negate_errors : draw errors as desired minus simulated, as in figure 8 of the paper, not simulated minus desired
     logarithmic : whether the sizes of dots and the lengths of bars have a logarithmic scale
     most_clips : number of clips that are drawn one by one; all other clips are summed up
     """
