@@ -209,7 +209,8 @@ class _Aligning:
         wanted = self._options.reference
         if wanted not in (MEDOID, NEAREST_MEAN_LENGTH) and wanted not in {one.uid for one in clips}:
             raise MotionError(
-                "the reference is not one of the clips to align; choose one of them",
+                f"the reference is not one of the clips to align; choose one of them, {MEDOID} or "
+                f"{NEAREST_MEAN_LENGTH}",
                 code="unknown-reference",
                 where=wanted,
             )

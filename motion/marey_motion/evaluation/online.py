@@ -147,14 +147,15 @@ class OnlineCoverage:
 
         Raises
         ------
-        MotionError    if a value is invalid or too far from the origin; no frame is added
+        MotionError    if a shape or a value is invalid, or if a position is too far from the origin; no frame is added
         """
-        if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
+        if positions.shape != (len(headings), 2):
             raise MotionError(
-                f"each position needs one finite heading, but there are {len(headings)} headings and positions of "
-                f"shape {positions.shape}",
+                f"{len(headings)} headings need positions of the shape ({len(headings)}, 2), not {positions.shape}",
                 where="roots",
             )
+        if not np.all(np.isfinite(headings)):
+            raise MotionError("a heading is infinite or not a number", where="roots")
         _require_near(positions)
         return self._add(positions, np.stack((np.sin(headings), np.cos(headings)), axis=-1))
 

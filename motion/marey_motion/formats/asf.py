@@ -219,7 +219,7 @@ class _AsfReader:
                 section(text.split())
         if not self.children:
             raise self.lines.error(
-                "the file has no section :hierarchy; copy or export the file again", code="file-truncated"
+                "the section :hierarchy is missing or empty; copy or export the file again", code="file-truncated"
             )
         return self._assembled()
 
@@ -303,8 +303,8 @@ class _AsfReader:
         for name in (parent, *children):
             if name != ROOT and name not in self.bones:
                 raise self.lines.error(
-                    "the section :hierarchy contains this bone, but the section :bonedata does not define the bone; "
-                    "add or remove the bone",
+                    "the section :hierarchy contains this bone, but the section :bonedata does not define it; define "
+                    "it in :bonedata, or remove it from :hierarchy",
                     joint=name,
                 )
         self.children.setdefault(parent, []).extend(children)

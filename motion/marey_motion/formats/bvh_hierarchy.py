@@ -216,7 +216,8 @@ class _HierarchyReader:
             raise self.lines.error(f"channel {unknown!r} is not one of {', '.join(CHANNELS)}", joint=joint)
         if len(words[0]) > 3 or int(words[0]) != len(names):
             raise self.lines.error(
-                f"CHANNELS declares {excerpt(words[0])} channels, but lists {len(names)}; correct the number",
+                f"CHANNELS declares {excerpt(words[0])} channels, but lists {len(names)}; correct the number or the "
+                "list",
                 joint=joint,
             )
         if len(set(names)) != len(names):

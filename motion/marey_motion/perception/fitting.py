@@ -112,7 +112,7 @@ def fit_component(
     if means.mean(axis=0) @ raw[1:] <= _NOTHING:
         raise MotionError(
             f"{differences.measurement} do not explain the perceived differences: the best fit gives every joint class "
-            "the weight 0; use another measurement or another shaping",
+            "the weight 0, so no component can be fitted",
             code="fit-without-weights",
         )
     given = dict(zip(differences.classes, (raw[1:] / total).tolist(), strict=True))

@@ -94,10 +94,12 @@ class Component:
         """
         found = np.array([self.weights.get(name, 0.0) for name in classes])
         if found.sum() <= 0:
-            needed = ", ".join(name for name, weight in self.weights.items() if weight > 0)
+            needed = ", ".join(
+                joint for name, weight in self.weights.items() if weight > 0 for joint in JOINT_CLASSES[name]
+            )
             raise MotionError(
-                f"the joint mapping contains none of the joint classes with a weight for {self.measurement}: {needed}; "
-                "map these joints",
+                f"the joint mapping contains none of the joints with a weight for {self.measurement}: {needed}; map at "
+                "least one of them",
                 code="mapping-invalid",
             )
         return np.asarray(found / found.sum())

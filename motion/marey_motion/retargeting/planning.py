@@ -111,8 +111,8 @@ class RetargetPlan:
             start, middle = ("hip", "knee") if end == "ankle" else ("shoulder", "elbow")
             raise MappingError(
                 f"to keep {'feet' if end == 'ankle' else 'hands'}, {start}, {middle} and {end} of both sides must be "
-                f"mapped in both skeletons; the limb that ends at {' or '.join(missing)} is incomplete; map these "
-                "joints, or leave the option out",
+                f"mapped in both skeletons; no complete limb ends at {' or '.join(missing)}; map these joints, or "
+                "leave the option out",
                 code="limbs-not-mapped",
                 where=missing[0],
             )

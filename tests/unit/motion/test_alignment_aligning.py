@@ -272,7 +272,7 @@ def short(frames: int) -> SourceExample:
             "cut: contact, frame 60: the frame of the cut is outside the clip, whose frames are 0 to 59",
         ),
         (short(8), TO_FIRST, "alignment-impossible", "short: .*60 frames cannot be aligned with 8"),
-        (short(20), AlignOptions(reference="nobody"), "unknown-reference", "nobody: the reference is not one"),
+        (short(20), AlignOptions(reference="nobody"), "unknown-reference", "nobody: .*, medoid or nearest_mean"),
         (short(20), AlignOptions(weights={"tail": 2.0}), "unknown-joint", "tail"),
         (SourceExample("clip_a@1", "twin", walk()), None, "motion-invalid", "clip_a@1: two examples have this uid"),
     ],

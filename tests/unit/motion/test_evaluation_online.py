@@ -311,9 +311,10 @@ def test_frames_that_are_nowhere_are_refused_and_change_nothing(walk: Clip) -> N
     for bad in (np.array([[np.nan, 0.0]]), np.array([[np.inf, 0.0]])):
         with pytest.raises(MotionError):
             online.add_roots(bad, np.zeros(1))
-    with pytest.raises(MotionError):
-        online.add_roots(np.zeros((1, 2)), np.array([np.nan]))
-    with pytest.raises(MotionError, match="headings"):
+    for heading in (np.nan, np.inf):
+        with pytest.raises(MotionError, match="roots: a heading is infinite or not a number"):
+            online.add_roots(np.zeros((1, 2)), np.array([heading]))
+    with pytest.raises(MotionError, match=r"1 headings need positions of the shape \(1, 2\), not \(2, 2\)"):
         online.add_roots(np.zeros((2, 2)), np.zeros(1))
     assert encode_tree(online.as_tree(), MSGPACK) == before
 

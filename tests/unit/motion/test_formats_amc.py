@@ -222,7 +222,7 @@ def test_what_is_wrong_in_an_amc_is_named_with_its_line(amc: str, line: int, joi
         ("angle deg", "angle gon", None, "deg or rad"),
         (":hierarchy", ":units\n  angle rad\n:hierarchy", None, "move :units before :bonedata"),
         ("length 0.45", "length -1", None, "positive"),
-        (":hierarchy", ":nothing", None, "no section :hierarchy"),
+        (":hierarchy", ":nothing", None, ":hierarchy is missing or empty"),
     ],
 )
 def test_what_is_wrong_in_an_asf_is_named(found: str, written: str, joint: str | None, words: str) -> None:

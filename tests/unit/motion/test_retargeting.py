@@ -531,7 +531,9 @@ def test_feet_or_hands_of_limbs_that_are_not_mapped_cannot_be_kept(
     plan = plan_between(lacking, game, scale=1.0)
 
     retarget(studio.clip, plan)
-    with pytest.raises(MappingError, match="map these joints, or leave the option out"):
+    end = without.replace("knee", "ankle").replace("elbow", "wrist")
+    advice = f"no complete limb ends at {end}; map these joints, or leave the option out"
+    with pytest.raises(MappingError, match=advice):
         retarget_with_checks(studio.clip, plan, RetargetOptions.model_validate({kept: True}))
 
 
