@@ -62,7 +62,7 @@ def test_a_server_that_accepts_late_writes_is_found(
 
     monkeypatch.setattr(HostileAttempt, "post", accepting)
     job = running._submit(scratch, "there")
-    assert "the server answered 200" in running._attempt(scratch, job, name, random.Random(1)).fault
+    assert "but answered 200" in running._attempt(scratch, job, name, random.Random(1)).fault
 
 
 def test_a_repeated_claim_that_gets_another_attempt_is_found(scratch: Scratch, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,7 +88,7 @@ def test_joints_whose_axes_differ_are_refused_by_name() -> None:
 
 def test_what_is_not_there_cannot_be_copied() -> None:
     walk = make_walk()
-    with pytest.raises(EditError, match=r"source_frames: the frames 0:9999"):
+    with pytest.raises(EditError, match=r"source_frames: the range 0:9999"):
         paste(walk, walk, source_frames=(0, 9999))
     with pytest.raises(UnknownJoint, match="LeftHand"):
         apply_edit(walk, [Paste(source="other", joints=["LeftHans"])], sources={"other": walk})
