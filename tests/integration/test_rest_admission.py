@@ -148,7 +148,7 @@ def test_a_token_that_was_revoked_writes_nothing_though_its_body_is_decoded_for_
 def test_a_refused_request_leaves_nothing_for_the_garbage_collector(server: Server, path: str) -> None:
     """The garbage collector stops all threads. The more refused requests it must free, the longer this takes."""
     client = server.client(server.make_project())
-    refuse_bodies(client, path)  # pydantic builds a model when it first validates, and then the frame is part of a cycle
+    refuse_bodies(client, path)  # the first validation builds the model, and leaves a cycle with the frame
     deadline = time.monotonic() + PATIENCE_S
     while are_resources_left():  # of earlier requests, which may end after their answers
         gc.collect()

@@ -221,7 +221,7 @@ it("deletes the answers of a participant who withdraws, and what this browser ke
   await page.keyboard.press("2");
   await page.getByRole("button", { name: "Withdraw" }).click();
   await page.getByRole("button", { name: "Delete my answers" }).click();
-  await page.getByText("Your answers are deleted").waitFor();
+  await page.getByRole("heading", { name: "Your answers are deleted" }).waitFor();
   expect(await page.evaluate(() => localStorage.length)).toBe(0);
   await context.close();
 });

@@ -121,7 +121,9 @@ class Metrics:
             "marey_database_connections", "Connections to the database in use.", registry=self.registry
         )
         self.children = Gauge(
-            "marey_children", "Tasks that child processes run: they read uploaded files or compute.", registry=self.registry
+            "marey_children",
+            "Tasks that child processes run: they read uploaded files or compute.",
+            registry=self.registry,
         )
         self.children_stopped = Counter(
             "marey_children_stopped", "Child processes that ended during their work, by reason (memory, time, "
