@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -120,10 +121,10 @@ class _Handler(RequestHandler):
             changed = objects.changed
             if faults.watches == "work":
                 version = await self._send_events(version, selector)
-            try:
-                await asyncio.wait_for(changed.wait(), min(left_s, 0.2))
-            except TimeoutError:
-                continue
+            # `asyncio.wait_for` ignores, in Python 3.11, a cancellation that comes together with the change.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(min(left_s, 0.2)):
+                    await changed.wait()
 
     async def _send_events(self, version: int, selector: str) -> int:
         """Send the events since a version, and return the newest version."""

@@ -120,7 +120,8 @@ class StubCluster:
                 self.controllers.step()
                 self.kubelet.step()
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(stop.wait(), STEP_S)
+                    async with asyncio.timeout(STEP_S):
+                        await stop.wait()
         finally:
             await self.kubelet.close()
             server.stop()
