@@ -97,6 +97,8 @@ def validate_body(model: type[Model], tree: Any) -> Model:
 
     Raises `InvalidProblem` with a JSON Pointer for each fault.
     """
+    if not isinstance(tree, Mapping):
+        tree = None  # refused as any other value that is not an object, without a look at thousands of items
     try:
         if survey(tree):
             return model.model_validate(tree)

@@ -85,6 +85,12 @@ def test_a_missing_field_is_pointed_at_where_it_should_be() -> None:
     assert pointers(refusal) == {"/name"}
 
 
+def test_a_body_that_is_no_object_is_refused_without_a_look_at_its_items() -> None:
+    with pytest.raises(InvalidProblem) as caught:
+        validate_body(ProjectCreate, ["no\0"])
+    assert [(fault.pointer, fault.code) for fault in caught.value.errors or ()] == [("", "model-type")]
+
+
 def test_arrays_pass_through_untouched() -> None:
     array = np.zeros((2, 3), "<f4")
     made = validate_body(ItemCreate, {"name": "n", "parts": {"motion": {"poses": array}}})
