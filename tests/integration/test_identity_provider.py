@@ -297,11 +297,13 @@ def test_a_provider_that_fails_later_ends_the_sign_in(
     house: Server, provider: FakeProvider, fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link(house)
-    monkeypatch.setattr(identity_provider, "PROVIDER_TIMEOUT_S", 1.0)
     person = Person(house)
     back = person.sign_in()
     provider.fault = fault
-    answer = person.browser.get(back)
+    with monkeypatch.context() as impatient:
+        if fault == "slow":  # other answers may take as long as they need on a busy machine
+            impatient.setattr(identity_provider, "PROVIDER_TIMEOUT_S", 1.0)
+        answer = person.browser.get(back)
     assert answer.status_code == 503
     assert "answer with the ID token" in answer.text
     provider.fault, provider.error = "", "access_denied"
