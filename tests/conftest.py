@@ -1,5 +1,6 @@
 """Fixtures that every test may use."""
 
+import inspect
 import os
 import shutil
 import sys
@@ -7,6 +8,7 @@ import tempfile
 from collections.abc import Generator
 from pathlib import Path
 
+import httpx
 import pytest
 
 from marey_motion.warm_up import discard_outdated_kernels
@@ -30,6 +32,9 @@ ENOUGH_BYTES = 4 << 30
 """Free space that is enough: databases of two test processes and the largest files of tests need less than half."""
 
 
+PATIENCE_S = 60.0
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Discard all compiled kernels if one of them has changed, before tests are distributed to processes."""
     if not hasattr(config, "workerinput"):
@@ -37,6 +42,7 @@ def pytest_configure(config: pytest.Config) -> None:
         keep_files_in_memory()
         name_runtime_folder()
         trust_no_authority()
+    be_patient()
     keep_folders_together(config)
     keep_bytecode()
 
@@ -84,6 +90,12 @@ def trust_no_authority() -> None:
     """
     os.environ["SSL_CERT_FILE"] = str(Path(__file__).parent / "support" / "root_of_nobody.pem")
     os.environ.pop("SSL_CERT_DIR", None)
+
+
+def be_patient() -> None:
+    """Let HTTP requests without a timeout of their own wait longer: a busy machine may need more than five seconds."""
+    usual: httpx.Timeout = inspect.signature(httpx.Client).parameters["timeout"].default
+    usual.connect = usual.read = usual.write = usual.pool = PATIENCE_S
 
 
 def keep_bytecode() -> None:

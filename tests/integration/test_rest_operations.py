@@ -267,6 +267,7 @@ def test_metrics_tell_the_sizes_of_queues_and_pools(server: Server) -> None:
 def test_metrics_never_wait_for_the_database_except_for_the_first_numbers(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(services, "FIGURES_WAIT_S", PATIENCE_S)
     assert 'marey_workers{version="unknown"}' in metrics(server)  # the first request already shows numbers
     begun, going_on = threading.Event(), threading.Event()
 
@@ -276,7 +277,6 @@ def test_metrics_never_wait_for_the_database_except_for_the_first_numbers(
         return Figures(uploads=7)
 
     monkeypatch.setattr(services, "read_figures", read_slowly)
-    monkeypatch.setattr(services, "FIGURES_WAIT_S", PATIENCE_S)
     monkeypatch.setattr(OperatorMetrics, "is_due", True)
     try:
         assert "marey_upload_sessions 0.0" in metrics(server)  # and does not hang

@@ -200,7 +200,7 @@ def test_a_collector_that_does_not_work_stops_nobody_and_does_not_flood_the_log(
     answers: str, open_receiver: Open, sqlite_template: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    receiver = open_receiver(status=400, delay_s=60.0 if answers == "never" else 0.0)
+    receiver = open_receiver(status=400, silent=answers == "never")
     monkeypatch.setenv("OTEL_BSP_SCHEDULE_DELAY", "20")
     monkeypatch.setattr(export, "CLOSE_S", 0.2)
     with serving(sqlite_template, tmp_path, traces_endpoint=receiver.url) as server:

@@ -138,14 +138,12 @@ def test_a_test_is_sent_once_and_its_failure_is_reported(owner: httpx.Client, op
 
 
 def test_a_slow_receiver_does_not_delay_another_one(owner: httpx.Client, open_receiver: Open) -> None:
-    slow, fast = open_receiver(delay_s=2.0), open_receiver()
+    slow, fast = open_receiver(silent=True), open_receiver()
     make_webhook(owner, slow.url)
     make_webhook(owner, fast.url)
-    started = time.monotonic()
     add_folders(owner, *(f"folder-{number}" for number in range(10)))
     fast.wait_for(lambda found: len(found) >= 10)
-    assert time.monotonic() - started < 2.0
-    assert len(slow.received) <= 1
+    assert slow.received == []  # its first request still waits for its answer
 
 
 def test_a_redirect_is_a_failure_and_is_not_followed(owner: httpx.Client, open_receiver: Open) -> None:

@@ -7,7 +7,6 @@ import hmac
 import json
 import ssl
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -60,10 +59,10 @@ class Received:
 
 @dataclass
 class Receiver:
-    """HTTP server that records requests, and answers with `status` after `delay_s`."""
+    """HTTP server that records requests, and answers with `status`; if it is `silent`, only when the test ends."""
 
     status: int = 204
-    delay_s: float = 0.0
+    silent: bool = False
     answer: bytes = b""
     headers: dict[str, str] = field(default_factory=dict)
     certificate: Path | None = None
@@ -91,6 +90,7 @@ Open = Callable[..., Receiver]
 def open_receiver() -> Iterator[Open]:
     """Function that starts a receiver on this machine."""
     servers: list[ThreadingHTTPServer] = []
+    ended = threading.Event()
 
     def start(**kwargs: Any) -> Receiver:
         receiver = Receiver(**kwargs)
@@ -98,7 +98,8 @@ def open_receiver() -> Iterator[Open]:
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers["Content-Length"]))
-                time.sleep(receiver.delay_s)
+                if receiver.silent:
+                    ended.wait()
                 status = receiver.status
                 with receiver.changed:
                     receiver.received.append(Received({k.lower(): v for k, v in self.headers.items()}, body))
@@ -125,6 +126,7 @@ def open_receiver() -> Iterator[Open]:
         return receiver
 
     yield start
+    ended.set()
     for server in servers:
         server.shutdown()
         server.server_close()
