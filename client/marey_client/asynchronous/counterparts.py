@@ -44,11 +44,10 @@ class Counterpart:
         return cls(sync, calls)
 
     def __repr__(self) -> str:
-        text = repr(self._sync)
-        return f"<async {text[1:]}" if text.startswith("<") else text
+        return _named_async(repr(self._sync))
 
     def __str__(self) -> str:
-        return str(self._sync)
+        return _named_async(str(self._sync))
 
     async def _run(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Run a method whose arguments and result are those of the SDK."""
@@ -158,6 +157,10 @@ class Connection(Counterpart):
         handles. The requests of the function end if the task is cancelled.
         """
         return await self._exchange(function, *args, **kwargs)
+
+
+def _named_async(text: str) -> str:
+    return f"<async {text[1:]}" if text.startswith("<") else text
 
 
 def counterpart_of(sync: type[Any]) -> Callable[[CounterpartClass], CounterpartClass]:
