@@ -140,9 +140,9 @@ def test_errors_are_those_of_the_synchronous_client(takes: Path) -> None:
         with pytest.raises(BadArgument, match="frames"):
             await (await lab.clips.list().__anext__()).motion(frames=slice(0, 10, 2))
         with pytest.raises(TypeError, match="not iterable"):
-            list(lab.clips)
+            list(lab.clips)  # pyrefly: ignore[bad-argument-type]
         with pytest.raises(TypeError, match="not a container"):
-            "raw/walk" in lab.clips  # noqa: B015
+            "raw/walk" in lab.clips  # noqa: B015 # pyrefly: ignore[unsupported-operation]
 
     run(program)
     with pytest.raises(BadArgument, match="concurrency"):
@@ -157,7 +157,7 @@ def test_jobs_are_submitted_with_handles_and_waiting_for_them_ends_at_once(takes
         await lab.upload(takes, shown=False)
         clips = [clip async for clip in lab.clips]
         job = await lab.quality(clips[:2], draws=10)
-        assert isinstance(job, Job)  # pyrefly: ignore[unnecessary-comparison]
+        assert isinstance(job, Job)
         assert (await lab.job(job.id)).inputs == job.inputs
 
         async def note(now: Job) -> None:

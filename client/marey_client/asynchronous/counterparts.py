@@ -112,7 +112,7 @@ class ModelCounterpart(Counterpart):
 
     @classmethod
     def _of(cls, sync: Any, calls: Calls) -> Counterpart:
-        counterpart: Counterpart = cls.model_construct(sync.model_fields_set, **dict(sync))  # pyrefly: ignore
+        counterpart: Counterpart = cls.model_construct(sync.model_fields_set, **dict(sync))  # pyrefly: ignore[missing-attribute]
         counterpart._sync, counterpart._calls = sync, calls
         return counterpart
 

@@ -14,6 +14,7 @@ from marey_client.asynchronous.calls import GRACE_S, Calls
 from marey_client.asynchronous.interruption import CallPool, Interrupted, pause, stop_if_interrupted, waiting
 from marey_client.asynchronous.marey import AsyncMarey
 from marey_client.errors import ConnectionClosed
+from marey_client.progress import ignore_progress, progress
 
 LONG_S = 60.0
 SOON_S = 10.0
@@ -131,6 +132,15 @@ def test_a_closed_client_refuses_calls() -> None:
             time.sleep(0.01)
 
     asyncio.run(main())
+
+
+def test_only_one_progress_bar_is_shown_at_a_time() -> None:
+    with progress(shown=True) as first:
+        with progress(shown=True) as second:
+            assert second is ignore_progress
+        assert first is not ignore_progress
+    with progress(shown=True) as third:
+        assert third is not ignore_progress
 
 
 def test_nested_waits_of_a_call_free_one_place() -> None:

@@ -11,6 +11,8 @@ from typing import Any, assert_type
 
 import numpy as np
 import pytest
+from docs.async_client import async_modules
+from docs.sdk_source import CLIENT
 from numpy.typing import NDArray
 from tests.support.scripted_server import ScriptedServer
 
@@ -45,7 +47,7 @@ def members(kind: type[Any]) -> Iterator[tuple[str, Any]]:
 
 
 def is_property(member: Any) -> bool:
-    return isinstance(member, property | cached_property)
+    return isinstance(member, property) or type(member) is cached_property
 
 
 def counterpart_of(counterpart: type[Any], name: str) -> Any:
@@ -121,6 +123,12 @@ def written(kind: Any) -> str:
     text = f"{kind.__module__}.{kind.__qualname__}" if plain else str(kind)
     text = re.sub(r"marey_client\.asynchronous\.([\w.]+)\.(_?)Async(\w+)", r"marey_client.\1.\2\3", text)
     return text.replace("~Async", "~").replace("AsyncIterator", "Iterator")
+
+
+def test_no_generated_module_is_left_over() -> None:
+    written = {path for path in async_modules() if path.name != "__init__.py"}
+    found = {path for path in (CLIENT / "asynchronous").rglob("*.py") if "Written by `make docs`" in path.read_text()}
+    assert found == written
 
 
 def test_only_what_sends_a_request_is_awaited(script: ScriptedServer) -> None:
