@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator
 from inspect import isawaitable
 from types import TracebackType
 from typing import Any, ClassVar, ParamSpec, Self, TypeVar
@@ -22,7 +22,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 CounterpartClass = TypeVar("CounterpartClass", bound="type[Counterpart]")
 
-_COUNTERPARTS: dict[type[Any], type[Counterpart]] = {}
+COUNTERPARTS: dict[type[Any], type[Counterpart]] = {}
+"""Class of the async client for each class of the SDK, as far as its module is loaded."""
 
 
 class Counterpart:
@@ -101,7 +102,7 @@ class Counterpart:
 
     def _as_async(self, found: Any) -> Any:
         """Return a result with counterparts in place of objects of the SDK."""
-        counterpart = _COUNTERPARTS.get(type(found))
+        counterpart = COUNTERPARTS.get(type(found))
         if counterpart is not None:
             return counterpart._of(found, self._calls)
         return [self._as_async(one) for one in found] if type(found) is list else found
@@ -167,12 +168,7 @@ def counterpart_of(sync: type[Any]) -> Callable[[CounterpartClass], CounterpartC
     """Register a class as the counterpart of a class of the SDK."""
 
     def register(counterpart: CounterpartClass) -> CounterpartClass:
-        _COUNTERPARTS[sync] = counterpart
+        COUNTERPARTS[sync] = counterpart
         return counterpart
 
     return register
-
-
-def counterparts() -> Mapping[type[Any], type[Counterpart]]:
-    """Return all registered counterparts, by their class of the SDK."""
-    return dict(_COUNTERPARTS)

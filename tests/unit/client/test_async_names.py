@@ -16,7 +16,7 @@ from docs.sdk_source import CLIENT
 from numpy.typing import NDArray
 from tests.support.scripted_server import ScriptedServer
 
-from marey_client.asynchronous.counterparts import counterparts
+from marey_client.asynchronous.counterparts import COUNTERPARTS
 from marey_client.asynchronous.handles.clips import AsyncClipHandle
 from marey_client.asynchronous.handles.jobs import AsyncJobHandle
 from marey_client.asynchronous.items import AsyncItems
@@ -88,15 +88,15 @@ def can_send(kind: type[Any]) -> bool:
 def test_every_class_that_a_client_leads_to_has_an_async_counterpart() -> None:
     connected = {kind for kind in reached() if can_send(kind)}
     assert len(connected) > 40
-    assert connected - counterparts().keys() == set()
+    assert connected - COUNTERPARTS.keys() == set()
 
 
-@pytest.mark.parametrize("sync", counterparts(), ids=lambda sync: sync.__name__)
+@pytest.mark.parametrize("sync", COUNTERPARTS, ids=lambda sync: sync.__name__)
 def test_names_parameters_defaults_types_and_docstrings_are_those_of_the_original(sync: type[Any]) -> None:
     for name, member in members(sync):
         if sync is Marey and name == "close":
             continue  # written by hand
-        other = counterpart_of(counterparts()[sync], name)
+        other = counterpart_of(COUNTERPARTS[sync], name)
         assert is_property(other) == is_property(member), name
         assert other.__doc__ == member.__doc__, name
         if not is_property(member):
