@@ -13,8 +13,10 @@ from typing import Any
 
 import typer
 import yaml
+from docs.async_client import async_modules
 from docs.keyword_types import keyword_modules
 from docs.motion_library import library_page
+from docs.sdk_reference import sdk_page
 from prometheus_client.metrics import MetricWrapperBase
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
@@ -62,6 +64,7 @@ def pages() -> dict[str, str]:
         "metrics.md": metrics_page(),
         "traces.md": traces_page(),
         "motion-library.md": NOTE + library_page(),
+        "python-sdk.md": NOTE + sdk_page(),
     }
 
 
@@ -394,6 +397,7 @@ def files() -> dict[Path, str]:
     return {
         **{REFERENCE / name: text for name, text in pages().items()},
         **{KEYWORDS / name: text for name, text in keyword_modules().items()},
+        **async_modules(),
         POOL_MANIFEST: pool_manifest(),
     }
 

@@ -20,7 +20,9 @@ PACKAGES = {
 }
 """Packages of the product, by the folder that contains them."""
 
-GENERATED = "<!-- Written by `make docs`"
+WRITTEN_BY = "Written by `make docs`"
+"""Words in pages and modules that are generated from the code."""
+GENERATED = f"<!-- {WRITTEN_BY}"
 """Beginning of pages that are generated from texts in the code."""
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
@@ -53,6 +55,11 @@ class Module:
     def lines(self) -> int:
         """The number of lines of the module."""
         return len(self.text.splitlines())
+
+    @cached_property
+    def is_generated(self) -> bool:
+        """Whether the module is generated from other modules."""
+        return WRITTEN_BY in (ast.get_docstring(self.tree) or "")
 
     @cached_property
     def definitions(self) -> list[tuple[str, Definition]]:

@@ -7,6 +7,8 @@
     for clip in lab.clips:
         print(clip.path, clip.frames, clip.positions(joints=["LeftFoot"], frames=slice(0, 120)).shape)
 
+Programs with an event loop call `connect_async` instead of `connect`; the methods have the same names and are awaited.
+
 The classes are those of `marey_client`, which also contains the parts that fewer programs need. Names are loaded when
 they are first used, so that the import takes hardly any time.
 """
@@ -15,6 +17,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from marey_client.asynchronous.marey import AsyncMarey as AsyncMarey
+    from marey_client.asynchronous.marey import connect_async as connect_async
     from marey_client.credentials import TokenFile as TokenFile
     from marey_client.errors import JobUnsuccessful as JobUnsuccessful
     from marey_client.errors import MareyError as MareyError
@@ -23,15 +27,26 @@ if TYPE_CHECKING:
     from marey_client.poses.windows import MotionWindows as MotionWindows
 
 _HOMES = {
+    "AsyncMarey": "marey_client.asynchronous.marey",
     "JobUnsuccessful": "marey_client.errors",
     "Marey": "marey_client.marey",
     "MareyError": "marey_client.errors",
     "MotionWindows": "marey_client.poses.windows",
     "TokenFile": "marey_client.credentials",
     "connect": "marey_client.marey",
+    "connect_async": "marey_client.asynchronous.marey",
 }
 
-__all__ = ["JobUnsuccessful", "Marey", "MareyError", "MotionWindows", "TokenFile", "connect"]
+__all__ = [
+    "AsyncMarey",
+    "JobUnsuccessful",
+    "Marey",
+    "MareyError",
+    "MotionWindows",
+    "TokenFile",
+    "connect",
+    "connect_async",
+]
 
 
 def __getattr__(name: str) -> Any:

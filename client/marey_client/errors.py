@@ -22,6 +22,13 @@ class Unreachable(MareyError):
     """The server cannot be reached, or the connection was lost before it answered."""
 
 
+class ConnectionClosed(MareyError):
+    """The async client was closed before the call ended, or before it began."""
+
+    def __init__(self) -> None:
+        super().__init__("the client is closed; keep it open until all calls have ended")
+
+
 class UnexpectedAnswer(MareyError):
     """An answer of the server is not valid, or lacks requested data; the text gives the reason."""
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from pydantic import TypeAdapter, ValidationError
 
+from marey_client.asynchronous.interruption import CallPool
 from marey_client.blobs import Blobs
 from marey_client.errors import BadFileName, NothingToUpload, SameName
 from marey_client.jobs import Jobs
@@ -226,7 +226,7 @@ class Imports:
         notify = notice or _ignore_notice
         known = [(one.item, found.exported[one.name]) for one in entries if one.item and one.name in found.exported]
         changed = 0
-        with ThreadPoolExecutor(UPLOADS_AT_ONCE, thread_name_prefix="marey-restore") as pool:
+        with CallPool(UPLOADS_AT_ONCE, thread_name_prefix="marey-restore") as pool:
             outcomes = pool.map(lambda pair: restore_clip(self.transport, self.project, *pair), known)
             for done, outcome in enumerate(outcomes, start=1):
                 changed += outcome
@@ -255,7 +255,7 @@ class Imports:
                 raise BadFileName(refusal_text(_refused_name(file.name)))
         notify = notice or _ignore_notice
         digests: dict[str, str] = {}
-        with ThreadPoolExecutor(UPLOADS_AT_ONCE, thread_name_prefix="marey-upload") as pool:
+        with CallPool(UPLOADS_AT_ONCE, thread_name_prefix="marey-upload") as pool:
             for file, digest in zip(files, pool.map(lambda file: digest_of_file(file.path), files), strict=True):
                 digests[file.name] = digest
                 notify("hashing", len(digests), len(files))

@@ -15,7 +15,7 @@ from marey_client.listing.paths import missing_path, require_folder
 from marey_client.listing.tables import summary_table
 from marey_client.one_or_several import several
 from marey_client.paging import pages
-from marey_client.transport import Params, Transport, as_json, read_model
+from marey_client.transport import Params, Transport, as_json, read_model, sends_nothing
 from marey_schemas.documents.differences import Difference, DifferenceRequest
 from marey_schemas.items import (
     Item,
@@ -35,6 +35,12 @@ from marey_schemas.queue.jobs import ItemInput
 
 class ItemHandle:
     """Handle of an item in the state in which it was read; its methods send requests."""
+
+    transport: Transport
+    project: str
+    """Name of the project."""
+    item: Item
+    """State of the item when it was read, or changed by this handle."""
 
     def __init__(self, transport: Transport, project: str, item: Item) -> None:
         self.transport = transport
@@ -64,6 +70,7 @@ class ItemHandle:
         """The path of the resource, relative to the API's root."""
         return f"/projects/{self.project}/{self.item.kind.plural}/{self.item.id}"
 
+    @sends_nothing
     def as_input(self) -> ItemInput:
         """Return the revision that was read, as an input of jobs."""
         return ItemInput(item=self.id, revision=self.item.revision)
@@ -198,7 +205,7 @@ Handle = TypeVar("Handle", bound=ItemHandle)
 
 @dataclass(frozen=True)
 class Items(Generic[Handle]):
-    """Items of one kind in a project, which can be iterated, counted by `len`, and looked up by `items[path]`."""
+    """Items of one kind in a project, which can be iterated, counted, and looked up by `items[path]`."""
 
     transport: Transport
     project: str
@@ -345,6 +352,10 @@ class Selection(Generic[Handle]):
         return self.items.list(collection=self.folder, query=self.query, sort="name")
 
     def __len__(self) -> int:
+        return self.count()
+
+    def count(self) -> int:
+        """Count the items."""
         return self.items.count(collection=self.folder, filters={"query": self.query})
 
     def to_dataframe(self) -> Any:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from marey_client.asynchronous.interruption import pause, waiting
 from marey_client.errors import JobUnsuccessful, WaitedTooLong
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport
@@ -54,9 +55,9 @@ class Jobs:
         """Wait up to `wait_s` seconds for the end of a job, and return its current state."""
         if wait_s <= 0:
             return self.transport.get(Job, f"/jobs/{job_id}")
-        return self.transport.get(
-            Job, f"/jobs/{job_id}", headers={"Prefer": f"wait={max(1, round(min(wait_s, LONGEST_WAIT_S)))}"}
-        )
+        preferred = {"Prefer": f"wait={max(1, round(min(wait_s, LONGEST_WAIT_S)))}"}
+        with waiting():
+            return self.transport.get(Job, f"/jobs/{job_id}", headers=preferred)
 
     def wait(
         self,
@@ -86,7 +87,7 @@ class Jobs:
                     f"job {job_id} is still {job.state} after {timeout_s:g} s; it continues on the server"
                 )
             if time.monotonic() - asked < pause_s:  # the server answered at once
-                time.sleep(pause_s)
+                pause(pause_s)
                 pause_s = min(2 * pause_s, 1.0)
 
     def cancel(self, job_id: str) -> Job:
@@ -118,7 +119,7 @@ class Jobs:
             elif not follow or response.headers["Log-Sealed"] == "true":
                 return
             else:
-                time.sleep(FOLLOW_EVERY_S)
+                pause(FOLLOW_EVERY_S)
 
     def _ended(self, job: Job, require_success: bool) -> Job:
         if not require_success or job.state is JobState.SUCCEEDED:

@@ -18,7 +18,7 @@ from marey_client.jobs import Jobs
 from marey_client.paging import pages
 from marey_client.project import ProjectHandle
 from marey_client.retries import Retries
-from marey_client.transport import Transport
+from marey_client.transport import Transport, sends_nothing
 from marey_schemas.access import Login, Me, NewToken, Project, ProjectCreate
 from marey_schemas.audit import AuditEntry
 from marey_schemas.invitations import AcceptedInvitation, InvitationAcceptance, SignedUp, SignUp
@@ -103,6 +103,7 @@ class Marey:
         """Return the user and the scopes of the token."""
         return self.transport.get(Me, "/me")
 
+    @sends_nothing
     def project(self, name: str) -> ProjectHandle:
         """Return a project by its name, without a request."""
         return ProjectHandle(self.transport, name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from marey_client.asynchronous.interruption import note_at_hand
 from marey_client.transport import Model, Params, Transport
 from marey_schemas.items import Page
 
@@ -14,7 +15,9 @@ def pages(transport: Transport, entry: type[Model], path: str, params: Params | 
     query: dict[str, Any] = dict(params or {})
     while True:
         page = transport.get(Page, path, query)
-        yield from map(entry.model_validate, page.items)
+        for number, item in enumerate(page.items, start=1):
+            note_at_hand(len(page.items) - number)
+            yield entry.model_validate(item)
         if page.next_cursor is None:
             return
         query["cursor"] = page.next_cursor

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import Lock
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -15,6 +16,10 @@ OnProgress = Callable[[str, int, int | None], None]
 
 Advance = Callable[[str, float, float | None], None]
 """Function called with the current activity, the amount done, and the total amount if known, all of them floats."""
+
+
+_bar = Lock()
+"""Held by the thread that shows a bar."""
 
 
 def ignore_progress(_doing: str, _done: float, _of: float | None) -> None:
@@ -28,10 +33,22 @@ def is_shown(shown: bool | None) -> bool:
 
 @contextmanager
 def progress(shown: bool | None = None) -> Iterator[Advance]:
-    """Show a progress bar during the `with` block if `is_shown(shown)`; yield a function that updates the bar."""
-    if not is_shown(shown):
+    """Show a progress bar during the `with` block if `is_shown(shown)`; yield a function that updates the bar.
+
+    Only one bar is shown at a time, because the bars of several threads would overwrite each other.
+    """
+    if not is_shown(shown) or not _bar.acquire(blocking=False):
         yield ignore_progress
         return
+    try:
+        with _new_bar() as advance:
+            yield advance
+    finally:
+        _bar.release()
+
+
+@contextmanager
+def _new_bar() -> Iterator[Advance]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 

@@ -26,7 +26,7 @@ from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
 from marey_client.keywords.asking import PurgeKeywords, SimilarKeywords
 from marey_client.paging import pages
-from marey_client.transport import Params, Transport, as_json, read_model
+from marey_client.transport import Params, Transport, as_json, read_model, sends_nothing
 from marey_schemas.documents.skeleton_merges import SkeletonMergeAnswer, SkeletonMergeRequest
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.kinds import Kind
@@ -37,6 +37,10 @@ from marey_schemas.search import SimilarAnswer, SimilarRequest
 
 class ProjectItems:
     """Items of a project, given by name; requests are sent only by its methods."""
+
+    transport: Transport
+    name: str
+    """Name of the project."""
 
     def __init__(self, transport: Transport, name: str) -> None:
         self.transport = transport
@@ -92,6 +96,7 @@ class ProjectItems:
         """The perceptual metrics of the project."""
         return PerceptualMetrics(self.transport, self.name, Kind.METRIC, MetricHandle)
 
+    @sends_nothing
     def items(self, kind: Kind) -> Items[Any]:
         """The items of the project, of any kind."""
         known: tuple[Items[Any], ...] = (

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import random
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import httpx
 
+from marey_client.asynchronous.interruption import pause
 from marey_schemas.backoff import Backoff
 
 NEVER_ARRIVED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
@@ -40,7 +40,7 @@ class Retries:
     longest_s: float = 15.0
     total_s: float = 90.0
     notice: Callable[[str], None] | None = field(default=None, repr=False)
-    sleep: Callable[[float], None] = field(default=time.sleep, repr=False)
+    sleep: Callable[[float], None] = field(default=pause, repr=False)
     random_unit: Callable[[], float] = field(default=random.random, repr=False)
 
     def delay_s(self, tried: int, retry_after_s: float | None) -> float:

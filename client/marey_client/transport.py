@@ -17,6 +17,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import BaseModel, ValidationError
 
+from marey_client.asynchronous.interruption import note_at_hand, stop_if_interrupted
 from marey_client.credentials import BearerToken, TokenFile, require_address, resolve, trusted_authorities
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
@@ -28,6 +29,7 @@ from marey_schemas.problems import Problem
 
 Model = TypeVar("Model", bound=BaseModel)
 T = TypeVar("T")
+Method = TypeVar("Method", bound=Callable[..., Any])
 Params = Mapping[str, str | int | float | bool | None]
 
 BLOCKS = "application/msgpack; arrays=blocks"
@@ -38,6 +40,11 @@ TRIES_TO_REACH = 3
 """Number of attempts for the first request: a server that has never answered is probably not running."""
 
 log = logging.getLogger(__name__)
+
+
+def sends_nothing(method: Method) -> Method:
+    """Mark a method of the SDK that sends no request, so that the async client need not wait for it."""
+    return method
 
 
 class _TlsOnFirstUse(httpx.BaseTransport):
@@ -208,6 +215,8 @@ class Transport:
         """
         started = time.monotonic()
         for tried in range(1, self.retries.tries + 1):
+            stop_if_interrupted()
+            note_at_hand(0)
             try:
                 answer = once()
                 self._reached.set()

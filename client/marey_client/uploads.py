@@ -11,6 +11,7 @@ from pathlib import Path
 from marey_client.handles.clips import ClipHandle
 from marey_client.imports import FoundFiles, Notice, left_out_texts, refusal_text
 from marey_client.project_items import ProjectItems
+from marey_client.transport import sends_nothing
 from marey_schemas.imports import ImportEntry
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.wording import counted
@@ -56,6 +57,7 @@ class UploadReport:
 
     __repr__ = __str__
 
+    @sends_nothing
     def _repr_html_(self) -> str:
         return "".join(f"<p>{html.escape(line)}</p>" for line in str(self).splitlines())
 

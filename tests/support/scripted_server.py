@@ -51,12 +51,16 @@ class ScriptedServer:
             raise answer
         return answer if isinstance(answer, httpx.Response) else answer(request)
 
+    def transport(self) -> httpx.MockTransport:
+        """Return the connection of a client to this server."""
+        return httpx.MockTransport(self)
+
     def marey(self, **options: Any) -> Marey:
         """Return a client of this server whose waits take no time."""
         retries = Retries(sleep=self.waited.append, random_unit=lambda: 0.0)
         return Marey(
             "http://server.test/",
             "marey_secret",
-            http=httpx.MockTransport(self),
+            http=self.transport(),
             **dict[str, Any](retries=retries) | options,
         )

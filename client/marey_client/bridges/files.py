@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from marey_client.asynchronous.interruption import CallPool
 from marey_client.bridges.folders import file_names, new_folder, require_free
 from marey_client.bridges.sidecars import RECORDS, SidecarWriter
 from marey_client.bridges.version import (
@@ -84,7 +84,7 @@ class MotionFiles:
     ) -> None:
         """Write the clips to the files `names` below `folder`, and call `add` with each clip, in order."""
         total, done = len(self.version.clips), 0
-        with ThreadPoolExecutor(EXPORTS_AT_ONCE, thread_name_prefix="marey-export") as pool:
+        with CallPool(EXPORTS_AT_ONCE, thread_name_prefix="marey-export") as pool:
             for group in self.version.described(pool):
                 files = names[done : done + len(group)]
                 digests = pool.map(self._write_one, group, [folder / name for name in files])

@@ -11,12 +11,12 @@ import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from marey_client.asynchronous.interruption import CallPool
 from marey_client.bridges.episodes import (
     ACTION,
     COUNTERS,
@@ -120,7 +120,7 @@ def write_lerobot(version: VersionToExport, target: Path, on_progress: OnProgres
             SidecarWriter(folder, {**identity, "layout": "lerobot"}) as sidecar,
             ParquetFiles(folder / "data") as data,
             ParquetFiles(folder / "meta" / "episodes") as episodes,
-            ThreadPoolExecutor(EXPORTS_AT_ONCE, thread_name_prefix="marey-export") as pool,
+            CallPool(EXPORTS_AT_ONCE, thread_name_prefix="marey-export") as pool,
         ):
             writing = _Writing(version, sidecar, data, EpisodeTable(episodes))
             for group in version.described(pool):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypedDict
 
 from marey_client.archives.contents import read_documents, request_contents
 from marey_client.archives.writing import DatasetReader, check_consents
+from marey_client.asynchronous.interruption import CallPool
 from marey_client.errors import CannotExport
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, RequestedDocument
@@ -101,7 +101,7 @@ class VersionToExport:
             message=self.commit.message,
         )
 
-    def described(self, pool: ThreadPoolExecutor) -> Iterator[list[DescribedClip]]:
+    def described(self, pool: CallPool) -> Iterator[list[DescribedClip]]:
         """Yield the clips in the order of their paths, with take records and lineage, in groups of limited size."""
         for some in batched(self.clips, MOST_CONTENTS):
             group = [_located(one) for one in some]

@@ -65,6 +65,14 @@ class CoverageStreams:
 class CoverageStreamHandle:
     """Handle of a coverage stream. `offset` is the number of frames sent so far."""
 
+    transport: Transport
+    url: str
+    """The path of the resource, relative to the API's root."""
+    stream: CoverageStream
+    """The stream in the state in which it was read."""
+    offset: int
+    """The number of frames sent so far."""
+
     def __init__(self, transport: Transport, streams_url: str, stream: CoverageStream) -> None:
         self.transport = transport
         self.url = f"{streams_url}/{stream.id}"

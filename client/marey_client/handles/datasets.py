@@ -14,7 +14,7 @@ from marey_client.errors import Conflict, NotFound, RequestFailed
 from marey_client.handles.versions import DatasetHandle
 from marey_client.paging import pages
 from marey_client.progress import OnProgress, ignore_progress
-from marey_client.transport import Transport
+from marey_client.transport import Transport, sends_nothing
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefKind
 
@@ -128,6 +128,7 @@ class Datasets:
         except NotFound:
             self.create(name, collection=name)
 
+    @sends_nothing
     def at(self, name: str) -> DatasetHandle:
         """Return a handle of the dataset with this name; no request is sent."""
         return DatasetHandle(self.transport, f"{self.url}/{name}")

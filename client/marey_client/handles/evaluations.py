@@ -21,6 +21,7 @@ from marey_client.items import Items
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.keywords.evaluation import CompareKeywords, OptimiseKeywords, SuggestKeywords, SweepKeywords
 from marey_client.places import Places, as_inputs, resolved
+from marey_client.transport import sends_nothing
 from marey_schemas.documents.evaluations import COSTS, MOST_EVALUATIONS_COMPARED, trial_name
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
@@ -122,6 +123,7 @@ class EvaluationHandle(ReportedHandle):
 
     # -- requests for the same jobs --
 
+    @sends_nothing
     def compare_request(self, *others: EvaluationHandle, **options: Unpack[CompareKeywords]) -> JobCreate:
         """Return the job request of `compare`; `options` are those of `CompareParams`."""
         if not 0 < len(others) < MOST_EVALUATIONS_COMPARED:
@@ -146,6 +148,7 @@ class EvaluationHandle(ReportedHandle):
         """Return the job request of `optimise`; `options` are those of `OptimiseParams`."""
         return job_request("optimise", self._with_candidates(candidates), checked(OptimiseParams, options))
 
+    @sends_nothing
     def sweep_request(self, **options: Unpack[SweepKeywords]) -> JobCreate:
         """Return the job request of `sweep`; `options` are those of `SweepParams`."""
         return job_request("sweep", {"evaluation": self.as_input()}, checked(SweepParams, options))

@@ -11,7 +11,7 @@ from marey_client.blobs import Blobs
 from marey_client.downloads import safe_file_name
 from marey_client.errors import NotComparable
 from marey_client.handles.reports import saved
-from marey_client.transport import Transport
+from marey_client.transport import Transport, sends_nothing
 from marey_schemas.documents.quality import QualityConditions, QualityDocument, command_with, differing_conditions
 from marey_schemas.documents.reports import StoredFigure
 from marey_schemas.encoding.codecs import JSON, decode_tree
@@ -49,6 +49,7 @@ class Findings:
         """Write a file of the result, such as `report`; return its path. Raises `LookupError` without such a file."""
         return Blobs(self.transport).fetch_to(self._blob(name), Path(path))
 
+    @sends_nothing
     def figures(self) -> tuple[StoredFigure, ...]:
         """Return the figures of the report; without a report, there are none."""
         return tuple(StoredFigure.model_validate(figure) for figure in (self.job.result or {}).get("figures", ()))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from types import MappingProxyType
 
+from marey_client.asynchronous.interruption import pause
 from marey_client.errors import Conflict, JobUnsuccessful, WaitedTooLong
 from marey_client.jobs import LONGEST_WAIT_S, Jobs
 from marey_client.transport import Transport
@@ -65,7 +66,7 @@ class PipelineRun:
             asked = time.monotonic()
             self._look(wait_s=min(left_s, LOOK_EVERY_S if on_progress else LONGEST_WAIT_S))
             if not self.ended:
-                time.sleep(max(0.0, min(left_s, asked + SHORTEST_PAUSE_S - time.monotonic())))
+                pause(max(0.0, min(left_s, asked + SHORTEST_PAUSE_S - time.monotonic())))
 
     def outputs(self, step: str) -> Iterator[JobOutput]:
         """Return the revisions created by a step."""

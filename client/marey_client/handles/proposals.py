@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from marey_client.arguments import checked
 from marey_client.paging import pages
-from marey_client.transport import Params, Transport, read_model
+from marey_client.transport import Params, Transport, read_model, sends_nothing
 from marey_schemas.datasets.merges import Resolution
 from marey_schemas.datasets.naming import MAIN
 from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Verdict
@@ -43,6 +43,7 @@ class Proposals:
         query: Params = {} if state is None else {"state": state.value}
         return pages(self.transport, Proposal, self.url, query)
 
+    @sends_nothing
     def at(self, number: int) -> ProposalHandle:
         """Return a handle of the proposal with this number; no request is sent."""
         return ProposalHandle(self.transport, f"{self.url}/{number}")

@@ -15,7 +15,7 @@ from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.keywords.asking import SearchKeywords
 from marey_client.keywords.processing import TreeKeywords
 from marey_client.one_or_several import several
-from marey_client.transport import BLOCKS, as_json, read_tree
+from marey_client.transport import BLOCKS, as_json, read_tree, sends_nothing
 from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT
 from marey_schemas.queue.job_params import TreeParams
 from marey_schemas.queue.jobs import Job, JobCreate
@@ -78,6 +78,7 @@ class SearchableHandle(ReportedHandle):
         request = self.tree_request(**options).model_copy(update={"seed": seed})
         return Jobs(self.transport).run(self.project, request, on_progress=on_progress)
 
+    @sends_nothing
     def tree_request(self, **options: Unpack[TreeKeywords]) -> JobCreate:
         """Return the job request of `make_tree`; `options` are those of `TreeParams`."""
         return job_request("tree", {"model": self.as_input()}, checked(TreeParams, options))

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from datetime import timedelta
 
 from marey_client.arguments import checked
+from marey_client.asynchronous.interruption import pause
 from marey_client.paging import pages
-from marey_client.transport import Params, Transport, as_json, read_model
+from marey_client.transport import Params, Transport, as_json, read_model, sends_nothing
 from marey_schemas.event_kinds import DEFAULT_WEBHOOK_KINDS, ProjectEventKind
 from marey_schemas.webhooks import (
     DeliveryState,
@@ -46,6 +47,7 @@ class Webhooks:
         """List the webhooks, oldest first, without their secrets."""
         return pages(self.transport, Webhook, self.url)
 
+    @sends_nothing
     def at(self, webhook_id: str) -> WebhookHandle:
         """Return a handle of the webhook with this id; no request is sent."""
         return WebhookHandle(self.transport, f"{self.url}/{webhook_id}")
@@ -103,6 +105,6 @@ class WebhookHandle:
         deadline = time.monotonic() + timeout_s
         found = self.delivery(delivery_id)
         while found.state == "waiting" and time.monotonic() < deadline:
-            time.sleep(LOOK_EVERY_S)
+            pause(LOOK_EVERY_S)
             found = self.delivery(delivery_id)
         return found

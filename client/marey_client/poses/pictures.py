@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from marey_client.asynchronous.interruption import CallPool
 from marey_client.errors import BadArgument
 from marey_client.extras import room
 from marey_client.poses.arrays import PosedItem, frames_text
@@ -55,7 +55,7 @@ def draw_poses(clip: PosedItem, frames: slice | None, moments: int) -> MotionPic
         motion = clip.motion(frames=slice(frame, frame + 1), revision=clip.item.revision)
         return documents.clip_from_document(motion, skeleton)
 
-    with ThreadPoolExecutor(READS_AT_ONCE, thread_name_prefix="marey-poses") as pool:
+    with CallPool(READS_AT_ONCE, thread_name_prefix="marey-poses") as pool:
         poses = list(pool.map(read, picked))
     svg: str = drawing.draw_clip_strip(poses, picked, clip.frame_rate_hz, title=clip.path)
     return MotionPicture(svg, clip.path)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from marey_client.asynchronous.interruption import CallPool
 from marey_client.errors import BadArgument
 from marey_client.extras import room
 from marey_client.handles.clips import ClipHandle
@@ -47,7 +47,7 @@ class ClipOfStrip:
         def read(frame: int) -> MotionDocument:
             return self.clip.motion(frames=slice(frame, frame + 1), revision=self.number)
 
-        with ThreadPoolExecutor(READS_AT_ONCE, thread_name_prefix="marey-poses") as pool:
+        with CallPool(READS_AT_ONCE, thread_name_prefix="marey-poses") as pool:
             found = list(pool.map(read, frames))
         reference = found[0].skeleton
         assert isinstance(reference, RevisionRef)

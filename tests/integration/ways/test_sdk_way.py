@@ -56,5 +56,6 @@ def test_the_page(names: dict[str, Any]) -> None:
         exec(compile(example, str(PAGE), "exec"), names)
     assert names["ended"].result["refused"] == []
     assert (names["positions"].shape, names["contacts"].shape) == ((100, 2, 3), (names["walk"].frames, 2))
+    assert (names["counted"], names["state"]) == (len(lab.clips), "succeeded")
     assert "<svg" in Path("walk.svg").read_text("utf-8")
     assert [one.path for one in lab.clips.where("moved")] == ["moved/walk-moved"]

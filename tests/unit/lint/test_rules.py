@@ -132,6 +132,11 @@ def test_names_in_the_docs_are_used() -> None:
     assert not list(unused.find(house(modules, {"docs/use.md": "`project.of_the_sdk()`"})))
 
 
+def test_names_in_generated_modules_are_not_used() -> None:
+    modules = {"marey_x.a": "def of_the_sdk(): ...\n", "marey_x.b": '"""Written by `make docs`."""\nof_the_sdk()\n'}
+    assert [offence.subject for offence in unused.find(house(modules))] == ["marey_x.a.of_the_sdk"]
+
+
 def test_reader_and_writer_of_a_format_are_used_by_the_name_of_their_module() -> None:
     text = "def read_toy(): pass\ndef write_toy(): pass\ndef read_other(): pass\n"
     found = [offence.subject for offence in unused.find(house({"marey_motion.formats.toy": text}))]

@@ -1,0 +1,101 @@
+"""HTTP connections whose waits end when their call is interrupted."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import cached_property
+from typing import Any, TypeVar
+
+import httpcore
+import httpx
+
+from marey_client.asynchronous.interruption import current_call
+from marey_client.credentials import trusted_authorities
+
+T = TypeVar("T")
+
+
+class InterruptibleConnections(httpx.BaseTransport):
+    """HTTP connections for calls that can be interrupted. The first request that uses TLS reads its certificates."""
+
+    def __init__(self, limits: httpx.Limits) -> None:
+        self._limits = limits
+        self._plain = _Pool(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), limits)  # trusts nobody
+
+    @cached_property
+    def _tls(self) -> _Pool:
+        return _Pool(trusted_authorities(), self._limits)
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        """Send a request, and return the answer; its body is read later."""
+        return (self._tls if request.url.scheme == "https" else self._plain).handle_request(request)
+
+    def close(self) -> None:
+        """Close every connection."""
+        self._plain.close()
+        if "_tls" in self.__dict__:
+            self._tls.close()
+
+
+class _Pool(httpx.HTTPTransport):
+    def __init__(self, authorities: ssl.SSLContext, limits: httpx.Limits) -> None:
+        super().__init__(verify=authorities, trust_env=False)
+        # httpx has no parameter for the network backend of its pool.
+        self._pool = httpcore.ConnectionPool(
+            ssl_context=authorities,
+            max_connections=limits.max_connections,
+            max_keepalive_connections=limits.max_keepalive_connections,
+            keepalive_expiry=limits.keepalive_expiry,
+            network_backend=_Network(),
+        )
+
+
+class _Network(httpcore.SyncBackend):
+    def connect_tcp(
+        self,
+        host: str,
+        port: int,
+        timeout: float | None = None,
+        local_address: str | None = None,
+        socket_options: Iterable[Any] | None = None,
+    ) -> httpcore.NetworkStream:
+        return _Stream(super().connect_tcp(host, port, timeout, local_address, socket_options))
+
+
+class _Stream(httpcore.NetworkStream):
+    """Connection that is shut down if the call that reads or writes is interrupted."""
+
+    def __init__(self, stream: httpcore.NetworkStream) -> None:
+        self._stream = stream
+
+    def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
+        return self._interruptible(lambda: self._stream.read(max_bytes, timeout))
+
+    def write(self, buffer: bytes, timeout: float | None = None) -> None:
+        self._interruptible(lambda: self._stream.write(buffer, timeout))
+
+    def close(self) -> None:
+        self._stream.close()
+
+    def start_tls(
+        self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
+    ) -> httpcore.NetworkStream:
+        return _Stream(self._interruptible(lambda: self._stream.start_tls(ssl_context, server_hostname, timeout)))
+
+    def get_extra_info(self, info: str) -> Any:
+        return self._stream.get_extra_info(info)
+
+    def _interruptible(self, step: Callable[[], T]) -> T:
+        call = current_call()
+        if call is None:
+            return step()
+        with call.ending_by(self._shut_down):
+            return step()
+
+    def _shut_down(self) -> None:
+        with suppress(OSError):  # closed already
+            # Not the method of `ssl.SSLSocket`, which would take the TLS state away from the thread that reads.
+            socket.socket.shutdown(self._stream.get_extra_info("socket"), socket.SHUT_RDWR)

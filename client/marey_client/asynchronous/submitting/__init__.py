@@ -1,0 +1,1 @@
+"""Counterparts of `marey_client.submitting` for async programs."""

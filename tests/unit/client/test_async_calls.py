@@ -1,0 +1,201 @@
+"""Calls of the async client in threads: order, cancellation, waits, functions of the user."""
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from typing import Any
+
+import httpx
+import pytest
+from tests.support.scripted_server import ScriptedServer
+
+from marey_client.asynchronous.calls import GRACE_S, Calls
+from marey_client.asynchronous.interruption import CallPool, Interrupted, pause, stop_if_interrupted, waiting
+from marey_client.asynchronous.marey import AsyncMarey
+from marey_client.errors import ConnectionClosed
+from marey_client.progress import ignore_progress, progress
+
+LONG_S = 60.0
+SOON_S = 10.0
+ME = {"user": None, "scopes": [], "token": None}
+
+
+def run(program: Callable[[Calls], Coroutine[Any, Any, None]], concurrency: int = 1) -> None:
+    async def main() -> None:
+        calls = Calls(concurrency)
+        try:
+            await program(calls)
+        finally:
+            await calls.close(lambda: None)
+
+    asyncio.run(main())
+
+
+async def cancelled(task: asyncio.Task[Any]) -> float:
+    """Cancel a task that has begun; return the seconds that it took to end."""
+    started = time.monotonic()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    return time.monotonic() - started
+
+
+def test_calls_begin_in_their_order_and_a_cancelled_one_never() -> None:
+    ran: list[int] = []
+    begin = threading.Event()
+
+    async def program(calls: Calls) -> None:
+        first = asyncio.create_task(calls.run(begin.wait, LONG_S))
+        others = [asyncio.create_task(calls.run(ran.append, number)) for number in range(4)]
+        await asyncio.sleep(0)
+        assert await cancelled(others[1]) < GRACE_S / 2
+        begin.set()
+        await asyncio.gather(first, others[0], others[2], others[3])
+
+    run(program)
+    assert ran == [0, 2, 3]
+
+
+def test_a_wait_leaves_its_place_to_another_call_and_ends_when_it_is_cancelled() -> None:
+    async def program(calls: Calls) -> None:
+        pausing = [asyncio.create_task(calls.run(pause, LONG_S)) for _ in range(5)]
+        await asyncio.sleep(0.1)
+        assert await calls.run(int, "7") == 7
+        for one in pausing:
+            assert await cancelled(one) < SOON_S
+        assert calls._running == 0
+
+    run(program)
+
+
+def test_threads_of_a_cancelled_call_stop_too() -> None:
+    ended: list[str] = []
+
+    def piece(_number: int) -> None:
+        try:
+            pause(LONG_S)
+        except Interrupted:
+            ended.append("interrupted")
+            raise
+
+    def work() -> None:
+        with CallPool(2) as pool:
+            list(pool.map(piece, range(4)))
+
+    async def program(calls: Calls) -> None:
+        working = asyncio.create_task(calls.run(work))
+        await asyncio.sleep(0.2)
+        assert await cancelled(working) < SOON_S
+
+    run(program)
+    assert ended == ["interrupted"] * 2  # the others never began
+
+
+def test_a_thread_that_computes_is_left_after_a_moment_and_can_send_nothing() -> None:
+    go_on = threading.Event()
+    later: list[str] = []
+
+    def compute() -> None:
+        go_on.wait(LONG_S)
+        try:
+            stop_if_interrupted()  # before each request
+        except Interrupted:
+            later.append("interrupted")
+            raise
+
+    async def program(calls: Calls) -> None:
+        computing = asyncio.create_task(calls.run(compute))
+        await asyncio.sleep(0.1)
+        assert GRACE_S * 0.9 < await cancelled(computing) < GRACE_S + SOON_S
+        go_on.set()
+
+    run(program)
+    assert later == ["interrupted"]
+
+
+def test_a_closed_client_refuses_calls() -> None:
+    async def main() -> None:
+        calls = Calls(1)
+        running, queued = (asyncio.create_task(calls.run(pause_without_leaving)) for _ in range(2))
+        await asyncio.sleep(0.1)
+        await calls.close(lambda: None)
+        for one in (running, queued):
+            with pytest.raises(ConnectionClosed):
+                await one
+        with pytest.raises(ConnectionClosed, match="the client is closed"):
+            await calls.run(int)
+
+    def pause_without_leaving() -> None:
+        while True:
+            stop_if_interrupted()
+            time.sleep(0.01)
+
+    asyncio.run(main())
+
+
+def test_only_one_progress_bar_is_shown_at_a_time() -> None:
+    with progress(shown=True) as first:
+        with progress(shown=True) as second:
+            assert second is ignore_progress
+        assert first is not ignore_progress
+    with progress(shown=True) as third:
+        assert third is not ignore_progress
+
+
+def test_nested_waits_of_a_call_free_one_place() -> None:
+    async def program(calls: Calls) -> None:
+        def work() -> int:
+            with waiting(), waiting():
+                return calls._running
+
+        assert await calls.run(work) == 0
+        assert calls._running == 0
+
+    run(program)
+
+
+def test_entries_of_one_answer_are_read_in_one_call_and_an_iterator_may_be_left(script: ScriptedServer) -> None:
+    threads: list[str] = []
+
+    def numbers() -> Iterator[int]:
+        for number in range(3):
+            threads.append(threading.current_thread().name)
+            yield number
+
+    async def program(calls: Calls) -> None:
+        assert [one async for one in calls.each(numbers)] == [0, 1, 2]
+        async for one in calls.each(numbers):
+            assert one == 0
+            break
+
+    run(program)
+    assert all(name.startswith("marey-async") for name in threads)
+
+
+def test_a_function_of_the_user_runs_in_the_loop_and_may_use_the_client(script: ScriptedServer) -> None:
+    """Also if only one call runs at a time, and the call of the function is that one."""
+
+    async def main() -> None:
+        async with AsyncMarey("http://server.test", "t", http=script.transport(), concurrency=1) as server:
+
+            async def ask(number: int) -> int:
+                assert threading.current_thread() is threading.main_thread()
+                return number + len((await server.me()).scopes)
+
+            def fail(number: int) -> int:
+                raise ValueError(f"number {number}")
+
+            assert await server.call(lambda function: function(5), ask) == 5
+            with pytest.raises(ValueError, match="number 6"):
+                await server.call(lambda function: function(6), fail)
+
+            async def never() -> None:
+                await asyncio.sleep(LONG_S)
+
+            task = asyncio.create_task(server.call(lambda function: function(), never))
+            await asyncio.sleep(0.1)
+            assert await cancelled(task) < SOON_S
+
+    script.answers = [httpx.Response(200, json=ME)]
+    asyncio.run(main())
