@@ -162,7 +162,7 @@ class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
     @property
     def trial_count(self) -> int:
         """The number of trials."""
-        return len(self.families) * len(self.speeds_m_s) * len(self.turn_rates_deg_s)
+        return len(self.speeds_m_s) * sum(len(self.courses_deg(family)) for family in self.families)
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:

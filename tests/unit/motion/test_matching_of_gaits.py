@@ -99,6 +99,7 @@ def test_a_clip_asked_to_do_what_it_does_is_played_through(speed: float, turn_ra
         headings=database.root_headings,
         speeds_m_s=60 * steps,
         turn_rates_rad_s=60 * np.diff(database.root_headings, append=database.root_headings[-1]),
+        directions=database.root_headings,
     )
 
     record = play(database, own, EXACT.replace(follow=follow))
