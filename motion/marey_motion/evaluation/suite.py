@@ -25,9 +25,10 @@ from marey_motion.evaluation.scenario import Trial, reference, require_names, su
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
+from marey_motion.matching.copies import index_of
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.record import TrialRecord
-from marey_motion.matching.search import SearchIndex, build_index
+from marey_motion.matching.search import SearchIndex
 from marey_motion.rigs import map_joints
 from marey_schemas.documents.replicates import LEAST_REPLICATES
 from marey_schemas.options.evaluation import EvaluationOptions
@@ -89,7 +90,7 @@ def run_suite(
         report(next(numbers), len(wanted), trial.name)
 
     if ahead:
-        searched = index or _index_of(database)
+        searched = index or index_of(database)
         run = _runner(database, searched, options)
         run_each(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     return [records[trial.name] for trial in wanted]
@@ -99,10 +100,6 @@ def _runner(
     database: MatchingDatabase, index: SearchIndex, options: EvaluationOptions
 ) -> Callable[[Trial], TrialRecord]:
     return lambda trial: simulate(database, index, options, run_of(trial, 0, options))
-
-
-def _index_of(database: MatchingDatabase) -> SearchIndex:
-    return build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
 
 
 def assemble(
@@ -193,7 +190,7 @@ def evaluate(
     EvaluationCancelled    if cancelled
     """
     trials = suite_trials(options)
-    index = _index_of(database)
+    index = index_of(database)
     replicated = len(trials) * options.replicates
     total = replicated + (len(trials) * baseline_replicates(options) if with_baseline else 0)
     report = progress or (lambda _done, _total, _note: None)
