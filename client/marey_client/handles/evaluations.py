@@ -167,7 +167,7 @@ class EvaluationHandle(ReportedHandle):
 def name_of_trial(trial: Mapping[str, Any]) -> str:
     """Return the name of a trial in an evaluation's document; the records of the trial have the same name."""
     angle_rad = trial.get("angle_rad", 0.0)  # evaluations of old versions have no angles
-    return trial_name(trial["family"], trial["speed_m_s"], trial["turn_rate_rad_s"], angle_rad)
+    return trial_name(trial["family"], trial["speed_m_s"], trial["turn_rate_rad_s"], angle_rad, trial.get("label", ""))
 
 
 def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

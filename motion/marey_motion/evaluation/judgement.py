@@ -53,6 +53,7 @@ Region = Literal[
     "figures of eight",
     "backwards",
     "sideways",
+    "real paths",
 ]
 REGIONS: tuple[Region, ...] = get_args(Region)
 _REGION_OF: dict[str, Region] = {
@@ -60,6 +61,7 @@ _REGION_OF: dict[str, Region] = {
     "stopping": "stops",
     "corners": "corners",
     "eights": "figures of eight",
+    "takes": "real paths",
 }
 BACKWARDS_DEG = 135.0
 """Least angle, in degrees, between heading and direction of travel of a backward motion."""

@@ -19,7 +19,7 @@ from marey_motion.arrays import Flags, Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.result import Metrics, TrialResult
-from marey_motion.evaluation.scenario import TIME_TOLERANCE_S, Reference, Trial
+from marey_motion.evaluation.scenario import LEAST_TRAVEL_M_S, TIME_TOLERANCE_S, Reference, Trial
 from marey_motion.matching.record import Status, TrialRecord
 from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
@@ -33,8 +33,6 @@ SETTLING_S = 1.0
 
 The character changes its motion before this time, too, because it looks one second ahead.
 """
-LEAST_TRAVEL_M_S = 0.05
-"""Speed, in metres per second, below which the direction of travel of a step is not defined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +51,7 @@ class TrialSeries:
     heading_errors_rad : recorded minus desired heading at the same tick
     settled : whether the step is at least `SETTLING_S` away from changes of the desired speed or direction
     changes_speed : whether the desired speed alternates, so that there are responses to measure
+    varies : whether the desired speed and turn rate vary all the time, so that the spread of their errors is measured
     regimes : index of the step's regime in `REGIMES`
     pieces : index of the step's period of constant desired speed, -1 for the approach
     """
@@ -70,6 +69,7 @@ class TrialSeries:
     heading_errors_rad: Floats
     settled: Flags
     changes_speed: bool
+    varies: bool
     regimes: NDArray[np.int8]
     pieces: NDArray[np.int64]
 
@@ -117,6 +117,7 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
         heading_errors_rad=record.headings[1:] - reference.headings[1:ticks],
         settled=_settled(trial, np.arange(ticks - 1) / rate),
         changes_speed=trial.changes_speed,
+        varies=bool(trial.path),
         regimes=np.where(pieces < 0, 0, 1 + pieces % 2 * (trial.family != "corners")).astype(np.int8),
         pieces=pieces,
     )
@@ -214,7 +215,7 @@ def _speed_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None
         bias = _of(np.mean, (recorded - wanted)[known])
         metrics[f"se_{name}"] = None if bias is None else scale * bias
         metrics[f"abs_se_{name}"] = None if bias is None else scale * abs(bias)
-        spread = _pooled_spread(recorded[known], series.regimes[known])
+        spread = _pooled_spread((recorded - wanted if series.varies else recorded)[known], series.regimes[known])
         metrics[f"dse_{name}"] = None if spread is None else scale * spread
     return metrics
 

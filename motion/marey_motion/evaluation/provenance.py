@@ -49,8 +49,11 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
 
 
 def _asked(trial: Trial) -> dict[str, Any]:
-    """Return the members of a trial for the digest; the angle only if there is one, since old trials have none."""
-    return {name: value for name, value in asdict(trial).items() if name != "angle_rad" or value}
+    """Return the members of a trial for the digest; members that old trials lack only if they are not empty."""
+    return {name: value for name, value in asdict(trial).items() if name not in _LATER_MEMBERS or value}
+
+
+_LATER_MEMBERS = ("angle_rad", "left_out", "label", "path")
 
 
 def _drawn(options: EvaluationOptions) -> list[dict[str, int]]:
@@ -112,7 +115,7 @@ _CONDITION_OF = {
     **dict.fromkeys(("database", "controller", "window"), "options"),
     **dict.fromkeys(("speeds_m_s", "turn_rates_deg_s", "families", "approach_s", "duration_s"), "scenarios"),
     **dict.fromkeys(("switch_speed_m_s", "switch_every_s", "replicates", "seed"), "scenarios"),
-    **dict.fromkeys(("corner_angles_deg", "strafe_angles_deg"), "scenarios"),
+    **dict.fromkeys(("corner_angles_deg", "strafe_angles_deg", "most_takes"), "scenarios"),
     "limits": "limits",
 }
 """For each member of the evaluation options, the condition of a comparison that changes with this member.

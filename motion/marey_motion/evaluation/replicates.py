@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from marey_motion.evaluation.held_out import index_for
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.metrics import measure_trial
 from marey_motion.evaluation.relevance import UsageTally, treading_steps
@@ -102,7 +103,8 @@ def simulate(
     TrialRecord    the ticks
     """
     guide = guide_for(run.driven, database)
-    return run_trial(database, index, guide, options.controller, start_ticks=run.start_ticks)
+    own = index_for(database, index, run.trial)
+    return run_trial(database, own, guide, options.controller, start_ticks=run.start_ticks)
 
 
 def measure_run(

@@ -22,6 +22,10 @@ LOOK_AHEAD_S = 1.0
 # A boundary belongs to the tick that it falls on, however its time in seconds is rounded.
 TIME_TOLERANCE_S = 1e-9
 STRAIGHT_DEG_S = 1e-6
+KEY_RATE_HZ = 10.0
+"""Keys per second of the path of a take; roots are smoothed over half a second, so more keys would say no more."""
+LEAST_TRAVEL_M_S = 0.05
+"""Speed, in metres per second, below which the direction of travel of a step is not defined."""
 
 _DEFAULTS = EvaluationOptions()
 
@@ -34,6 +38,10 @@ class Trial:
     every `switch_every_s` seconds; the first of these periods begins at the end of the approach. `switch_speed_m_s` is
     the second speed: 0 in `stopping` trials, ignored in families with one speed. `angle_rad` is the angle of the
     corners, or from the heading to the direction of travel.
+
+    A trial along a take has the members `left_out`, the uid of the take, which is not in the set; `label`, its name;
+    and `path`, keys of x and z in metres and heading in radians, `KEY_RATE_HZ` per second, from (0, 0, 0) on. Its speed
+    is the mean speed of the path.
     """
 
     family: Family
@@ -44,11 +52,14 @@ class Trial:
     switch_speed_m_s: float = _DEFAULTS.switch_speed_m_s
     switch_every_s: float = _DEFAULTS.switch_every_s
     angle_rad: float = 0.0
+    left_out: str = ""
+    label: str = ""
+    path: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def name(self) -> str:
         """Stable name, unique within a suite."""
-        return trial_name(self.family, self.speed_m_s, self.turn_rate_rad_s, self.angle_rad)
+        return trial_name(self.family, self.speed_m_s, self.turn_rate_rad_s, self.angle_rad, self.label)
 
     @property
     def changes_speed(self) -> bool:
@@ -77,6 +88,8 @@ def demand(trial: Trial) -> str:
     turn = float(np.degrees(trial.turn_rate_rad_s))
     speed, angle = f"{trial.speed_m_s:g} m/s", f"{abs(float(np.degrees(trial.angle_rad))):.4g}"
     side = "left" if trial.angle_rad > 0.0 else "right"
+    if trial.family == "takes":
+        return f"path of “{trial.label}”, which is left out"
     if trial.family == "corners":
         return f"path with corners of {angle} degrees to the {side} at {speed}"
     if trial.family == "strafing":
@@ -196,6 +209,8 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
     if (every_s := trial.changes_every_s) is not None and not every_s > 0.0:
         raise MotionError("the interval between speed switches must be longer than 0 s", where=trial.name)
     times = np.arange(tick_count + int(np.ceil(look_ahead_s * rate_hz))) / rate_hz
+    if trial.path:
+        return _along_keys(trial, times, rate_hz, tick_count)
     starts, speeds, turn_rates, corners = _pieces(trial, float(times[-1]))
     origins, directions = _piece_origins(starts, speeds, turn_rates, corners)
     piece = np.searchsorted(starts, times + TIME_TOLERANCE_S, side="right") - 1
@@ -214,6 +229,29 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
         speeds_m_s=speeds[piece],
         turn_rates_rad_s=asked_rates,
         directions=travelled,
+    )
+
+
+def _along_keys(trial: Trial, times: Floats, rate_hz: float, tick_count: int) -> Reference:
+    """Compute the trajectory along the keys of a take; the approach goes straight, with the first velocity."""
+    from scipy.interpolate import CubicSpline
+
+    curve = CubicSpline(np.arange(len(trial.path)) / KEY_RATE_HZ, np.array(trial.path))
+    # One row more gives the last step.
+    since_s = np.append(times, times[-1] + 1.0 / rate_hz) - trial.approach_s
+    found = curve(np.clip(since_s, 0.0, (len(trial.path) - 1) / KEY_RATE_HZ))
+    positions, headings = found[:, :2] + np.minimum(since_s, 0.0)[:, None] * curve(0.0, 1)[:2], found[:, 2]
+    steps = np.diff(positions, axis=0)
+    speeds = np.hypot(steps[:, 0], steps[:, 1]) * rate_hz
+    travelled = np.where(speeds >= LEAST_TRAVEL_M_S, np.arctan2(steps[:, 0], steps[:, 1]), headings[:-1])
+    return Reference(
+        rate_hz=rate_hz,
+        tick_count=tick_count,
+        positions=(positions - positions[0])[:-1],
+        headings=headings[:-1],
+        speeds_m_s=speeds,
+        turn_rates_rad_s=np.diff(headings) * rate_hz,
+        directions=np.unwrap(travelled),
     )
 
 

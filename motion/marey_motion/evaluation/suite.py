@@ -13,6 +13,7 @@ from math import radians
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.held_out import take_trials
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.metrics import measure_trial
 from marey_motion.evaluation.pooling import pool_suite
@@ -176,7 +177,7 @@ def evaluate(
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     threads : int, optional    number of trials at a time; one per processor if None
-    with_baseline : bool    whether to also evaluate generated clips
+    with_baseline : bool    whether to also evaluate generated clips; no baseline has trials along takes
     progress : callable, optional    called as progress(runs done, total, name of the last trial); runs are all
         replicates of the trials, and the trials over generated clips
     cancelled : callable, optional    returns True to stop
@@ -189,10 +190,12 @@ def evaluate(
     ------
     EvaluationCancelled    if cancelled
     """
-    trials = suite_trials(options)
+    trials = (*suite_trials(options), *take_trials(database, options))
     index = index_of(database)
     replicated = len(trials) * options.replicates
-    total = replicated + (len(trials) * baseline_replicates(options) if with_baseline else 0)
+    asked = len(suite_trials(options))
+    with_baseline = with_baseline and asked > 0
+    total = replicated + (asked * baseline_replicates(options) if with_baseline else 0)
     report = progress or (lambda _done, _total, _note: None)
 
     def progress_after(before: int) -> ProgressCallback:
@@ -249,7 +252,8 @@ def evaluate_baseline(
     ------
     EvaluationCancelled    if cancelled
     """
-    options = options.replace(replicates=baseline_replicates(options))
+    families = tuple(family for family in options.families if family != "takes")
+    options = options.replace(replicates=baseline_replicates(options), families=families)
     if options not in _baselines:
         database, notes = baseline_database(options)
         made = evaluate(database, options, threads=threads, with_baseline=False, progress=progress, cancelled=cancelled)

@@ -11,7 +11,7 @@ from marey_schemas.documents.evaluations import ANGLED_FAMILIES
 from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 from marey_schemas.options.verdict import VerdictLimits
 
-Family = Literal["circle", "switching", "stopping", "corners", "eights", "strafing"]
+Family = Literal["circle", "switching", "stopping", "corners", "eights", "strafing", "takes"]
 """Kinds of trials, by the path and the speeds that they ask for."""
 Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
@@ -57,6 +57,7 @@ _IMPOSSIBLE: dict[Family, tuple[str, ...]] = {
     "stopping": ("path",),  # the nearest point of the path stays the same at a stop, so the character would never start
     "corners": ("open_loop",),  # a speed and a turn rate do not describe a corner
     "strafing": ("open_loop",),  # nor a direction that differs from the heading
+    "takes": ("path", "open_loop"),  # a real path can contain stops and side steps
 }
 """Follow modes in which the trials of a family cannot be followed."""
 
@@ -67,11 +68,19 @@ class EvaluationOptions(Grid):
     families: tuple[Family, ...] = Field(
         ("circle", "switching"),
         min_length=1,
-        max_length=6,
+        max_length=7,
         description="Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle; "
         "stopping: the character stops and starts again on the circle; corners: straight lines with corners of "
         "`corner_angles_deg` between them; eights: two circles that touch, with the turn rate and its opposite; "
-        "strafing: a straight line in a direction of `strafe_angles_deg`, while the character keeps facing ahead.",
+        "strafing: a straight line in a direction of `strafe_angles_deg`, while the character keeps facing ahead; "
+        "takes: the paths of clips of the set, each of which is left out of the set in its own trial.",
+    )
+    most_takes: int = Field(
+        20,
+        ge=1,
+        le=500,
+        description="Greatest number of `takes` trials. Clips are chosen evenly from those that last at least 4 s and "
+        "move at least 2 m. Long clips are asked for up to `duration_s`.",
     )
     corner_angles_deg: tuple[Angle, ...] = Field(
         (-90.0, 90.0, 180.0),
@@ -152,7 +161,12 @@ class EvaluationOptions(Grid):
         return self
 
     def courses_deg(self, family: Family) -> tuple[float, ...]:
-        """Return what the trials of a family vary beside their speed: turn rates (degrees/s) or angles (degrees)."""
+        """Return what the trials of a family vary beside their speed: turn rates (degrees/s) or angles (degrees).
+
+        Trials along takes depend on the clips, so they are not listed.
+        """
+        if family == "takes":
+            return ()
         if family in ANGLED_FAMILIES:
             return self.corner_angles_deg if family == "corners" else self.strafe_angles_deg
         return tuple(rate for rate in self.turn_rates_deg_s if rate or family != "eights")

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.evaluation.held_out import index_for
 from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.replicates import TrialReplicate, guide_for, measure_run, run_of, simulate
@@ -282,6 +283,7 @@ def needed_rows(
     # What the last search chose is not displayed any more when it was made at the last tick.
     if not np.isnan(record.match_cost[-1]):
         asked, last = guide_for(trial, database), len(record.rows) - 1
-        reason = explain_choice(database, index, asked, options.controller, record, last, count=1)
+        own = index_for(database, index, trial)
+        reason = explain_choice(database, own, asked, options.controller, record, last, count=1)
         rows.append(np.array([reason.chosen]))
     return np.unique(np.concatenate(rows))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-COURSES: tuple[Family, ...] = ("corners", "stopping", "eights", "strafing")
+COURSES: tuple[Family, ...] = ("corners", "stopping", "eights", "strafing", "takes")
 """Families that `draw_course` draws."""
 SIDE, GAP = 3.9, 0.75
 # Where within a section its number may stand, the middle first.
@@ -39,7 +39,7 @@ def draw_switching(subjects: Sequence[Subject], trial: str | None, _options: Fig
 
 
 def draw_course(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
-    """Draw a trial with stops, corners, a figure of eight, or motion sideways or backwards."""
+    """Draw a trial with stops, corners, a figure of eight, motion sideways or backwards, or the path of a take."""
     return _draw(subjects, trial, *COURSES)
 
 
@@ -162,7 +162,7 @@ def _caption(trial: Trial, sections: Sequence[tuple[int, int, float]], rate_hz: 
     if trial.family in COURSES:
         return (
             f"Desired path from above, from the dot on: {sections[0][1] / rate_hz:g} s straight at "
-            f"{trial.speed_m_s:g} m/s (1), then a {demand(trial)}."
+            f"{trial.speed_m_s:.4g} m/s (1), then a {demand(trial)}."
         )
     turn = np.degrees(trial.turn_rate_rad_s)
     straight = sections[0][1] / rate_hz
