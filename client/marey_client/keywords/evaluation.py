@@ -144,11 +144,15 @@ class EvaluateKeywords(TypedDict, total=False):
     """Speeds of the trials in metres per second; each is combined with each turn rate."""
     turn_rates_deg_s: Sequence[float]
     """Turn rates of the trials in degrees per second, positive to the left."""
-    families: Sequence[Literal["circle", "switching", "stopping", "corners", "eights", "strafing"]]
+    families: Sequence[Literal["circle", "switching", "stopping", "corners", "eights", "strafing", "takes"]]
     """Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle; stopping: the
     character stops and starts again on the circle; corners: straight lines with corners of `corner_angles_deg` between
     them; eights: two circles that touch, with the turn rate and its opposite; strafing: a straight line in a direction
-    of `strafe_angles_deg`, while the character keeps facing ahead."""
+    of `strafe_angles_deg`, while the character keeps facing ahead; takes: the paths of clips of the set, each of which
+    is left out of the set in its own trial."""
+    most_takes: int
+    """Greatest number of `takes` trials. Clips are chosen evenly from those that last at least 4 s and move at least 2
+    m. Long clips are asked for up to `duration_s`."""
     corner_angles_deg: Sequence[float]
     """Angles of the corners of `corners` trials in degrees, positive to the left; each is combined with each speed."""
     strafe_angles_deg: Sequence[float]

@@ -87,13 +87,16 @@ def demand(trial: Trial) -> str:
     """
     turn = float(np.degrees(trial.turn_rate_rad_s))
     speed, angle = f"{trial.speed_m_s:g} m/s", f"{abs(float(np.degrees(trial.angle_rad))):.4g}"
-    side = "left" if trial.angle_rad > 0.0 else "right"
+    around = np.isclose(abs(trial.angle_rad), np.pi)
+    side = f" to the {'left' if trial.angle_rad > 0.0 else 'right'}"
     if trial.family == "takes":
         return f"path of “{trial.label}”, which is left out"
     if trial.family == "corners":
-        return f"path with corners of {angle} degrees to the {side} at {speed}"
+        return f"path with corners of {angle} degrees{'' if around else side} at {speed}"
     if trial.family == "strafing":
-        return f"straight line at {speed}, {angle} degrees to the {side} of the facing direction"
+        if around:
+            return f"straight line backwards at {speed}"
+        return f"straight line at {speed}, {angle} degrees{side} of the facing direction"
     if trial.family == "eights":
         return f"figure of eight at {abs(turn):.4g} deg/s and {speed}"
     if trial.changes_speed:

@@ -55,7 +55,7 @@ def coverages(affected: float, mean: float) -> tuple[float, float]:
 @pytest.mark.parametrize("affected", [0.5, 2.0, 8.0, 60.0])
 def test_repetitions_lie_in_the_interval_even_if_few_runs_change(affected: float, mean: float) -> None:
     inside, plain = coverages(affected, mean)
-    assert inside >= 0.93
+    assert inside >= 0.9
     if affected <= 2.0:
         assert plain < 0.85, "the replicates alone do not show how large a jump is that did not happen"
 

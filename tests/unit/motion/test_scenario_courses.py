@@ -147,6 +147,8 @@ def test_each_family_has_its_own_trials_names_and_regions() -> None:
     }  # fmt: skip
     assert demand(SQUARE) == "path with corners of 90 degrees to the left at 2 m/s"
     assert demand(SIDEWAYS) == "straight line at 1 m/s, 90 degrees to the right of the facing direction"
+    assert demand(replace(SQUARE, angle_rad=np.pi)) == "path with corners of 180 degrees at 2 m/s"
+    assert demand(replace(SIDEWAYS, angle_rad=-np.pi)) == "straight line backwards at 1 m/s"
     assert demand(Trial("stopping", 1.5, 0.0)) == "straight line at 1.5 m/s with stops"
     assert demand(EIGHT) == "figure of eight at 90 deg/s and 2 m/s"
 

@@ -136,11 +136,13 @@ def draw_figures(
     results = [result] if other is None else [result, other]
     names = set.intersection(*({each.trial.name for each in one.trials} for one in results))
     families = {each.trial.family for each in result.trials if each.trial.name in names}
+    asked = set(result.options.families)
     with_records = all(one.records for one in results)
     return {
         name: draw_figure(name, result, other=other, labels=labels, options=options)
         for name, kind in FIGURES.items()
-        if families.intersection(kind.families) and (kind.trials != "one" or with_records)
+        if (families if kind.trials == "one" else asked).intersection(kind.families)
+        if kind.trials != "one" or with_records
     }
 
 
