@@ -55,7 +55,7 @@ def take_trials(database: MatchingDatabase, options: EvaluationOptions) -> tuple
         )
     chosen = np.unique(np.linspace(0, len(found) - 1, min(options.most_takes, len(found))).round().astype(int))
     names = [clip.name for clip, _ in found]
-    trials = tuple(_trial(*found[number], options, names) for number in chosen)
+    trials = tuple(_trial(clip, path, options, names) for clip, path in (found[number] for number in chosen))
     require_names(trials)
     return trials
 

@@ -6,6 +6,7 @@ was generated. It moves on slightly smaller circles, at a slightly lower speed. 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ LEAN_M = 0.04
 """Greatest distance in metres between the torso and the curve of the feet, towards the inside."""
 
 
-def circle(speed: float, turn_rate_deg: float, **options: float) -> Trial:
+def circle(speed: float, turn_rate_deg: float, **options: Any) -> Trial:
     return Trial("circle", speed, float(np.radians(turn_rate_deg)), **options)
 
 
