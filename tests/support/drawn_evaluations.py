@@ -92,6 +92,9 @@ def _unmeasured(every: int) -> EvaluationResult:
     return replace(usual(), trials=trials, suite=usual().suite if every > 1 else {})
 
 
+DEFAULT_FIGURES = tuple(name for name, kind in FIGURES.items() if {"circle", "switching"} & set(kind.families))
+"""Names of the figures of an evaluation with the default families of trials."""
+
 LITTLE: dict[str, Callable[[], EvaluationResult]] = {
     "one clip": lambda: tiny((DatabaseClip("only", "only", "", 0, 900),)),
     "clips of one frame": lambda: tiny(tuple(DatabaseClip(f"c{i}", f"c{i}", "", i, i + 1) for i in range(3))),
@@ -179,4 +182,4 @@ def hostile() -> EvaluationResult:
 @functools.cache
 def drawn_hostile() -> Mapping[str, DrawnFigure]:
     """Return the figures of `hostile()` that contain names of clips; in the tier `soak`, all its figures."""
-    return {name: draw_figure(name, hostile()) for name in (FIGURES if is_soak() else NAMING)}
+    return {name: draw_figure(name, hostile()) for name in (DEFAULT_FIGURES if is_soak() else NAMING)}

@@ -195,7 +195,7 @@ def _unwound(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.array(places), np.array(headings)
 
 
-def circle(speed: float, turn_rate_deg: float, **options: float) -> Trial:
+def circle(speed: float, turn_rate_deg: float, **options: Any) -> Trial:
     return Trial("circle", speed, float(np.radians(turn_rate_deg)), **options)
 
 

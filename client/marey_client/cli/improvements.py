@@ -261,8 +261,9 @@ def _chance_in_words(refused: Mapping[str, Any]) -> str:
 
 
 def _change(change: Mapping[str, Any]) -> str:
-    """Return a change as text, followed by its interval if there is one."""
-    interval = "" if change["low"] is None else f" ({change['low']:+.4f} to {change['high']:+.4f})"
+    """Return a change as text, followed by the interval of repetitions if there is one."""
+    low, high = change["again_low"], change["again_high"]
+    interval = "" if low is None else f" ({low:+.4f} to {high:+.4f})"
     return f"{change['change']:+.4f}{interval}"
 
 

@@ -169,7 +169,8 @@ class EvaluationHandle(ReportedHandle):
 
 def name_of_trial(trial: Mapping[str, Any]) -> str:
     """Return the name of a trial in an evaluation's document; the records of the trial have the same name."""
-    return trial_name(trial["family"], trial["speed_m_s"], trial["turn_rate_rad_s"])
+    angle_rad = trial.get("angle_rad", 0.0)  # evaluations of old versions have no angles
+    return trial_name(trial["family"], trial["speed_m_s"], trial["turn_rate_rad_s"], angle_rad, trial.get("label", ""))
 
 
 def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
@@ -185,6 +186,7 @@ def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
             "family": asked["family"],
             "speed_m_s": asked["speed_m_s"],
             "turn_rate_deg_s": turn_rate_deg_s,
+            "angle_deg": math.degrees(asked.get("angle_rad", 0.0)),
             **{name: one[name] for name in TRIAL_VERDICT if name in one},
             **one["metrics"],
         }

@@ -144,8 +144,20 @@ class EvaluateKeywords(TypedDict, total=False):
     """Speeds of the trials in metres per second; each is combined with each turn rate."""
     turn_rates_deg_s: Sequence[float]
     """Turn rates of the trials in degrees per second, positive to the left."""
-    families: Sequence[Literal["circle", "switching"]]
-    """Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle."""
+    families: Sequence[Literal["circle", "switching", "stopping", "corners", "eights", "strafing", "takes"]]
+    """Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle; stopping: the
+    character stops and starts again on the circle; corners: straight lines with corners of `corner_angles_deg` between
+    them; eights: two circles that touch, with the turn rate and its opposite; strafing: a straight line in a direction
+    of `strafe_angles_deg`, while the character keeps facing ahead; takes: the paths of clips of the set, each of which
+    is left out of the set in its own trial."""
+    most_takes: int
+    """Greatest number of `takes` trials. Clips are chosen evenly from those that last at least 4 s and move at least 2
+    m. Long clips are asked for up to `duration_s`."""
+    corner_angles_deg: Sequence[float]
+    """Angles of the corners of `corners` trials in degrees, positive to the left; each is combined with each speed."""
+    strafe_angles_deg: Sequence[float]
+    """Directions of `strafing` trials in degrees from the facing direction, positive to the left; 180: backwards. Each
+    is combined with each speed."""
     approach_s: float
     """Duration of the approach in seconds: the straight path before the circle."""
     duration_s: float
@@ -153,7 +165,8 @@ class EvaluateKeywords(TypedDict, total=False):
     switch_speed_m_s: float
     """Second speed of switching trials, in metres per second; the first is one of `speeds_m_s`."""
     switch_every_s: float
-    """Seconds that each speed of a switching trial lasts."""
+    """Seconds that each speed of a switching trial lasts; also the seconds from a start to the next stop, and from
+    corner to corner."""
     replicates: int
     """Number of replicates of each trial. The first one is the trial itself; each further one has another phase of the
     stride at the start, and an approach that is up to one second longer. Results are means with 95 % intervals. 1: only

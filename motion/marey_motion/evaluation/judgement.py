@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -43,8 +43,28 @@ Measure = Literal[
 ]
 LOOKS: tuple[Measure, ...] = ("skating", "sinking", "gliding", "pattering", "jerking", "jumping", "treading")
 """The measures of how the motion looks; all other measures are about place, speed and heading."""
-Region = Literal["straight", "gentle turns", "sharp turns", "speed changes"]
-REGIONS: tuple[Region, ...] = ("straight", "gentle turns", "sharp turns", "speed changes")
+Region = Literal[
+    "straight",
+    "gentle turns",
+    "sharp turns",
+    "speed changes",
+    "stops",
+    "corners",
+    "figures of eight",
+    "backwards",
+    "sideways",
+    "real paths",
+]
+REGIONS: tuple[Region, ...] = get_args(Region)
+_REGION_OF: dict[str, Region] = {
+    "switching": "speed changes",
+    "stopping": "stops",
+    "corners": "corners",
+    "eights": "figures of eight",
+    "takes": "real paths",
+}
+BACKWARDS_DEG = 135.0
+"""Least angle, in degrees, between heading and direction of travel of a backward motion."""
 
 
 class LimitCheck(NamedTuple):
@@ -95,11 +115,13 @@ class TrialVerdict:
 
     @property
     def region(self) -> Region:
-        """The group of trials to which the trial belongs, by its turn rate and its changes of speed."""
+        """The group of trials to which the trial belongs, by its family, its turn rate and its angle."""
         trial = self.outcome.trial
+        if (region := _REGION_OF.get(trial.family)) is not None:
+            return region
+        if trial.family == "strafing":
+            return "backwards" if abs(float(np.degrees(trial.angle_rad))) >= BACKWARDS_DEG else "sideways"
         turn_deg_s = abs(float(np.degrees(trial.turn_rate_rad_s)))
-        if trial.family == "switching":
-            return "speed changes"
         return (
             "straight" if turn_deg_s < 1.0 else "gentle turns" if turn_deg_s <= GENTLE_DEG_S + 1e-6 else "sharp turns"
         )
@@ -169,7 +191,7 @@ def judge_trial(outcome: TrialResult, limits: VerdictLimits) -> TrialVerdict:
     path = (
         _check("place", outcome.metrics, "offset_mean", limits.lag_s * mean_speed_m_s(outcome.trial)),
         *_speed_checks(outcome, limits),
-        *_turn_checks(outcome.metrics, limits),
+        *_turn_checks(outcome.metrics, limits, "settled_" if "settled_heading_rms_deg" in outcome.metrics else ""),
     )
     return TrialVerdict(outcome, (*path, *_looks_checks(outcome.metrics, limits)))
 
@@ -178,12 +200,14 @@ def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[Limit
     """Check the speed in each regime, apart from the time around speed switches, and the response to the switches."""
     trial, metrics = outcome.trial, outcome.metrics
     regimes = [(mean_speed_m_s(trial), metrics)]
-    if "settled_se_v" in metrics and trial.family == "switching" and "switched" in outcome.regimes:
+    if "settled_se_v" in metrics and trial.changes_speed and "switched" in outcome.regimes:
         base, switched = outcome.regimes["base"], outcome.regimes["switched"]
         regimes = [(trial.speed_m_s, base), (trial.switch_speed_m_s, switched)]
     fastest = max(wanted for wanted, _ in regimes)
     for wanted, own in regimes:
-        yield _check("speed", own, "settled_se_v" if "settled_se_v" in own else "se_v", limits.speed_share * wanted)
+        # A character that shall stand may move by the share of the speed from which it stops.
+        limit = limits.speed_share * (wanted or fastest)
+        yield _check("speed", own, "settled_se_v" if "settled_se_v" in own else "se_v", limit)
         if "settled_dse_v" in own:
             yield _check("speed wobble", own, "settled_dse_v", limits.speed_wobble_share * fastest)
     yield from _response_checks(metrics, limits)
@@ -195,11 +219,12 @@ def _response_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitC
         yield _check("response", metrics, "response_median_s", limits.response_s)
 
 
-def _turn_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitCheck]:
+def _turn_checks(metrics: Metrics, limits: VerdictLimits, prefix: str = "") -> Iterator[LimitCheck]:
+    """Check turn rate and heading; with the prefix `settled_`, apart from the time around changes of the direction."""
     yield _check("turn", metrics, "se_omega_deg", limits.turn_deg_s)
     if "heading_rms_deg" in metrics:
-        yield _check("heading", metrics, "heading_rms_deg", limits.heading_deg)
-        yield _check("turn wobble", metrics, "dse_omega_deg", limits.turn_wobble_deg_s)
+        yield _check("heading", metrics, f"{prefix}heading_rms_deg", limits.heading_deg)
+        yield _check("turn wobble", metrics, f"{prefix}dse_omega_deg", limits.turn_wobble_deg_s)
 
 
 def _looks_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitCheck]:
@@ -249,7 +274,7 @@ def _check(measure: Measure, metrics: Metrics, metric: str, limit: float) -> Lim
 
 
 def mean_speed_m_s(trial: Trial) -> float:
-    """Compute the mean desired speed while a trial follows its circular path.
+    """Compute the mean desired speed of a trial after its approach.
 
     If the desired speed alternates, the path begins at the base speed.
 
@@ -261,7 +286,7 @@ def mean_speed_m_s(trial: Trial) -> float:
     -------
     float    metres per second
     """
-    if trial.family == "circle" or trial.duration_s <= 0.0:
+    if not trial.changes_speed or trial.duration_s <= 0.0:
         return trial.speed_m_s
     pieces = int(trial.duration_s // trial.switch_every_s)
     rest_s = trial.duration_s - pieces * trial.switch_every_s

@@ -19,7 +19,7 @@ from marey_motion.arrays import Flags, Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.result import Metrics, TrialResult
-from marey_motion.evaluation.scenario import TIME_TOLERANCE_S, Reference, Trial
+from marey_motion.evaluation.scenario import LEAST_TRAVEL_M_S, TIME_TOLERANCE_S, Reference, Trial
 from marey_motion.matching.record import Status, TrialRecord
 from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
@@ -29,12 +29,10 @@ RESPONSE_SHARE = 0.1
 RESPONSE_HOLD_S = 0.5
 """Seconds for which the error must stay below `RESPONSE_SHARE` for the speed to count as reached."""
 SETTLING_S = 1.0
-"""Seconds around a switch of the desired speed that do not count as settled, since the character changes its speed.
+"""Seconds around a change of the desired speed or direction that do not count as settled.
 
-The character changes its speed before the switch, too, because it looks one second ahead.
+The character changes its motion before this time, too, because it looks one second ahead.
 """
-LEAST_TRAVEL_M_S = 0.05
-"""Speed, in metres per second, below which the direction of travel of a step is not defined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +46,12 @@ class TrialSeries:
     travel_turn_rates_rad_s : turn rate of the direction of travel; NaN if the character hardly moves
     wanted_speeds_m_s, wanted_turn_rates_rad_s : speed and turn rate of the reference
     offsets_m : distance from the reference at the same tick
-    cross_track_m, along_track_m : components of this offset in the reference's frame, positive to the left and ahead
+    cross_track_m, along_track_m : components of this offset, positive to the left and ahead in the reference's
+        direction of travel
     heading_errors_rad : recorded minus desired heading at the same tick
-    settled : whether the step is at least `SETTLING_S` away from switches of the desired speed
+    settled : whether the step is at least `SETTLING_S` away from changes of the desired speed or direction
+    changes_speed : whether the desired speed alternates, so that there are responses to measure
+    varies : whether the desired speed and turn rate vary all the time, so that the spread of their errors is measured
     regimes : index of the step's regime in `REGIMES`
     pieces : index of the step's period of constant desired speed, -1 for the approach
     """
@@ -67,6 +68,8 @@ class TrialSeries:
     along_track_m: Floats
     heading_errors_rad: Floats
     settled: Flags
+    changes_speed: bool
+    varies: bool
     regimes: NDArray[np.int8]
     pieces: NDArray[np.int64]
 
@@ -97,7 +100,7 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
         )
     steps = np.diff(record.positions, axis=0)
     apart = record.positions[1:] - reference.positions[1:ticks]
-    sine, cosine = np.sin(reference.headings[1:ticks]), np.cos(reference.headings[1:ticks])
+    sine, cosine = np.sin(reference.directions[1:ticks]), np.cos(reference.directions[1:ticks])
     pieces = _pieces(trial, np.arange(ticks - 1) / rate)
     speeds = np.hypot(steps[:, 0], steps[:, 1]) * rate
     return TrialSeries(
@@ -113,7 +116,9 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
         along_track_m=apart[:, 0] * sine + apart[:, 1] * cosine,
         heading_errors_rad=record.headings[1:] - reference.headings[1:ticks],
         settled=_settled(trial, np.arange(ticks - 1) / rate),
-        regimes=np.where(pieces < 0, 0, 1 + pieces % 2).astype(np.int8),
+        changes_speed=trial.changes_speed,
+        varies=bool(trial.path),
+        regimes=np.where(pieces < 0, 0, 1 + pieces % 2 * (trial.family != "corners")).astype(np.int8),
         pieces=pieces,
     )
 
@@ -158,20 +163,20 @@ def measure_trial(
 
 
 def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
-    """Return, for each time, the index of its period of constant speed; -1 during the approach."""
+    """Return, for each time, the index of its period of constant speed and turn rate; -1 during the approach."""
     on_circle = times_s + TIME_TOLERANCE_S - trial.approach_s
-    if trial.family == "switching":
-        return np.maximum(np.floor(on_circle / trial.switch_every_s), -1.0).astype(np.int64)
+    if (every_s := trial.changes_every_s) is not None:
+        return np.maximum(np.floor(on_circle / every_s), -1.0).astype(np.int64)
     return np.where(on_circle < 0.0, -1, 0).astype(np.int64)
 
 
 def _settled(trial: Trial, times_s: Floats) -> Flags:
-    """Mark the times that are not near a switch of the desired speed; if switches are frequent, half of all times."""
-    if trial.family != "switching":
+    """Mark the times that are not near a change of the desired motion; if changes are frequent, half of all times."""
+    if (every_s := trial.changes_every_s) is None:
         return np.full(len(times_s), True)
-    margin_s = min(SETTLING_S, 0.25 * trial.switch_every_s)
-    since_s = np.mod(times_s + TIME_TOLERANCE_S - trial.approach_s, trial.switch_every_s)
-    return (since_s >= margin_s) & (since_s < trial.switch_every_s - margin_s)
+    margin_s = min(SETTLING_S, 0.25 * every_s)
+    since_s = np.mod(times_s + TIME_TOLERANCE_S - trial.approach_s, every_s)
+    return (since_s >= margin_s) & (since_s < every_s - margin_s)
 
 
 def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64], rate: float) -> Floats:
@@ -210,7 +215,7 @@ def _speed_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None
         bias = _of(np.mean, (recorded - wanted)[known])
         metrics[f"se_{name}"] = None if bias is None else scale * bias
         metrics[f"abs_se_{name}"] = None if bias is None else scale * abs(bias)
-        spread = _pooled_spread(recorded[known], series.regimes[known])
+        spread = _pooled_spread((recorded - wanted if series.varies else recorded)[known], series.regimes[known])
         metrics[f"dse_{name}"] = None if spread is None else scale * spread
     return metrics
 
@@ -247,17 +252,29 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
 def _settled_metrics(series: TrialSeries, window: Flags, speeds: Metrics) -> dict[str, float | None]:
     """Compute error and spread of the speed in settled steps, and the root mean square of the heading error.
 
-    Settled steps are not near a switch of the desired speed. `speeds` are the metrics of the whole window; if the
-    desired speed does not switch, they are used for the settled steps, too.
+    Settled steps are not near a change of the desired motion. `speeds` are the metrics of the whole window; if the
+    desired motion does not change, they are used for the settled steps, too. If its direction or turn rate changes, the
+    heading and the spread of the turn rate in settled steps are added.
     """
-    heading = _of(_rms, series.heading_errors_rad[window])
-    heading_deg = None if heading is None else float(np.degrees(heading))
+    heading_deg = _degrees(_of(_rms, series.heading_errors_rad[window]))
     if series.settled.all():
         return {"settled_se_v": speeds["se_v"], "settled_dse_v": speeds["dse_v"], "heading_rms_deg": heading_deg}
     settled = window & series.settled
     errors = (series.speeds_m_s - series.wanted_speeds_m_s)[settled]
-    spread = _pooled_spread(series.speeds_m_s[settled], series.regimes[settled])
-    return {"settled_se_v": _of(np.mean, errors), "settled_dse_v": spread, "heading_rms_deg": heading_deg}
+    metrics = {
+        "settled_se_v": _of(np.mean, errors),
+        "settled_dse_v": _pooled_spread(series.speeds_m_s[settled], series.regimes[settled]),
+        "heading_rms_deg": heading_deg,
+    }
+    if not series.changes_speed:
+        metrics["settled_heading_rms_deg"] = _degrees(_of(_rms, series.heading_errors_rad[settled]))
+        spread = _pooled_spread(series.turn_rates_rad_s[settled], series.regimes[settled])
+        metrics["settled_dse_omega_deg"] = _degrees(spread)
+    return metrics
+
+
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else float(np.degrees(angle_rad))
 
 
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
@@ -269,7 +286,7 @@ def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | N
     times = [
         _response_s(series, first, stop)
         for first, stop in _stretches(series.pieces)
-        if series.pieces[first] > 0 and window[first] and stop - first >= _hold_steps(series)
+        if series.changes_speed and series.pieces[first] > 0 and window[first] and stop - first >= _hold_steps(series)
     ]
     answered = [time for time in times if time is not None]
     return {
@@ -301,7 +318,9 @@ def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
     Returns None if the next switch, at step `stop`, comes first.
     """
     wanted = series.wanted_speeds_m_s[first:stop]
-    right = np.abs(series.speeds_m_s[first:stop] - wanted) < RESPONSE_SHARE * wanted
+    # A stop is answered when only a share of the other speed is left.
+    scale = np.where(wanted > 0.0, wanted, series.wanted_speeds_m_s.max())
+    right = np.abs(series.speeds_m_s[first:stop] - wanted) < RESPONSE_SHARE * scale
     hold = _hold_steps(series)
     held = np.convolve(right, np.ones(hold), mode="valid") >= hold - 0.5
     return float(np.argmax(held)) / series.rate_hz if held.any() else None

@@ -42,10 +42,18 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
         clips={clip.uid: clip.content or own for clip, own in zip(database.clips, rows, strict=True)},
         normaliser=database.normaliser.digest,
         options=_digest({"database": database.options, "controller": options.controller, "window": options.window}),
-        scenarios=_digest([*trials, *_drawn(options)]),
+        scenarios=_digest([*map(_asked, trials), *_drawn(options)]),
         code_version=code_version(),
         limits=_digest(options.limits),
     )
+
+
+def _asked(trial: Trial) -> dict[str, Any]:
+    """Return the members of a trial for the digest; members that old trials lack only if they are not empty."""
+    return {name: value for name, value in asdict(trial).items() if name not in _LATER_MEMBERS or value}
+
+
+_LATER_MEMBERS = ("angle_rad", "left_out", "label", "path")
 
 
 def _drawn(options: EvaluationOptions) -> list[dict[str, int]]:
@@ -107,6 +115,7 @@ _CONDITION_OF = {
     **dict.fromkeys(("database", "controller", "window"), "options"),
     **dict.fromkeys(("speeds_m_s", "turn_rates_deg_s", "families", "approach_s", "duration_s"), "scenarios"),
     **dict.fromkeys(("switch_speed_m_s", "switch_every_s", "replicates", "seed"), "scenarios"),
+    **dict.fromkeys(("corner_angles_deg", "strafe_angles_deg", "most_takes"), "scenarios"),
     "limits": "limits",
 }
 """For each member of the evaluation options, the condition of a comparison that changes with this member.

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from marey_motion.evaluation.held_out import index_for
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.metrics import measure_trial
 from marey_motion.evaluation.relevance import UsageTally, treading_steps
@@ -24,9 +25,10 @@ from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.running import CancelCallback, ProgressCallback, run_each
 from marey_motion.evaluation.scenario import LOOK_AHEAD_S, Reference, Trial, reference
 from marey_motion.matching.controller import run_trial
+from marey_motion.matching.copies import index_of
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import Status, TrialRecord
-from marey_motion.matching.search import SearchIndex, build_index
+from marey_motion.matching.search import SearchIndex
 from marey_schemas.options.evaluation import EvaluationOptions
 
 START_S = 1.0
@@ -101,7 +103,8 @@ def simulate(
     TrialRecord    the ticks
     """
     guide = guide_for(run.driven, database)
-    return run_trial(database, index, guide, options.controller, start_ticks=run.start_ticks)
+    own = index_for(database, index, run.trial)
+    return run_trial(database, own, guide, options.controller, start_ticks=run.start_ticks)
 
 
 def measure_run(
@@ -235,7 +238,7 @@ def run_replicates(
     """
     if options.replicates == 1:
         return None
-    searched = index or build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+    searched = index or index_of(database)
     looks = LooksMeter(database, options.controller)
     runs = [run_of(trial, number, options) for trial in trials for number in range(1, options.replicates)]
     kept = _Kept(UsageTally.of(database.clips))

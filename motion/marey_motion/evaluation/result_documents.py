@@ -89,7 +89,7 @@ def _result_body(result: EvaluationResult) -> Tree:
         "clips": [_plain(asdict(clip)) for clip in result.clips],
         "trials": [
             {
-                "trial": asdict(one.outcome.trial),
+                "trial": _plain(asdict(one.outcome.trial)),
                 "metrics": dict(one.outcome.metrics),
                 "regimes": _plain(one.outcome.regimes),
                 "followed": one.followed,
@@ -150,7 +150,7 @@ def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> Evaluati
         options=options_from_tree(tree["options"]),
         provenance=Provenance(**tree["provenance"]),
         clips=clips,
-        trials=tuple(TrialResult(Trial(**one["trial"]), one["metrics"], one["regimes"]) for one in tree["trials"]),
+        trials=tuple(TrialResult(_trial(one["trial"]), one["metrics"], one["regimes"]) for one in tree["trials"]),
         suite=tree["suite"],
         usage=_usage(tree["usage"], clips),
         switches=tree["switches"],
@@ -161,6 +161,11 @@ def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> Evaluati
         perceived=PerceivedTransitions.from_tree(tree.get("perceived")),
         replicates=_replicates(tree.get("replicates")),
     )
+
+
+def _trial(tree: Mapping[str, Any]) -> Trial:
+    path = tuple((x, z, heading) for x, z, heading in tree.get("path", ()))
+    return Trial(**(dict(tree) | {"path": path}))
 
 
 def options_from_tree(tree: Mapping[str, Any]) -> EvaluationOptions:

@@ -13,6 +13,7 @@ from math import radians
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.held_out import take_trials
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.metrics import measure_trial
 from marey_motion.evaluation.pooling import pool_suite
@@ -25,9 +26,10 @@ from marey_motion.evaluation.scenario import Trial, reference, require_names, su
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
+from marey_motion.matching.copies import index_of
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.record import TrialRecord
-from marey_motion.matching.search import SearchIndex, build_index
+from marey_motion.matching.search import SearchIndex
 from marey_motion.rigs import map_joints
 from marey_schemas.documents.replicates import LEAST_REPLICATES
 from marey_schemas.options.evaluation import EvaluationOptions
@@ -89,7 +91,7 @@ def run_suite(
         report(next(numbers), len(wanted), trial.name)
 
     if ahead:
-        searched = index or _index_of(database)
+        searched = index or index_of(database)
         run = _runner(database, searched, options)
         run_each(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     return [records[trial.name] for trial in wanted]
@@ -99,10 +101,6 @@ def _runner(
     database: MatchingDatabase, index: SearchIndex, options: EvaluationOptions
 ) -> Callable[[Trial], TrialRecord]:
     return lambda trial: simulate(database, index, options, run_of(trial, 0, options))
-
-
-def _index_of(database: MatchingDatabase) -> SearchIndex:
-    return build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
 
 
 def assemble(
@@ -179,7 +177,7 @@ def evaluate(
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     threads : int, optional    number of trials at a time; one per processor if None
-    with_baseline : bool    whether to also evaluate generated clips
+    with_baseline : bool    whether to also evaluate generated clips; no baseline has trials along takes
     progress : callable, optional    called as progress(runs done, total, name of the last trial); runs are all
         replicates of the trials, and the trials over generated clips
     cancelled : callable, optional    returns True to stop
@@ -192,10 +190,12 @@ def evaluate(
     ------
     EvaluationCancelled    if cancelled
     """
-    trials = suite_trials(options)
-    index = _index_of(database)
+    trials = (*suite_trials(options), *take_trials(database, options))
+    index = index_of(database)
     replicated = len(trials) * options.replicates
-    total = replicated + (len(trials) * baseline_replicates(options) if with_baseline else 0)
+    asked = len(suite_trials(options))
+    with_baseline = with_baseline and asked > 0
+    total = replicated + (asked * baseline_replicates(options) if with_baseline else 0)
     report = progress or (lambda _done, _total, _note: None)
 
     def progress_after(before: int) -> ProgressCallback:
@@ -252,7 +252,8 @@ def evaluate_baseline(
     ------
     EvaluationCancelled    if cancelled
     """
-    options = options.replace(replicates=baseline_replicates(options))
+    families = tuple(family for family in options.families if family != "takes")
+    options = options.replace(replicates=baseline_replicates(options), families=families)
     if options not in _baselines:
         database, notes = baseline_database(options)
         made = evaluate(database, options, threads=threads, with_baseline=False, progress=progress, cancelled=cancelled)

@@ -110,7 +110,9 @@ def region_verdicts(result: EvaluationResult) -> tuple[RegionVerdict, ...]:
         more = f"; {_problems(wrong)}" if wrong else ""
         sentence = f"{region.capitalize()}: {followed} of {counted(len(own), 'trajectory')} followed{more}."
         regions.append(RegionVerdict(region=region, followed=followed, trials=len(own), sentence=sentence))
-    return (*regions, *_not_asked_for(result.coverage, 1.0 / result.options.database.rate_hz))
+    asked = {one.region for one in regions}
+    unasked = _not_asked_for(result.coverage, 1.0 / result.options.database.rate_hz)
+    return (*regions, *(one for one in unasked if one.region not in asked))
 
 
 def _not_asked_for(coverage: Coverage, window_s: float) -> list[RegionVerdict]:

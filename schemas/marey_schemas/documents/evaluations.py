@@ -22,9 +22,20 @@ MOST_EVALUATIONS_COMPARED = 8
 """Greatest number of evaluations in one comparison; more evaluations do not fit side by side in a table."""
 
 
-def trial_name(family: str, speed_m_s: float, turn_rate_rad_s: float) -> str:
-    """Return the name of a trial, unique in a suite, such as "circle v=1.25 w=-50"; w is in degrees per second."""
-    return f"{family} v={speed_m_s:g} w={math.degrees(turn_rate_rad_s):g}"
+ANGLED_FAMILIES = ("corners", "strafing")
+"""The families of trials that vary an angle instead of the turn rate."""
+
+
+def trial_name(family: str, speed_m_s: float, turn_rate_rad_s: float, angle_rad: float = 0.0, label: str = "") -> str:
+    """Return the name of a trial, unique in a suite, such as "circle v=1.25 w=-50" or "corners v=1.25 a=90".
+
+    w is the turn rate in degrees per second; a is the angle in degrees, for the families that vary an angle. A trial
+    along a take has the take's name, its `label`.
+    """
+    if label:
+        return f"{family} {label}"
+    course = f"a={math.degrees(angle_rad):g}" if family in ANGLED_FAMILIES else f"w={math.degrees(turn_rate_rad_s):g}"
+    return f"{family} v={speed_m_s:g} {course}"
 
 
 class HeadlineMetric(NamedTuple):

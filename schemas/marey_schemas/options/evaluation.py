@@ -7,12 +7,15 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from marey_schemas.base import Options
+from marey_schemas.documents.evaluations import ANGLED_FAMILIES
 from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 from marey_schemas.options.verdict import VerdictLimits
 
-Family = Literal["circle", "switching"]
+Family = Literal["circle", "switching", "stopping", "corners", "eights", "strafing", "takes"]
+"""Kinds of trials, by the path and the speeds that they ask for."""
 Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
+Angle = Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
 
 LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
 """Least and greatest frame rate at which coverage is measured during a recording."""
@@ -50,14 +53,48 @@ class Grid(Options):
         return self
 
 
+_IMPOSSIBLE: dict[Family, tuple[str, ...]] = {
+    "stopping": ("path",),  # the nearest point of the path stays the same at a stop, so the character would never start
+    "corners": ("open_loop",),  # a speed and a turn rate do not describe a corner
+    "strafing": ("open_loop",),  # nor a direction that differs from the heading
+    "takes": ("path", "open_loop"),  # a real path can contain stops and side steps
+}
+"""Follow modes in which the trials of a family cannot be followed."""
+
+
 class EvaluationOptions(Grid):
     """Options that, together with the clips, determine the result of an evaluation."""
 
     families: tuple[Family, ...] = Field(
         ("circle", "switching"),
         min_length=1,
-        max_length=2,
-        description="Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle.",
+        max_length=7,
+        description="Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle; "
+        "stopping: the character stops and starts again on the circle; corners: straight lines with corners of "
+        "`corner_angles_deg` between them; eights: two circles that touch, with the turn rate and its opposite; "
+        "strafing: a straight line in a direction of `strafe_angles_deg`, while the character keeps facing ahead; "
+        "takes: the paths of clips of the set, each of which is left out of the set in its own trial.",
+    )
+    most_takes: int = Field(
+        20,
+        ge=1,
+        le=500,
+        description="Greatest number of `takes` trials. Clips are chosen evenly from those that last at least 4 s and "
+        "move at least 2 m. Long clips are asked for up to `duration_s`.",
+    )
+    corner_angles_deg: tuple[Angle, ...] = Field(
+        (-90.0, 90.0, 180.0),
+        min_length=1,
+        max_length=200,
+        description="Angles of the corners of `corners` trials in degrees, positive to the left; each is combined with "
+        "each speed.",
+    )
+    strafe_angles_deg: tuple[Angle, ...] = Field(
+        (-90.0, 90.0, 180.0),
+        min_length=1,
+        max_length=200,
+        description="Directions of `strafing` trials in degrees from the facing direction, positive to the left; 180: "
+        "backwards. Each is combined with each speed.",
     )
     approach_s: float = Field(
         3.0,
@@ -74,7 +111,12 @@ class EvaluationOptions(Grid):
         description="Second speed of switching trials, in metres per second; the first is one of `speeds_m_s`.",
     )
     switch_every_s: float = Field(
-        5.0, ge=0.5, le=600, allow_inf_nan=False, description="Seconds that each speed of a switching trial lasts."
+        5.0,
+        ge=0.5,
+        le=600,
+        allow_inf_nan=False,
+        description="Seconds that each speed of a switching trial lasts; also the seconds from a start to the next "
+        "stop, and from corner to corner.",
     )
     replicates: int = Field(
         8,
@@ -108,8 +150,26 @@ class EvaluationOptions(Grid):
 
     @model_validator(mode="after")
     def _check_families(self) -> Self:
-        _require_different("families", self.families)
+        for name in ("families", "corner_angles_deg", "strafe_angles_deg"):
+            _require_different(name, getattr(self, name))
+        for family in self.families:
+            if self.controller.follow in (modes := _IMPOSSIBLE.get(family, ())):
+                possible = " or ".join(mode for mode in ("time", "path", "open_loop") if mode not in modes)
+                raise ValueError(
+                    f"{family} trials cannot be followed in the mode {self.controller.follow}; choose {possible}"
+                )
         return self
+
+    def courses_deg(self, family: Family) -> tuple[float, ...]:
+        """Return what the trials of a family vary beside their speed: turn rates (degrees/s) or angles (degrees).
+
+        Trials along takes depend on the clips, so they are not listed.
+        """
+        if family == "takes":
+            return ()
+        if family in ANGLED_FAMILIES:
+            return self.corner_angles_deg if family == "corners" else self.strafe_angles_deg
+        return tuple(rate for rate in self.turn_rates_deg_s if rate or family != "eights")
 
 
 def _require_different(name: str, values: tuple[object, ...]) -> None:

@@ -161,8 +161,9 @@ class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
 
     @property
     def trial_count(self) -> int:
-        """The number of trials."""
-        return len(self.families) * len(self.speeds_m_s) * len(self.turn_rates_deg_s)
+        """The number of trials; of trials along takes, the greatest possible number."""
+        takes = self.most_takes if "takes" in self.families else 0
+        return takes + len(self.speeds_m_s) * sum(len(self.courses_deg(family)) for family in self.families)
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:

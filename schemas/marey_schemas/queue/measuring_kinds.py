@@ -137,7 +137,7 @@ SUGGEST = KindDeclaration(
     "coverage.",
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
-    version=6,
+    version=7,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": METRIC},
     outputs={"document": "file"},
     facets=REMOVAL_FACETS,
@@ -148,7 +148,7 @@ OPTIMISE = KindDeclaration(
     description="Removes clips from an evaluated set and adds others, step by step, as long as the set improves.",
     params=job_params.OptimiseParams,
     implementation="marey_worker.kinds.optimise:run",
-    version=4,
+    version=5,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
     outputs={"document": "file"},
 )
@@ -160,7 +160,7 @@ SWEEP = KindDeclaration(
     implementation="marey_worker.kinds.sweep:run",
     gathering="marey_worker.kinds.sweep:gather",
     task_count=job_params.count_sweep_tasks,
-    version=4,
+    version=5,
     inputs={"evaluation": _EVALUATED},
     outputs={"document": "file"},
 )

@@ -91,7 +91,7 @@ def test_several_sets_are_printed_beside_each_other_with_their_verdicts(
 def test_a_refused_step_is_printed_with_the_probability_by_which_it_was_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    change = {"change": -0.02, "low": -0.035, "high": -0.005, "p": 0.06}
+    change = {"change": -0.02, "low": -0.03, "high": -0.01, "again_low": -0.035, "again_high": -0.005, "p": 0.06}
     refused = {"action": "remove", "sources": ["a"], "estimated_gain": 0.05, "effect": {"objective": change}}
     _print_steps(
         {"names": {"a": "walk"}, "steps": [], "unconfirmed": [refused], "ended": "not confirmed", "total": None}

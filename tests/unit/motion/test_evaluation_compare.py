@@ -161,6 +161,13 @@ def test_a_verdict_needs_more_than_chance_and_a_metric_with_a_direction() -> Non
     assert paired_change("offset_mean", np.ones((1, 1)), np.zeros((1, 1))).verdict == "unclear"
 
 
+def test_differences_of_rounding_are_no_change() -> None:
+    before = 0.1 * np.arange(1.0, 9.0)[None]
+    found = paired_change("foot_skate", before, before * (1.0 + 2.0**-50))
+    assert (found.verdict, found.p, found.change) == ("same", None, 0.0)
+    assert paired_change("foot_skate", before, before * (1.0 + 1e-9)).verdict == "worse"
+
+
 def test_the_verdicts_of_many_metrics_are_rarely_false_together() -> None:
     """The replicates differ by chance alone: uncorrected, more than half of the families would have a false verdict."""
     random = np.random.default_rng(7)

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.drawn_evaluations import (
+    DEFAULT_FIGURES,
     DRAWN_EVALUATIONS,
     LITTLE,
     NAMING,
@@ -40,7 +41,7 @@ from marey_reports.drawing.paper import labels_of, nice_levels, shortened, witho
 from marey_reports.evaluation.figures import FIGURES, USE_FIGURES, FigureOptions, draw_figure, draw_figures
 from marey_reports.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
 from marey_reports.evaluation.figures.mixtures import fit_one, fit_two
-from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.evaluation import EvaluationOptions, Family
 
 pytestmark = DRAWN_EVALUATIONS
 
@@ -60,7 +61,7 @@ def other() -> EvaluationResult:
     return changed()
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", DEFAULT_FIGURES)
 def test_a_figure_has_the_same_bytes_each_time(name: str, result: EvaluationResult) -> None:
     first, second = is_sound_svg(figure_of(name)), draw_figure(name, result)
     assert (first.svg, first.data) == (second.svg, second.data)
@@ -68,12 +69,12 @@ def test_a_figure_has_the_same_bytes_each_time(name: str, result: EvaluationResu
         assert is_sound(first).files() == second.files()
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", DEFAULT_FIGURES)
 def test_a_figure_of_two_results_is_sound(name: str) -> None:
     is_sound_svg(drawn_both()[name])
 
 
-@pytest.mark.parametrize("name", FIGURES if is_soak() else ARRANGED)
+@pytest.mark.parametrize("name", DEFAULT_FIGURES if is_soak() else ARRANGED)
 def test_a_figure_of_two_results_is_the_same_drawing_each_time(
     name: str, result: EvaluationResult, other: EvaluationResult
 ) -> None:
@@ -119,9 +120,9 @@ def test_the_files_of_a_figure_are_its_pictures_and_its_data(result: EvaluationR
 
 
 def test_all_figures_of_a_result_are_drawn_but_those_it_has_no_trials_or_records_for() -> None:
-    assert list(drawn_both()) == list(FIGURES)
+    assert list(drawn_both()) == list(DEFAULT_FIGURES)
     circles = synthetic_result(SMALL.replace(families=("circle",)), clips=3, frames=100)
-    assert set(FIGURES) - set(draw_figures(circles)) == {"scenario-switching"}
+    assert set(FIGURES) - set(draw_figures(circles)) == {"scenario-switching", "scenario-course"}
     assert set(FIGURES) - set(draw_figures(replace(circles, records=()))) == set(ONE_TRIAL)
 
 
@@ -367,6 +368,18 @@ def test_the_use_of_frames_averages_their_popularity(result: EvaluationResult) -
     assert np.dot([row["ticks_per_frame"] for row in mine], sizes) == pytest.approx(most.ticks)
 
 
+@pytest.mark.parametrize("family", ["stopping", "corners", "eights", "strafing"])
+def test_each_course_is_drawn_with_its_sections_and_described(family: Family) -> None:
+    made = synthetic_result(SMALL.replace(families=(family,), duration_s=12.0), clips=3, frames=100)
+    figures = draw_figures(made)
+    drawn = is_sound_svg(figures["scenario-course"])
+    assert demand(judge(made).ranked[0].outcome.trial) in drawn.caption
+    sections = rows_of(drawn, "sections")
+    assert len(sections) == (2 if family == "strafing" else 1 + int(np.ceil(12.0 / (sections[1]["stop_s"] - 3.0))))
+    assert ("offsets" in figures) == (family in ("stopping", "eights"))
+    assert not {"scenario-circle", "scenario-switching", "errors"} & set(figures)
+
+
 # What is asked for
 
 
@@ -428,7 +441,7 @@ def standing() -> EvaluationResult:
 
 def test_of_a_clip_that_stands_rounding_is_not_shown_as_motion() -> None:
     still = standing()
-    figures = {name: draw_figure(name, still) for name in FIGURES if name not in USE_FIGURES or is_soak()}
+    figures = {name: draw_figure(name, still) for name in DEFAULT_FIGURES if name not in USE_FIGURES or is_soak()}
     assert "0 % of the time backward, 0 % mainly sideways." in figures["directions"].caption
     assert "840 windows from 1 clip, all" in figures["points"].caption
     for figure in figures.values():

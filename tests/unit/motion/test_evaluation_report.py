@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tests.support.compared_evaluations import compare_results
 from tests.support.drawn_evaluations import (
+    DEFAULT_FIGURES,
     DRAWN_EVALUATIONS,
     NAMING,
     changed,
@@ -40,7 +41,7 @@ from marey_reports.drawing.markup import element, text
 from marey_reports.drawing.words import duration
 from marey_reports.evaluation import page as pages
 from marey_reports.evaluation.definitions import METRICS, definitions
-from marey_reports.evaluation.figures import FIGURES, draw_figure
+from marey_reports.evaluation.figures import draw_figure
 from marey_reports.evaluation.page import compared, render_comparison, render_report
 from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_reports.evaluation.words import find_holes
@@ -58,7 +59,7 @@ def result() -> EvaluationResult:
 
 @pytest.fixture(scope="module")
 def figures() -> dict[str, DrawnFigure]:
-    return {name: figure_of(name) for name in FIGURES}
+    return {name: figure_of(name) for name in DEFAULT_FIGURES}
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def page(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> Page:
 
 
 def test_a_report_is_one_sound_file_that_shows_every_figure(page: Page, figures: dict[str, DrawnFigure]) -> None:
-    assert page.tags["svg"] == page.tags["figcaption"] == len(FIGURES)
+    assert page.tags["svg"] == page.tags["figcaption"] == len(DEFAULT_FIGURES)
     assert page.tags["h1"] == 1
     assert page.text.count("Data to record next") == 2  # the link and the heading
     for figure in figures.values():
@@ -211,7 +212,7 @@ def test_a_real_evaluation_is_reported() -> None:
     real = evaluate(database, options, threads=1, with_baseline=False)
     page = is_sound(render_report(real, title="Real"))
 
-    assert page.tags["figure"] == len(FIGURES)
+    assert page.tags["figure"] == len(DEFAULT_FIGURES)
     assert verdict(real) in page.text
     assert "turns of 50 degrees a second at 1.25 to 2 m/s" in page.text
 
@@ -379,7 +380,7 @@ def test_a_comparison_shows_what_came_went_and_changed(result: EvaluationResult)
     after = changed()
     page = is_sound(render_comparison(result, after, title="Change", labels=("old", "new"), figures=drawn_both()))
 
-    assert page.tags["figure"] == len(FIGURES)
+    assert page.tags["figure"] == len(DEFAULT_FIGURES)
     assert "Added clips (1) newcomer" in page.text
     assert "Removed clips (3)" in page.text
     assert f"{present(after.suite['offset_mean']) - present(result.suite['offset_mean']):+.2f}" in page.text

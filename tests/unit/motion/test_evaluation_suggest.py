@@ -26,6 +26,7 @@ from marey_motion.evaluation.improvement.filling import FilledCell, Filling
 from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means
 from marey_motion.evaluation.improvement.reasons import why_filling, why_redundant
 from marey_motion.evaluation.improvement.redundancy import Removal
+from marey_motion.evaluation.improvement.repeating import repeated
 from marey_motion.evaluation.improvement.selection import joined, without_rows, without_sources
 from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree, suggestions_to_tree
@@ -169,8 +170,10 @@ def test_reasons_name_the_clip_and_what_it_does(found: Suggestions) -> None:
 def effect(*changes_m: float) -> Effect:
     """Return an effect whose changes of the mean distance from the path, by replicate, are given."""
     before, after = np.ones((1, len(changes_m))), 1.0 + np.array([changes_m])
-    changes = {name: paired_change(name, before, after) for name in HEADLINES}
-    return Effect(paired_change(OBJECTIVE, before, after), changes)
+    found = {
+        name: repeated(paired_change(name, before, after), before, after - before) for name in (OBJECTIVE, *HEADLINES)
+    }
+    return Effect(found.pop(OBJECTIVE), found)
 
 
 SURE = effect(-0.0021, -0.0024, -0.0027, -0.0024)
@@ -179,14 +182,20 @@ SURE = effect(-0.0021, -0.0024, -0.0027, -0.0024)
 @pytest.mark.parametrize(
     ("confirmed", "said"),
     [
-        (effect(0.0, 0.0, 0.0), "the mean distance from the path stays the same."),
+        (
+            effect(0.0, 0.0, 0.0),
+            "the mean distance from the path stays the same (another such measurement: +0.00 to +0.00 cm, in 95 of "
+            "100 cases).",
+        ),
         (
             SURE,
-            "the mean distance from the path decreases by 0.24 cm (95 % interval of the change -0.28 to -0.20 cm).",
+            "the mean distance from the path decreases by 0.24 cm (another such measurement: -0.30 to -0.18 cm, in "
+            "95 of 100 cases).",
         ),
         (
             effect(0.01, -0.01, 0.02, -0.02),
-            "no effect on the mean distance from the path was found (95 % interval of the change -2.91 to +2.91 cm).",
+            "no effect on the mean distance from the path was found (another such measurement: -4.11 to +4.11 cm, "
+            "in 95 of 100 cases).",
         ),
         (
             None,

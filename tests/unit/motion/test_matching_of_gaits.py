@@ -6,6 +6,7 @@ was generated. It moves on slightly smaller circles, at a slightly lower speed. 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ LEAN_M = 0.04
 """Greatest distance in metres between the torso and the curve of the feet, towards the inside."""
 
 
-def circle(speed: float, turn_rate_deg: float, **options: float) -> Trial:
+def circle(speed: float, turn_rate_deg: float, **options: Any) -> Trial:
     return Trial("circle", speed, float(np.radians(turn_rate_deg)), **options)
 
 
@@ -99,6 +100,7 @@ def test_a_clip_asked_to_do_what_it_does_is_played_through(speed: float, turn_ra
         headings=database.root_headings,
         speeds_m_s=60 * steps,
         turn_rates_rad_s=60 * np.diff(database.root_headings, append=database.root_headings[-1]),
+        directions=database.root_headings,
     )
 
     record = play(database, own, EXACT.replace(follow=follow))

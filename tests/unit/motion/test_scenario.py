@@ -1,5 +1,7 @@
 """Trials of an evaluation: the requested paths, in closed form."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from marey_schemas.options.evaluation import EvaluationOptions
 RATE_HZ = 60.0
 
 
-def circle(speed: float, turn_rate_deg: float, **options: float) -> Trial:
+def circle(speed: float, turn_rate_deg: float, **options: Any) -> Trial:
     return Trial("circle", speed, float(np.radians(turn_rate_deg)), **options)
 
 

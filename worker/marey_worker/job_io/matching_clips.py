@@ -15,9 +15,10 @@ from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
+from marey_motion.matching.copies import index_of
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.normaliser import Normaliser
-from marey_motion.matching.search import SearchIndex, build_index
+from marey_motion.matching.search import SearchIndex
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import canonical_json, document_digest
@@ -44,8 +45,7 @@ class MatchingClips:
     @cached_property
     def index(self) -> SearchIndex:
         """The search index of the database's normalised features, built at the first use."""
-        database = self.database
-        return build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+        return index_of(self.database)
 
 
 _cache: LruCache[bytes, MatchingClips] = LruCache(max_entries=MOST_KEPT)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+from marey_motion.evaluation.held_out import take_trials
 from marey_motion.evaluation.judgement import judge
 from marey_motion.evaluation.perceived import PerceivedRows
 from marey_motion.evaluation.relevance import recorded_rows, sum_by_source
@@ -15,6 +16,7 @@ from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
 from marey_motion.evaluation.scenario import Trial, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
+from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
 from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
 from marey_reports.evaluation.page import render_report
@@ -39,8 +41,8 @@ Headline = dict[str, float | int | None]
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
     """Simulate the trials of this task and their replicates; the result refers to the file with their records."""
     options = EvaluationOptions.of(params)
-    trials = _trials(params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
+    trials = _trials(params, options, clips.database)[context.task.position :: context.task.size]
     runs = len(trials) * options.replicates
     started = time.monotonic()
     with refusing_motion_errors():
@@ -60,7 +62,8 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
             threads=context.threads,
             progress=lambda done, _total, note: context.progress(len(trials) + done, runs, note),
         )
-    found = {"records": records_to_tree(trials, records)}
+    # If there are fewer takes than asked for, a task can be without trials.
+    found = {"records": records_to_tree(trials, records)} if trials else {}
     if replicates is not None:
         found["replicates"] = replicates.as_tree()
     file = context.scratch / "trials.msgpack"
@@ -77,11 +80,11 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     options = EvaluationOptions.of(params)
     context.progress(0, GATHERING_STEPS, "reading the records of the trials")
     database = read_clips(context, params, options.database).database
-    trials = _trials(params, options)
+    trials = _trials(params, options, database)
     records, replicates = _read_trials(context, results, trials)
     with refusing_motion_errors():
         baseline = None
-        if params.baseline:
+        if params.baseline and suite_trials(options):
             context.progress(1, GATHERING_STEPS, "measuring generated clips")
             baseline = evaluate_baseline(options, threads=context.threads)
         context.progress(2, GATHERING_STEPS, "measuring the trials")
@@ -110,13 +113,13 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     return {"verdict": evaluation["verdict"], **headline, **perceived, "simulating_s": simulating_s}
 
 
-def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:
-    """Return all trials of the evaluation.
+def _trials(params: EvaluateParams, options: EvaluationOptions, database: MatchingDatabase) -> tuple[Trial, ...]:
+    """Return all trials of the evaluation; those along takes depend on the clips.
 
     Raises `JobRefused` if a figure is requested for a trial that the evaluation does not have.
     """
     with refusing_motion_errors():
-        trials = suite_trials(options)
+        trials = (*suite_trials(options), *take_trials(database, options))
     if unknown := set(params.trial_figures) - {trial.name for trial in trials}:
         named = f"{min(unknown)!r}; a name is like {trials[0].name!r}"
         raise JobRefused("unknown-trial", f"trial_figures: the evaluation has no trial {named}")
@@ -128,7 +131,7 @@ def _read_trials(
 ) -> tuple[list[TrialRecord], MeasuredReplicates | None]:
     """Read the results of the tasks: the record of each trial, and those of its further replicates, if any."""
     found = [decode_tree(context.blob(result["measured"]["blob"]), MSGPACK) for result in results]
-    known = {name: record for one in found for name, record in records_from_tree(one["records"]).items()}
+    known = {name: record for one in found if one for name, record in records_from_tree(one["records"]).items()}
     trees = [one["replicates"] for one in found if "replicates" in one]
     return [known[trial.name] for trial in trials], MeasuredReplicates.from_trees(trees, trials)
 

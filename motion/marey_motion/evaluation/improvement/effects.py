@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from marey_motion.arrays import Floats
 from marey_motion.evaluation.compare import OBJECTIVE, MetricChange, corrected_family, paired_change
-from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, objective_value
+from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, metric_weights, objective_value
+from marey_motion.evaluation.improvement.repeating import repeated
 from marey_motion.evaluation.improvement.resimulation import Resimulation, Sources
 from marey_motion.evaluation.result import TrialResult
 from marey_schemas.options.evaluation import EvaluationOptions
@@ -31,6 +33,8 @@ class Effect:
     objective : change of the objective, metres; without its term for the amount of data, unless the effect was computed
         with amounts of data
     headlines : change of each headline metric, by name, in its unit
+
+    Changes that were computed from trials are `RepeatedChange`, with an interval for repetitions.
     """
 
     objective: MetricChange
@@ -96,11 +100,29 @@ def effect_between(
         np.array([[objective_value(objective, one, seconds) for one in side]])
         for side, seconds in zip((before, after), data_s, strict=True)
     ]
+    addends = {name: tuple(_addends(side, name) for side in (before, after)) for name in HEADLINES}
     headlines = {}
-    for name in HEADLINES:
+    for name, (old, new) in addends.items():
         first, second = (np.array([[one[name] for one in side]]) for side in means)
-        headlines[name] = paired_change(name, first, second)
-    return Effect(paired_change(OBJECTIVE, values[0], values[1]), headlines)
+        headlines[name] = repeated(paired_change(name, first, second), old, new - old)
+    weights = metric_weights(objective)
+    old, new = (
+        sum((weight * addends[name][side] for name, weight in weights.items()), np.zeros(())) for side in (0, 1)
+    )
+    return Effect(repeated(paired_change(OBJECTIVE, values[0], values[1]), old, new - old), headlines)
+
+
+def _addends(results: Replicates, name: str) -> Floats:
+    """Return what each of T trials adds to the mean of a headline metric in each of R replicates, (T, R).
+
+    A trial in which the metric is not defined adds 0.
+    """
+    found = np.array(
+        [[np.nan if (value := one.metrics.get(name)) is None else value for one in own] for own in results]
+    )
+    known = np.isfinite(found)
+    shares = np.where(known, found, 0.0) / np.maximum(known.sum(axis=1, keepdims=True), 1)
+    return np.ascontiguousarray(shares.T)
 
 
 def effect_of(

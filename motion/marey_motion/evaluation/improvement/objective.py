@@ -27,13 +27,26 @@ def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], s
     float    metres: sum of the mean offset, speed error, turn rate error, pose cost and seconds, each times its weight
     """
     means = headline_means(results)
-    return (
-        weights.offset * means["offset_mean"]
-        + weights.abs_se_v * means["abs_se_v"]
-        + weights.abs_se_omega_deg * means["abs_se_omega_deg"]
-        + weights.pose_cost * means["pose_cost_mean"]
-        + weights.seconds * seconds
-    )
+    return sum(weight * means[name] for name, weight in metric_weights(weights).items()) + weights.seconds * seconds
+
+
+def metric_weights(weights: ObjectiveOptions) -> dict[str, float]:
+    """Return the weight of each headline metric that is part of the objective.
+
+    Parameters
+    ----------
+    weights : ObjectiveOptions    weights of the terms
+
+    Returns
+    -------
+    dict of str to float    metres per unit of the metric, by metric
+    """
+    return {
+        "offset_mean": weights.offset,
+        "abs_se_v": weights.abs_se_v,
+        "abs_se_omega_deg": weights.abs_se_omega_deg,
+        "pose_cost_mean": weights.pose_cost,
+    }
 
 
 def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:

@@ -7,6 +7,7 @@ from marey_motion.evaluation.improvement.duplicates import NearDuplicate
 from marey_motion.evaluation.improvement.effects import Effect
 from marey_motion.evaluation.improvement.filling import Addition, FilledCell, Filling
 from marey_motion.evaluation.improvement.redundancy import Removal
+from marey_motion.evaluation.improvement.repeating import RepeatedChange
 from marey_motion.evaluation.improvement.unused import UnusedClip, UnusedRange
 
 
@@ -98,7 +99,7 @@ def distance_in_words(effect: Effect) -> str:
     """
     change = effect.headlines["offset_mean"]
     if change.verdict == "same":
-        return "the mean distance from the path stays the same"
+        return f"the mean distance from the path stays the same{_interval(change)}"
     if change.verdict == "unclear":
         return f"no effect on the mean distance from the path was found{_interval(change)}"
     direction = "increases" if change.change > 0.0 else "decreases"
@@ -106,9 +107,11 @@ def distance_in_words(effect: Effect) -> str:
 
 
 def _interval(change: MetricChange) -> str:
-    if change.low is None or change.high is None:
+    """State in which interval the change lies if the same measurement is made again with another seed."""
+    if not isinstance(change, RepeatedChange) or change.again_low is None or change.again_high is None:
         return ""
-    return f" (95 % interval of the change {100 * change.low:+.2f} to {100 * change.high:+.2f} cm)"
+    low, high = 100 * change.again_low, 100 * change.again_high
+    return f" (another such measurement: {low:+.2f} to {high:+.2f} cm, in 95 of 100 cases)"
 
 
 def why_duplicate(source: str, pair: NearDuplicate, most_perceived: float | None = None) -> str:

@@ -26,12 +26,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.evaluation.held_out import index_for
 from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.replicates import TrialReplicate, guide_for, measure_run, run_of, simulate
 from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.running import CancelCallback, ProgressCallback, run_each
 from marey_motion.evaluation.scenario import Trial, require_names, suite_trials
+from marey_motion.matching.copies import index_of, searchable
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.display import switched_rows
 from marey_motion.matching.record import TrialRecord
@@ -87,7 +89,7 @@ class Resimulation:
         self._threads, self._cancelled = threads or os.cpu_count() or 1, cancelled or (lambda: False)
         self._progress = progress or (lambda _done, _total, _note: None)
         self._source_of_clip = np.array([source_of(clip) for clip in database.clips], dtype=object)
-        self.index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+        self.index = index_of(database)
         self._looks = LooksMeter(database, options.controller)
         drawn = options if seed is None else options.replace(seed=seed)
         self._runs = [run_of(trial, number, drawn) for number in replicates for trial in self.trials]
@@ -244,9 +246,9 @@ class Resimulation:
     def _index_without(self, gone: Sources) -> SearchIndex:
         if not gone:
             return self.index
-        selectable = self.database.selectable & ~rows_of_sources(self.database.clips, gone)
+        rows = searchable(self.database, rows_of_sources(self.database.clips, gone))
         method: Method = "boxes" if self.index.boxed else "scan"
-        return build_index(self.index.rows, self.database.starts, selectable, method=method)
+        return build_index(self.index.rows, self.database.starts, rows, method=method)
 
     def _outcome(self, index: SearchIndex, run: TrialReplicate, record: TrialRecord) -> Outcome:
         rows = needed_rows(self.database, index, run.driven, record, self.options)
@@ -281,6 +283,7 @@ def needed_rows(
     # What the last search chose is not displayed any more when it was made at the last tick.
     if not np.isnan(record.match_cost[-1]):
         asked, last = guide_for(trial, database), len(record.rows) - 1
-        reason = explain_choice(database, index, asked, options.controller, record, last, count=1)
+        own = index_for(database, index, trial)
+        reason = explain_choice(database, own, asked, options.controller, record, last, count=1)
         rows.append(np.array([reason.chosen]))
     return np.unique(np.concatenate(rows))

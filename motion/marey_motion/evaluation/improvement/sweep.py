@@ -12,6 +12,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import OBJECTIVE, MetricChange, corrected_family, paired_change
 from marey_motion.evaluation.improvement.effects import confirmation_replicates, estimation_replicates
 from marey_motion.evaluation.improvement.objective import headline_means, objective_value
+from marey_motion.evaluation.improvement.repeating import RepeatedChange, repeated
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.metrics import pooled_metrics
 from marey_motion.evaluation.result import Metrics
@@ -221,7 +222,9 @@ def group_influences(rows: Sequence[SweepRow]) -> tuple[Influence, ...]:
     return tuple(sorted(found, key=lambda influence: (-influence.spread, influence.group)))
 
 
-def _confirmed(first: SweepRow, best: SweepRow) -> MetricChange | None:
+def _confirmed(first: SweepRow, best: SweepRow) -> RepeatedChange | None:
     if best is first or not best.confirming:
         return None
-    return paired_change(OBJECTIVE, np.array([first.confirming]), np.array([best.confirming]))
+    # The objective is known for the whole suite only, which counts as one trial; new weights change each replicate.
+    before, after = np.array([first.confirming]), np.array([best.confirming])
+    return repeated(paired_change(OBJECTIVE, before, after), before, after - before)

@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from marey_motion.evaluation.improvement.resimulation import needed_rows
 from marey_motion.evaluation.improvement.selection import clips_by_source
 from marey_motion.evaluation.scenario import Trial
+from marey_motion.matching.copies import index_of
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
-from marey_motion.matching.search import SearchIndex, build_index
+from marey_motion.matching.search import SearchIndex
 from marey_motion.matching.simulation_root import DIRECTION_WINDOW_S
 from marey_schemas.options.evaluation import EvaluationOptions
 
@@ -151,7 +152,7 @@ def _needed(
     index: SearchIndex | None,
 ) -> NDArray[np.bool_]:
     if index is None:
-        index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+        index = index_of(database)
     needed = np.zeros(database.row_count, dtype=np.bool_)
     for trial, record in zip(trials, records, strict=True):
         needed[needed_rows(database, index, trial, record, options)] = True

@@ -6,7 +6,7 @@ matplotlib is loaded when the first figure is drawn. The same result gives the s
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.result import EvaluationResult
@@ -18,8 +18,8 @@ from marey_reports.evaluation.figures.density import draw_density, draw_directio
 from marey_reports.evaluation.figures.errors import draw_errors
 from marey_reports.evaluation.figures.frame_use import draw_frame_use
 from marey_reports.evaluation.figures.holes import draw_holes
-from marey_reports.evaluation.figures.offsets import draw_offsets
-from marey_reports.evaluation.figures.scenarios import draw_circle, draw_switching
+from marey_reports.evaluation.figures.offsets import FAMILY_TITLES, draw_offsets
+from marey_reports.evaluation.figures.scenarios import COURSES, draw_circle, draw_course, draw_switching
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 from marey_reports.evaluation.figures.transition_costs import draw_transition_costs
 from marey_schemas.options.evaluation import Family
@@ -55,17 +55,21 @@ class FigureKind(NamedTuple):
     title: str
     trials: str
     draw: Callable[[Sequence[Subject], str | None, FigureOptions], Sketch]
-    families: tuple[Family, ...] = ("circle", "switching")
+    families: tuple[Family, ...] = get_args(Family)
 
+
+PUBLISHED: tuple[Family, ...] = ("circle", "switching")
+"""Families of the paper."""
 
 FIGURES = {
     "points": FigureKind("1", "Speeds and turn rates of every clip", "none", draw_points),
     "scenario-circle": FigureKind("4a", "A trial at constant speed", "one", draw_circle, ("circle",)),
     "scenario-switching": FigureKind("4b", "A trial whose speed switches", "one", draw_switching, ("switching",)),
-    "offsets": FigureKind("5", "Distance from the path", "none", draw_offsets),
+    "scenario-course": FigureKind("", "A trial with stops, corners or other courses", "one", draw_course, COURSES),
+    "offsets": FigureKind("5", "Distance from the path", "none", draw_offsets, tuple(FAMILY_TITLES)),
     "density": FigureKind("6", "Density of the data", "none", draw_density),
-    "transition-cost": FigureKind("7", "Cost of transitions over a trial", "one", draw_transition_costs),
-    "errors": FigureKind("8", "Errors of speed and turn rate", "one", draw_errors),
+    "transition-cost": FigureKind("7", "Cost of transitions over a trial", "one", draw_transition_costs, PUBLISHED),
+    "errors": FigureKind("8", "Errors of speed and turn rate", "one", draw_errors, PUBLISHED),
     "usage": FigureKind("9", "Usage of the clips", "any", draw_usage),
     "clip-graph": FigureKind("10", "Frames and transitions", "any", draw_clip_graph),
     "directions": FigureKind("", "Forward, backward and sideways", "none", draw_directions),
@@ -75,7 +79,7 @@ FIGURES = {
 """Every figure by its name."""
 
 COVERAGE_FIGURES = ("density", "points", "holes", "directions")
-SCENARIO_FIGURES = ("scenario-circle", "scenario-switching")
+SCENARIO_FIGURES = ("scenario-circle", "scenario-switching", "scenario-course")
 TRIAL_FIGURES = ("transition-cost", "errors")
 USE_FIGURES = ("usage", "frame-use", "clip-graph")
 """Names of the figures of each chapter, in reports of one or two evaluations."""
@@ -132,11 +136,13 @@ def draw_figures(
     results = [result] if other is None else [result, other]
     names = set.intersection(*({each.trial.name for each in one.trials} for one in results))
     families = {each.trial.family for each in result.trials if each.trial.name in names}
+    asked = set(result.options.families)
     with_records = all(one.records for one in results)
     return {
         name: draw_figure(name, result, other=other, labels=labels, options=options)
         for name, kind in FIGURES.items()
-        if kind.trials != "one" or (with_records and families.intersection(kind.families))
+        if (families if kind.trials == "one" else asked).intersection(kind.families)
+        if kind.trials != "one" or with_records
     }
 
 
@@ -153,4 +159,5 @@ def draw_shared_figures(results: Sequence[EvaluationResult], labels: Sequence[st
         name: DrawnFigure(kind.draw(subjects, None, FigureOptions()), name, kind.number, kind.title)
         for name in SHARED_FIGURES
         for kind in (FIGURES[name],)
+        if set(kind.families).intersection(results[0].options.families)
     }

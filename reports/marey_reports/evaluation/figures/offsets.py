@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from marey_motion.arrays import Floats
+from marey_motion.errors import MotionError
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
     CHANGE,
@@ -25,13 +26,20 @@ from marey_reports.drawing.paper import (
 )
 from marey_reports.evaluation.figures.axes import COLUMNS, SPEED, TURN_RATE
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
+from marey_schemas.options.evaluation import Family
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-FAMILY_TITLES = {"circle": "Constant speed", "switching": "Switching speed"}
+FAMILY_TITLES: dict[Family, str] = {
+    "circle": "Constant speed",
+    "switching": "Switching speed",
+    "stopping": "Stops",
+    "eights": "Figures of eight",
+}
+"""Titles of the families whose trials are a grid of speeds and turn rates."""
 
 
 class _Field(NamedTuple):
@@ -48,6 +56,9 @@ def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: Figu
     More than two subjects share one scale, up to `COLUMNS` side by side.
     """
     families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
+    if not families:
+        wanted = ", ".join(FAMILY_TITLES)
+        raise MotionError(f"the figure needs trials on a grid of speeds and turn rates: {wanted}", code="unknown-trial")
     fields = [[_field(subject, family) for subject in subjects] for family in families]
     levels = nice_levels(max(_largest(field) for row in fields for field in row))
     if len(subjects) == 1:
@@ -59,7 +70,7 @@ def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: Figu
     return Sketch(figure, {"offsets": _table(subjects, families, fields)}, _caption(subjects, families, fields))
 
 
-def _field(subject: Subject, family: str) -> _Field:
+def _field(subject: Subject, family: Family) -> _Field:
     trials = [each for each in subject.result.trials if each.trial.family == family]
     speeds = np.unique([each.trial.speed_m_s for each in trials])
     turn_rates = np.unique([np.round(np.degrees(each.trial.turn_rate_rad_s), 9) for each in trials])
@@ -77,7 +88,7 @@ def _largest(field: _Field) -> float:
     return float(np.abs(np.nan_to_num(field.offset_m)).max(initial=0.0))
 
 
-def _draw_one(families: Sequence[str], fields: Sequence[_Field], levels: Floats) -> Figure:
+def _draw_one(families: Sequence[Family], fields: Sequence[_Field], levels: Floats) -> Figure:
     width, height = 3.75, 3.3
     figure = new_figure(0.7 + len(families) * (width + 0.35) + 0.75, height + 1.05)
     drawn = None
@@ -92,7 +103,7 @@ def _draw_one(families: Sequence[str], fields: Sequence[_Field], levels: Floats)
 
 
 def _draw_two(
-    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], levels: Floats
+    subjects: Sequence[Subject], families: Sequence[Family], fields: Sequence[Sequence[_Field]], levels: Floats
 ) -> Figure:
     width, height, gap = 2.54, 2.3, 0.42
     figure = new_figure(9.6, len(families) * (height + 0.85) + 0.95)
@@ -127,7 +138,7 @@ def _draw_two(
 
 
 def _draw_many(
-    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], levels: Floats
+    subjects: Sequence[Subject], families: Sequence[Family], fields: Sequence[Sequence[_Field]], levels: Floats
 ) -> Figure:
     """Draw small multiples in rows of up to `COLUMNS` subjects; each row shows one family of trials."""
     width, height, gap, beneath = 1.96, 1.8, 0.26, 0.85
@@ -220,7 +231,7 @@ def _mark_extreme(panel: Axes, field: _Field, signed: bool) -> None:
 
 
 def _table(
-    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]]
+    subjects: Sequence[Subject], families: Sequence[Family], fields: Sequence[Sequence[_Field]]
 ) -> dict[str, list[object]]:
     names = ("dataset", "family", "speed_m_s", "turn_rate_deg_s", "offset_mean_m")
     table: dict[str, list[object]] = {name: [] for name in names}
@@ -235,7 +246,7 @@ def _table(
     return table
 
 
-def _caption(subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]]) -> str:
+def _caption(subjects: Sequence[Subject], families: Sequence[Family], fields: Sequence[Sequence[_Field]]) -> str:
     parts = []
     for family, row in zip(families, fields, strict=True):
         for subject, field in zip(subjects, row, strict=True):

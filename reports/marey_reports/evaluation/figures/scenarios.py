@@ -1,4 +1,7 @@
-"""Figures 4a and 4b: a trial seen from above with numbered sections, and the path of the character."""
+"""Figures 4a and 4b: a trial seen from above with numbered sections, and the path of the character.
+
+Trials of families that the paper does not have are drawn in the same way.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marey_motion.arrays import Floats
-from marey_motion.evaluation.scenario import Reference, Trial, reference
+from marey_motion.evaluation.scenario import Reference, Trial, demand, reference
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import COLOURS, INK, PAPER, REFERENCE, SMALL, Place, add_keys, add_panel, new_figure
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, choose_trial, find_record
@@ -18,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+COURSES: tuple[Family, ...] = ("corners", "stopping", "eights", "strafing", "takes")
+"""Families that `draw_course` draws."""
 SIDE, GAP = 3.9, 0.75
 # Where within a section its number may stand, the middle first.
 NUMBER_PLACES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
@@ -33,8 +38,13 @@ def draw_switching(subjects: Sequence[Subject], trial: str | None, _options: Fig
     return _draw(subjects, trial, "switching")
 
 
-def _draw(subjects: Sequence[Subject], name: str | None, family: Family) -> Sketch:
-    trial = choose_trial(subjects, name, (family,))
+def draw_course(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
+    """Draw a trial with stops, corners, a figure of eight, motion sideways or backwards, or the path of a take."""
+    return _draw(subjects, trial, *COURSES)
+
+
+def _draw(subjects: Sequence[Subject], name: str | None, *families: Family) -> Sketch:
+    trial = choose_trial(subjects, name, families)
     guide = reference(trial, look_ahead_s=0.0)
     sections = _sections(trial, guide.tick_count, guide.rate_hz)
     followed = [_followed(subject, trial) for subject in subjects]
@@ -65,11 +75,11 @@ def _sections(trial: Trial, ticks: int, rate_hz: float) -> list[tuple[int, int, 
     """Return the first tick, the end tick and the speed of each section; the first section is the approach."""
     bounds = [0.0, trial.approach_s]
     end_s = ticks / rate_hz
-    if trial.family == "switching":
-        bounds += list(np.arange(trial.approach_s + trial.switch_every_s, end_s - 1e-9, trial.switch_every_s))
+    if (every_s := trial.changes_every_s) is not None:
+        bounds += list(np.arange(trial.approach_s + every_s, end_s - 1e-9, every_s))
     edges = [*(round(bound * rate_hz) for bound in bounds), ticks]
     speeds = [
-        trial.switch_speed_m_s if trial.family == "switching" and number >= 2 and number % 2 == 0 else trial.speed_m_s
+        trial.switch_speed_m_s if trial.changes_speed and number >= 2 and number % 2 == 0 else trial.speed_m_s
         for number in range(len(bounds))
     ]
     return [
@@ -125,8 +135,15 @@ def _section_table(trial: Trial, sections: Sequence[tuple[int, int, float]], rat
         "start_s": [start / rate_hz for start, _, _ in sections],
         "stop_s": [stop / rate_hz for _, stop, _ in sections],
         "speed_m_s": [speed for _, _, speed in sections],
-        "turn_rate_deg_s": [0.0 if number == 0 else turn_rate for number in range(len(sections))],
+        "turn_rate_deg_s": [_turn_rate(trial, number, turn_rate) for number in range(len(sections))],
     }
+
+
+def _turn_rate(trial: Trial, number: int, turn_rate: float) -> float:
+    """Return the turn rate of a section; section 0 is the approach."""
+    if number == 0 or (trial.family == "stopping" and number % 2 == 0):
+        return 0.0
+    return -turn_rate if trial.family == "eights" and number % 2 == 0 else turn_rate
 
 
 def _paths(guide: Reference, subjects: Sequence[Subject], followed: Sequence[Floats | None]) -> dict[str, object]:
@@ -142,6 +159,11 @@ def _paths(guide: Reference, subjects: Sequence[Subject], followed: Sequence[Flo
 
 
 def _caption(trial: Trial, sections: Sequence[tuple[int, int, float]], rate_hz: float) -> str:
+    if trial.family in COURSES:
+        return (
+            f"Desired path from above, from the dot on: {sections[0][1] / rate_hz:g} s straight at "
+            f"{trial.speed_m_s:.4g} m/s (1), then a {demand(trial)}."
+        )
     turn = np.degrees(trial.turn_rate_rad_s)
     straight = sections[0][1] / rate_hz
     text = f"Desired path from above, from the dot on: {straight:g} s straight at {trial.speed_m_s:g} m/s (1), "

@@ -1,0 +1,131 @@
+"""Trials along the paths of real takes: the path of a clip is asked for, and the clip itself is left out of the set.
+
+Such a path can be followed by a person, so what the set cannot follow is missing in the set. Clips that stand are not
+asked for, and long clips only at their beginning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from marey_motion.arrays import Flags, Floats
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.selection import rows_of_sources, source_of
+from marey_motion.evaluation.scenario import KEY_RATE_HZ, LOOK_AHEAD_S, Trial, require_names
+from marey_motion.matching.copies import equal_clips
+from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+from marey_motion.matching.search import SearchIndex, build_index
+from marey_schemas.options.evaluation import EvaluationOptions
+
+LEAST_S = 3.0
+"""Shortest part of a clip that is asked for, in seconds; a second more is needed for the look-ahead."""
+LEAST_PATH_M = 2.0
+"""Shortest path that is asked for, in metres."""
+MOST_NAME = 80
+"""Longest name of a clip in the name of a trial; longer names are replaced by the uid."""
+
+
+def take_trials(database: MatchingDatabase, options: EvaluationOptions) -> tuple[Trial, ...]:
+    """List trials along the paths of clips of a set, in the order of the clips.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the set
+    options : EvaluationOptions    greatest number and duration of these trials
+
+    Returns
+    -------
+    tuple of Trial    at most `most_takes`, evenly distributed over the clips; empty if the options ask for none
+
+    Raises
+    ------
+    MotionError    if no clip has a path that can be asked for, or if the set has no other clip
+    """
+    if "takes" not in options.families:
+        return ()
+    sources = [clip for clip in database.clips if clip.mirrored_from is None]
+    found = [(clip, path) for clip in sources if (path := _path_of(database, clip, options.duration_s)) is not None]
+    if not found or len(np.unique(equal_clips(database))) < 2:
+        raise MotionError(
+            f"no clip has a path to ask for: trials along takes need another clip, at least {LEAST_S + LOOK_AHEAD_S:g} "
+            f"s, and a path of {LEAST_PATH_M:g} m",
+            code="no-takes",
+        )
+    chosen = np.unique(np.linspace(0, len(found) - 1, min(options.most_takes, len(found))).round().astype(int))
+    names = [clip.name for clip, _ in found]
+    trials = tuple(_trial(clip, path, options, names) for clip, path in (found[number] for number in chosen))
+    require_names(trials)
+    return trials
+
+
+def _trial(clip: DatabaseClip, path: Floats, options: EvaluationOptions, names: Sequence[str]) -> Trial:
+    seconds = (len(path) - 1) / KEY_RATE_HZ - LOOK_AHEAD_S
+    length_m = _length_m(path[: round(seconds * KEY_RATE_HZ) + 1])
+    named = names.count(clip.name) == 1 and len(clip.name) <= MOST_NAME
+    return Trial(
+        family="takes",
+        speed_m_s=length_m / seconds,
+        turn_rate_rad_s=0.0,
+        approach_s=options.approach_s,
+        duration_s=seconds,
+        left_out=source_of(clip),
+        label=clip.name if named else clip.uid,
+        path=tuple((x, z, heading) for x, z, heading in path.tolist()),
+    )
+
+
+def _path_of(database: MatchingDatabase, clip: DatabaseClip, longest_s: float) -> Floats | None:
+    """Return the beginning of a clip's path as keys of x, z and heading (K, 3); None if it is too short.
+
+    The path starts at the origin with the heading 0.
+    """
+    rate_hz, rows = database.options.rate_hz, slice(clip.start, clip.stop)
+    seconds = min(longest_s, (clip.frame_count - 1) / rate_hz - LOOK_AHEAD_S)
+    count = int((seconds + LOOK_AHEAD_S) * KEY_RATE_HZ + 1e-9) + 1
+    if seconds < LEAST_S or clip.in_place:
+        return None
+    frames = np.arange(clip.frame_count) / rate_hz
+    keys = np.arange(count) / KEY_RATE_HZ
+    x, z, heading = (
+        np.interp(keys, frames, values) for values in (*database.root_positions[rows].T, database.root_headings[rows])
+    )
+    sine, cosine = np.sin(heading[0]), np.cos(heading[0])
+    x, z = x - x[0], z - z[0]
+    path = np.stack((x * cosine - z * sine, x * sine + z * cosine, heading - heading[0]), axis=1)
+    return path if _length_m(path) >= LEAST_PATH_M else None
+
+
+def _length_m(path: Floats) -> float:
+    return float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())
+
+
+def index_for(database: MatchingDatabase, index: SearchIndex, trial: Trial) -> SearchIndex:
+    """Return the search index of a trial: without the clip whose path it asks for, its mirrored copy, and equal clips.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the set
+    index : SearchIndex    index of the rows that other trials search
+    trial : Trial    the trial
+
+    Returns
+    -------
+    SearchIndex    `index` itself if the trial leaves nothing out
+
+    Raises
+    ------
+    MotionError    if no row is left to choose
+    """
+    if not trial.left_out:
+        return index
+    allowed = index.selectable & ~_rows_of_take(database, trial.left_out)
+    return build_index(index.rows, database.starts, allowed, method="boxes" if index.boxed else "scan")
+
+
+def _rows_of_take(database: MatchingDatabase, source: str) -> Flags:
+    """Mark the rows (N,) of a source clip, of its mirrored copy, and of all clips that equal one of them."""
+    own = rows_of_sources(database.clips, [source])
+    groups = equal_clips(database)
+    return np.isin(groups, groups[own[database.starts[:-1]]])[database.clip_of_row]

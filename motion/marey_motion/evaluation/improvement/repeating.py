@@ -1,0 +1,70 @@
+"""Intervals for repetitions: where the same measurement of an effect lies if it is repeated with another seed.
+
+The confidence interval of a mean is not enough for two reasons. A repetition varies by chance as well, so the
+difference of two measurements has twice the variance of one. And a removed clip changes few runs, each of them by a
+jump, because motion matching then follows another sequence of frames. The values of eight replicates are then mostly 0,
+and their standard deviation is too small whenever the sample contains fewer jumps than the repetition will.
+
+So the variance is computed from single runs, within each trial, because the runs of different trials are independent.
+If not all runs changed, one changed run more is counted than was observed. Its jump is as large as those observed, but
+at least as large as the difference of two replicates of one trial, since a run that continues in another sequence of
+frames is like another replicate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from marey_motion.arrays import Floats
+from marey_motion.evaluation.compare import MetricChange
+from marey_schemas.documents.replicates import LEAST_REPLICATES, student_quantile
+
+
+@dataclass(frozen=True)
+class RepeatedChange(MetricChange):
+    """Change of one metric, with the interval in which a repetition of the measurement will lie.
+
+    Parameters
+    ----------
+    again_low, again_high : bounds between which the change lies in 95 of 100 repetitions with another seed and as many
+        replicates; None if there are too few replicates
+    """
+
+    again_low: float | None = None
+    again_high: float | None = None
+
+
+def repeated(change: MetricChange, before: Floats, differences: Floats) -> RepeatedChange:
+    """Add the interval for repetitions to a change.
+
+    Parameters
+    ----------
+    change : MetricChange    the change, in the unit of its metric
+    before : (T, R) float64    addend of each of T trials to the metric of the unchanged suite in each of R replicates
+    differences : (T, R) float64    addend of each trial to the change in each replicate, in the same unit
+
+    Returns
+    -------
+    RepeatedChange    with the interval; without it if there are fewer than `LEAST_REPLICATES` replicates
+
+    Notes
+    -----
+    Let s_t² be the variance of the differences of trial t, u the share of the runs that did not change, and j² the
+    larger of two squares: the mean square of the differences that are not 0, and twice the mean variance of `before`
+    within a trial. A measurement has the variance v = (Σ s_t² + u j² / R) / R, in which u j² stands for one more run.
+    The difference of two measurements has the variance 2 v. The interval is ± t √(2 v), where t is the 97.5th
+    percentile of Student's distribution with R - 1 degrees of freedom.
+    """
+    low = high = None
+    if (count := differences.shape[1]) >= LEAST_REPLICATES:
+        changed = differences[differences != 0.0]
+        jump = max(
+            float(np.mean(changed**2)) if len(changed) else 0.0, 2.0 * float(np.var(before, axis=1, ddof=1).mean())
+        )
+        unchanged = 1.0 - len(changed) / differences.size
+        variance = (float(np.var(differences, axis=1, ddof=1).sum()) + unchanged * jump / count) / count
+        half = student_quantile(count - 1) * float(np.sqrt(2.0 * variance))
+        low, high = change.change - half, change.change + half
+    return RepeatedChange(**vars(change), again_low=low, again_high=high)

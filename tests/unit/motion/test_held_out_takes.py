@@ -1,0 +1,100 @@
+"""The paths of real takes as trials, each without the take itself."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.support.suggestion_cases import OPTIONS, named, places
+from tests.support.synthetic_databases import Track, arc_track, mirrored_track, random_tracks, synthetic_database
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.held_out import index_for, take_trials
+from marey_motion.evaluation.judgement import judge_trial
+from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.result_documents import result_from_tree, result_to_tree
+from marey_motion.evaluation.scenario import demand, reference, suite_trials
+from marey_motion.evaluation.suite import evaluate
+from marey_motion.matching.copies import index_of
+from marey_motion.matching.database import MatchingDatabase
+
+TAKES = OPTIONS.replace(families=("takes",), duration_s=5.0, approach_s=1.0, replicates=2)
+LEFT = arc_track(2.0, 50.0, 9.0, uid="left")
+
+
+def moved(track: Track, uid: str) -> Track:
+    """Return the same motion, recorded elsewhere in another direction, so that its rows differ by rounding."""
+    turned = np.stack((track.positions[:, 1], -track.positions[:, 0]), axis=1) + np.array([3.0, -7.0])
+    return track._replace(uid=uid, positions=turned, headings=track.headings + np.pi / 2)
+
+
+@pytest.fixture(scope="module")
+def database() -> MatchingDatabase:
+    clips = [
+        LEFT,
+        moved(LEFT, "left again"),
+        *named(random_tracks(5, seed=2)),
+        arc_track(0.0, 0.0, 9.0, uid="standing"),
+    ]
+    return synthetic_database(clips)
+
+
+@pytest.fixture(scope="module")
+def result(database: MatchingDatabase) -> EvaluationResult:
+    return evaluate(database, TAKES, threads=1)
+
+
+def test_the_path_of_a_clip_is_asked_for_after_a_straight_approach(database: MatchingDatabase) -> None:
+    trial = next(one for one in take_trials(database, TAKES) if one.left_out == "left")
+    assert (trial.name, demand(trial)) == ("takes left", "path of “left”, which is left out")
+    assert trial.speed_m_s == pytest.approx(2.0, rel=2e-3)
+    asked = reference(trial)
+    assert asked.tick_count == 6 * 60
+    assert asked.positions[60] == pytest.approx((0.0, 2.0), abs=1e-2)
+    radius, angle = 2.0 / np.radians(50.0), np.radians(50.0) * 4.0
+    there = np.array([radius * (1 - np.cos(angle)), 2.0 + radius * np.sin(angle)])
+    assert asked.positions[300] == pytest.approx(there, abs=2e-2)
+    assert asked.headings[300] == pytest.approx(angle, abs=1e-6)
+    assert asked.speeds_m_s[60:330] == pytest.approx(2.0, abs=2e-2)
+    assert np.degrees(asked.turn_rates_rad_s[60:330]) == pytest.approx(50.0, abs=0.5)
+
+
+def test_no_trial_shows_the_clip_that_it_leaves_out(database: MatchingDatabase, result: EvaluationResult) -> None:
+    assert len(result.trials) > 2
+    for one, record in zip(result.trials, result.records, strict=True):
+        assert one.trial.left_out not in {uid for uid, _ in places(database, record.rows)}
+    assert "standing" not in {one.trial.left_out for one in result.trials}
+    assert result.baseline is None
+
+
+def test_a_path_of_which_the_set_has_another_take_is_followed_best(result: EvaluationResult) -> None:
+    offsets = {one.trial.left_out: one.metrics["offset_mean"] or 0.0 for one in result.trials}
+    others = [offset for source, offset in offsets.items() if not source.startswith("left")]
+    assert max(offsets["left"], offsets["left again"]) < min(others)
+    assert {judge_trial(one, TAKES.limits).region for one in result.trials} == {"real paths"}
+
+
+def test_equal_and_mirrored_clips_are_left_out_with_the_take() -> None:
+    tracks = [LEFT, LEFT._replace(uid="copy"), mirrored_track(LEFT)._replace(uid="right"), *named(random_tracks(2, 4))]
+    pool = synthetic_database(tracks)
+    index, trials = index_of(pool), {one.left_out: one for one in take_trials(pool, TAKES)}
+    own = index_for(pool, index, trials["left"])
+    by_clip = {clip.uid: bool(own.selectable[clip.start : clip.stop].any()) for clip in pool.clips}
+    assert by_clip == {"left": False, "copy": False, "right": True, "clip_000": True, "clip_001": True}
+    circle = suite_trials(OPTIONS)[0]
+    assert index_for(pool, index, circle) is index
+
+
+def test_takes_are_chosen_evenly_and_refused_if_there_are_none(database: MatchingDatabase) -> None:
+    every = [one.left_out for one in take_trials(database, TAKES)]
+    few = [one.left_out for one in take_trials(database, TAKES.replace(most_takes=2))]
+    assert few == [every[0], every[-1]]
+    assert take_trials(database, OPTIONS) == ()
+    for clips in ([LEFT], [arc_track(0.0, 0.0, 9.0, uid="one"), arc_track(2.0, 0.0, 2.0, uid="two")]):
+        with pytest.raises(MotionError, match="no clip has a path to ask for"):
+            take_trials(synthetic_database(clips), TAKES)
+
+
+def test_trials_along_takes_travel_in_documents(result: EvaluationResult) -> None:
+    tree = json.loads(json.dumps(result_to_tree(result)["trials"], default=np.ndarray.tolist))
+    again = result_from_tree({**result_to_tree(result), "trials": tree})
+    assert [one.trial for one in again.trials] == [one.trial for one in result.trials]
