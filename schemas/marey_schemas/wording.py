@@ -20,6 +20,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {plural}"
 
 
+def part_of(shown: int, total: int, noun: str) -> str:
+    """Return how many of all things are shown, for example "8 of 130 takes"; "8 takes" if all of them are shown."""
+    return counted(total, noun) if shown == total else f"{shown:,} of {counted(total, noun)}"
+
+
 def one_of(names: Sequence[str]) -> str:
     """Return the names of a choice as text: "bvh, npz or json"."""
     return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))

@@ -5,38 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.support.real_takes import body_of, read_takes
 
-from marey_motion.clip import Clip
-from marey_motion.formats import read_motion
 from marey_motion.kinematics import global_positions
 from marey_motion.looping import rotated
-from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase, SourceClip
-from marey_motion.rigs import map_joints
-from marey_schemas.formats.companions import pair_companions
 from marey_schemas.options.matching import DatabaseOptions
 
 SUBJECTS = ("02", "05", "07", "09", "16")
 SWAY_DEG = 50.0  # by which a trunk turns to and fro in a dash: takes begin and end within a stride
 SETS = ("bandai-namco-1", "bandai-namco-2")
-
-
-def read_takes(folder: Path, pattern: str) -> list[SourceClip]:
-    names = sorted(str(path.relative_to(folder)) for path in folder.glob(pattern))
-    companions = {pairing.file: pairing.companion for pairing in pair_companions(names)}
-    takes = []
-    for name in names:
-        companion = companions.get(name)
-        data = None if companion is None else (folder / companion).read_bytes()
-        clip = read_motion((folder / name).read_bytes(), name, companion=data, companion_name=str(companion)).clip
-        if clip is not None:
-            takes.append(SourceClip(name, Path(name).stem, clip))
-    return takes
-
-
-def body_of(clip: Clip) -> MatchingBody:
-    return MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
 
 
 @pytest.fixture(

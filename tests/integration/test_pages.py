@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -14,11 +13,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from hatch_build import SOURCES
 from tests.support.database_fixtures import copied_sqlite
 from tests.support.rest_server import Server, running
 from tests.support.studying import analysis_of, files_of
 from tests.support.tiers import chromium, is_soak
+from tests.support.vitest_runs import run_vitest
 from tests.support.web_cases import write_cases
 
 from marey_client import Marey
@@ -194,7 +193,7 @@ def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_pat
         "positions": _positions(owner, items[names[0]]),
         "clips": names,
     }
-    _run_vitest("browser", "browser/pages.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
+    run_vitest("browser", "browser/pages.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
 
 
 @pytest.mark.chromium
@@ -218,7 +217,7 @@ def test_a_page_from_disk_plays_its_motions_without_a_request(
         "rate": clips[0].frame_rate_hz,
         "names": [names[0], HOSTILE_NAME, names[1]],
     }
-    _run_vitest("browser", "browser/player.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
+    run_vitest("browser", "browser/player.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
 
 
 @pytest.mark.chromium
@@ -258,7 +257,7 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
             "files": _written(files_of(analysis_of(7), {"item": calm.id, "revision": 1}), tmp_path),
             "answers": str(tmp_path / "answers.json"),
         }
-        _run_vitest("browser", "browser/study.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
+        run_vitest("browser", "browser/study.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
 
         answers = json.loads((tmp_path / "answers.json").read_text())
         judged = {one.participant: one for one in calm.judgements()}
@@ -320,14 +319,4 @@ def _positions(owner: httpx.Client, clip: str) -> dict[str, list[float]]:
 @pytest.mark.node
 def test_decoder_and_kinematics_in_typescript_agree_with_those_in_python(tmp_path: Path) -> None:
     write_cases(tmp_path)
-    _run_vitest("unit", MAREY_WEB_CASES=str(tmp_path))
-
-
-def _run_vitest(project: str, *files: str, **variables: str) -> None:
-    command = ["node", "node_modules/vitest/vitest.mjs", "run", "--project", project, *files]
-    done = subprocess.run(
-        command, cwd=SOURCES, env=os.environ | variables | {"NO_COLOR": "1"}, check=False, capture_output=True,
-        text=True, timeout=290,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    print(*(line for line in done.stdout.splitlines() if line.startswith("time: ")), sep="\n")  # pytest -s shows them
+    run_vitest("unit", MAREY_WEB_CASES=str(tmp_path))

@@ -2,6 +2,9 @@
 
 import base64
 import hashlib
+import re
+import zlib
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -13,9 +16,14 @@ from tests.support.present import present
 from tests.support.rest_server import Server
 
 from marey_motion.evaluation.result_documents import records_to_tree, result_to_tree
+from marey_schemas.documents.report_pages import ORIGIN_PLACE, PLAYER_PLACE
 from marey_schemas.encoding.codecs import encode_tree
+from marey_server.handlers import reports
+from marey_server.handlers.browser import pages
 
-PAGE = b"<!doctype html><title>Report</title><p>All is well."
+PAGE = f"<!doctype html><title>Report</title><dl>{ORIGIN_PLACE}</dl><p>All is well.{PLAYER_PLACE}".encode()
+PLAYER_SCRIPT = "sha256-" + "A" * 43 + "="
+PLAYER = f"<meta content=\"script-src '{PLAYER_SCRIPT}'\"><title>Player</title>".encode()
 SCRIPT = "sha256-" + base64.b64encode(hashlib.sha256(b"sort()").digest()).decode()
 FILES = {"png": b"\x89PNG drawn", "svg": b"<svg/>", "json": b'{"tables": {}}', "csv": b"speed\n1.0\n"}
 TYPES = {"png": "image/png", "svg": "image/svg+xml", "json": "application/json", "csv": "text/csv; charset=utf-8"}
@@ -54,10 +62,11 @@ def test_lists_show_the_verdict_and_the_headline_numbers(owner: httpx.Client, ev
 
 
 def test_a_report_is_a_page_that_may_run_its_own_script_and_do_nothing_else(
-    owner: httpx.Client, evaluation: str
+    owner: httpx.Client, evaluation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(pages, "FOLDER", tmp_path / "none")
     answer = owner.get(f"{evaluation}/report")
-    assert (answer.status_code, answer.content) == (200, PAGE)
+    assert answer.status_code == 200
     assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
     policy = answer.headers["Content-Security-Policy"].split("; ")
@@ -71,15 +80,50 @@ def test_a_report_that_is_held_already_is_not_sent_again(owner: httpx.Client, ev
     etag = owner.get(f"{evaluation}/report").headers["ETag"]
     again = owner.get(f"{evaluation}/report", headers={"If-None-Match": etag})
     assert (again.status_code, again.content) == (304, b"")
-    part = owner.get(f"{evaluation}/report", headers={"Range": "bytes=0-4"})
-    assert (part.status_code, part.content) == (206, PAGE[:5])
 
 
-def test_what_a_revision_reports_never_changes_and_what_an_item_reports_may(
+def test_browsers_ask_again_for_each_report_because_its_player_may_be_newer(
     owner: httpx.Client, evaluation: str
 ) -> None:
-    assert "immutable" in owner.get(f"{evaluation}/report?revision=1").headers["Cache-Control"]
-    assert owner.get(f"{evaluation}/report").headers["Cache-Control"] == "private, no-cache"
+    for path in (f"{evaluation}/report?revision=1", f"{evaluation}/report"):
+        assert owner.get(path).headers["Cache-Control"] == "private, no-cache"
+
+
+def facts_of(page: str) -> dict[str, str]:
+    """Return the facts in the head of a page by their names."""
+    return dict(re.findall(r"<dt>([^<]*)</dt><dd>([^<]*)</dd>", page))
+
+
+def test_a_report_names_its_project_its_author_and_the_date_of_its_revision(
+    server: Server, owner: httpx.Client, evaluation: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rita = server.client(server.make_user("rita"))
+    assert owner.put("/projects/lab/members/rita", json={"role": "reader"}).is_success
+    made = owner.get(f"{evaluation}/revisions").json()["items"][0]
+    for reader in (owner, rita):
+        assert facts_of(reader.get(f"{evaluation}/report").text) == {
+            "project": f"lab on {server.address}",
+            "requested by": made["author"],
+            "date": f"{made['created_at'][:10]} {made['created_at'][11:16]} UTC",
+        }
+    monkeypatch.setattr(reports, "MOST_FILLED_BYTES", len(PAGE) - 1)
+    assert owner.get(f"{evaluation}/report").content == PAGE
+
+
+def test_a_report_gets_the_player_of_this_installation_and_may_run_its_script(
+    owner: httpx.Client, evaluation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pages, "FOLDER", tmp_path)
+    bare = owner.get(f"{evaluation}/report")
+    assert PLAYER_PLACE in bare.text
+    assert f"script-src '{SCRIPT}';" in bare.headers["Content-Security-Policy"]
+    (tmp_path / "index.html").write_text("")
+    (tmp_path / "player.html").write_bytes(PLAYER)
+    answer = owner.get(f"{evaluation}/report")
+    (packed,) = re.findall(r'<script type="application/json" id="player">"([^"]*)"</script>', answer.text)
+    assert zlib.decompress(base64.b64decode(packed)) == PLAYER
+    assert f"script-src '{SCRIPT}' '{PLAYER_SCRIPT}';" in answer.headers["Content-Security-Policy"]
+    assert answer.headers["ETag"] != bare.headers["ETag"]
 
 
 @pytest.mark.parametrize("form", list(FILES))

@@ -114,6 +114,9 @@ def test_readers_get_the_files_of_an_analysis_which_browsers_show_without_script
     report = reader.get(f"{files}/report")
     assert (report.status_code, report.headers["Content-Type"]) == (200, "text/html; charset=utf-8")
     assert "Order and groups" in report.text
+    made = owner.get(f"/jobs/{job}").json()
+    for fact in (f"lab on {server.address}", made["author"], f"{made['finished_at'][:10]} "):
+        assert f"<dd>{fact}" in report.text
     policy = report.headers["Content-Security-Policy"]
     assert policy.startswith("default-src 'none'")
     assert policy.endswith("; sandbox")

@@ -8,9 +8,12 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import Collection, PathCollection, QuadMesh
 from matplotlib.figure import Figure
-from matplotlib.image import imread
+from matplotlib.image import AxesImage, imread
+from matplotlib.patches import Patch
 from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 
 from marey_reports.drawing.drawn import DrawnFigure
 
@@ -63,3 +66,49 @@ def _labels_beyond(axes: Axes) -> Iterator[Any]:
         for tick in axis.get_major_ticks():
             if not (axes.axison and low <= tick.get_loc() <= high):
                 yield from (tick.label1, tick.label2)
+
+
+def covered_by_legends(figure: Figure) -> list[str]:
+    """Return the data and the texts that a legend of a figure covers, each after the first label of the legend."""
+    canvas = FigureCanvasAgg(figure)
+    figure.draw_without_rendering()
+    renderer = canvas.get_renderer()
+    found = []
+    for legend in (each.get_legend() for each in figure.axes):
+        if legend is not None:
+            box = legend.get_window_extent(renderer)
+            name = legend.get_texts()[0].get_text()
+            found += [f"{name}: {what}" for axes in figure.axes for what in _drawn_within(axes, box)]
+            own = {id(text) for text in legend.get_texts()}
+            hidden = {id(label) for axes in figure.axes for label in _labels_beyond(axes)}
+            found += [
+                f"{name}: {text.get_text()}"
+                for text in figure.findobj(Text)
+                if text.get_visible() and text.get_text().strip() and id(text) not in own | hidden
+                and text.get_window_extent(renderer).overlaps(box)
+            ]  # fmt: skip
+    return found
+
+
+def _drawn_within(axes: Axes, box: Bbox) -> Iterator[str]:
+    """Yield the data of axes that lie within a box on the page; what the axes cut off does not count."""
+    for artist in (*axes.lines, *axes.patches, *axes.collections, *axes.images):
+        inner = Bbox.intersection(box, axes.bbox) if artist.get_clip_on() else box
+        if inner is None or inner.width <= 0.0 or inner.height <= 0.0 or not artist.get_visible():
+            continue
+        if isinstance(artist, PathCollection):
+            places = artist.get_offset_transform().transform(artist.get_offsets())
+            if inner.padded(2.0).count_contains(places):
+                yield "points"
+        elif isinstance(artist, QuadMesh | AxesImage):
+            yield "a map"
+        elif isinstance(artist, Collection):
+            paths = [artist.get_transform().transform_path(path) for path in artist.get_paths()]
+            if any(path.intersects_bbox(inner, filled=True) for path in paths):
+                yield "areas"
+        elif (
+            artist.get_transform()
+            .transform_path(artist.get_path())
+            .intersects_bbox(inner, filled=isinstance(artist, Patch))
+        ):
+            yield str(artist)

@@ -33,7 +33,8 @@ class Page(HTMLParser):
         assert not self.opened
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
-        self.tags[tag] += 1
+        is_data = tag == "script" and ("type", "application/json") in attrs
+        self.tags["script of data" if is_data else tag] += 1
         if tag not in VOID:
             self.opened.append(tag)
         for name, value in attrs:
@@ -63,7 +64,10 @@ class Page(HTMLParser):
 
 
 def is_sound(source: str) -> Page:
-    """Check that a page has balanced tags, unique ids, no external resources and one script; return it parsed."""
+    """Check that a page has balanced tags, unique ids, no external resources and one script; return it parsed.
+
+    Scripts of data, which browsers do not run, are not counted.
+    """
     page = Page(source)
     assert set(page.ids.values()) == {1}
     for link in page.links:

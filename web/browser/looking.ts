@@ -2,7 +2,7 @@
 import axe from "axe-core";
 import { mkdirSync } from "node:fs";
 import { join } from "node:path";
-import { type Browser, type BrowserContext, chromium, type Page } from "playwright-core";
+import { type Browser, type BrowserContext, chromium, type Locator, type Page } from "playwright-core";
 import { expect } from "vitest";
 import type { SceneState } from "../src/player/testHandle";
 
@@ -27,6 +27,24 @@ export function colours(where: Page): Promise<number> {
     context.drawImage(canvas, 0, 0);
     return new Set(new Uint32Array(context.getImageData(0, 0, copy.width, copy.height).data.buffer)).size;
   });
+}
+
+/** Return the number of different colours in what a browser shows of an element, such as a frame with a canvas. */
+export async function shownColours(element: Locator): Promise<number> {
+  const shot = (await element.screenshot()).toString("base64");
+  const blank = await element.page().context().newPage(); // without the content security policy of the page
+  const count = await blank.evaluate(async (data) => {
+    const image = new Image();
+    image.src = `data:image/png;base64,${data}`;
+    await image.decode();
+    const copy = document.createElement("canvas");
+    [copy.width, copy.height] = [image.width, image.height];
+    const context = copy.getContext("2d")!;
+    context.drawImage(image, 0, 0);
+    return new Set(new Uint32Array(context.getImageData(0, 0, copy.width, copy.height).data.buffer)).size;
+  }, shot);
+  await blank.close();
+  return count;
 }
 
 export async function picture(where: Page, name: string, fullPage = false): Promise<void> {

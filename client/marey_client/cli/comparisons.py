@@ -113,7 +113,9 @@ def _print_comparison(document: Mapping[str, Any]) -> None:
     print_table(columns, rows, right=columns[1:5])
     _print_perceived(document)
     if moved:
-        worst = sorted(moved, key=lambda one: -_rise(one))[:SHOWN]
+        from marey_schemas.documents.worst_first import worst_first
+
+        worst = worst_first(moved, _rise, lambda one: str(one["trial"]))[:SHOWN]
         rows_of_trials = [
             (one["trial"], _metres(one["offset_mean_before"]), _metres(one["offset_mean_after"])) for one in worst
         ]
@@ -131,8 +133,10 @@ def _print_perceived(document: Mapping[str, Any]) -> None:
             typer.echo(f"{name}: {perceived_text(perceived)}")
 
 
-def _rise(one: Mapping[str, Any]) -> float:
-    return float((one["offset_mean_after"] or 0.0) - (one["offset_mean_before"] or 0.0))
+def _rise(one: Mapping[str, Any]) -> float | None:
+    from marey_schemas.documents.worst_first import increase
+
+    return increase(one["offset_mean_before"], one["offset_mean_after"])
 
 
 def _metres(value: float | None) -> str:

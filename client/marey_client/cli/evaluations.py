@@ -214,11 +214,9 @@ def _print_evaluation(found: EvaluationHandle, as_json: bool) -> None:
         typer.echo(perceived_text(perceived))
     for region in document.get("regions", ()):
         typer.echo(region["sentence"])
-    # Evaluations of old versions do not contain an order of their trials.
-    worst = sorted(found.trials(), key=lambda row: (row.get("worst_rank", 0), -(row["offset_mean"] or 0.0)))
     rows = [(row["trial"], _number(row["offset_mean"], 2), _number(row["se_v"], 2), _number(row["se_omega_deg"], 1),
              _number(row.get("foot_skate"), 2), ", ".join(row.get("beyond_limits", ())))
-            for row in worst[:WORST_SHOWN]]  # fmt: skip
+            for row in found.worst_trials()[:WORST_SHOWN]]  # fmt: skip
     columns = ("worst trials", "offset m", "speed error m/s", "turn error deg/s", "feet slide m/s", "beyond limits")
     print_table(columns, rows, right=columns[1:-1])
     return print_message(f"to write the report, run marey report {found.project}/{found.path} --out report.html")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -23,6 +23,7 @@ from marey_client.keywords.evaluation import CompareKeywords, OptimiseKeywords, 
 from marey_client.places import Places, as_inputs, resolved
 from marey_client.transport import sends_nothing
 from marey_schemas.documents.evaluations import COSTS, MOST_EVALUATIONS_COMPARED, trial_name
+from marey_schemas.documents.worst_first import worst_first
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.queue.jobs import JobCreate
@@ -44,6 +45,10 @@ class EvaluationHandle(ReportedHandle):
     def trials(self) -> list[dict[str, Any]]:
         """Return one row per trial: name, requested motion, verdict, and metrics."""
         return list(trial_rows(self.document()))
+
+    def worst_trials(self) -> list[dict[str, Any]]:
+        """Return the rows of `trials` from the worst trial to the best, in the order of the report."""
+        return worst_rows_first(self.trials())
 
     def clips(self) -> list[dict[str, Any]]:
         """Return one row per clip: name, number of frames, and use of the clip by the trials."""
@@ -190,6 +195,18 @@ def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
             **{name: one[name] for name in TRIAL_VERDICT if name in one},
             **one["metrics"],
         }
+
+
+def worst_rows_first(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Sort rows of trials from the worst to the best.
+
+    Evaluations of old versions do not rank their trials; these are sorted by their distance from the path.
+    """
+
+    def badness(row: Mapping[str, Any]) -> float | None:
+        return -row["worst_rank"] if "worst_rank" in row else row.get("offset_mean")
+
+    return worst_first(map(dict, rows), badness, lambda row: str(row["trial"]), undefined_is_worst=True)
 
 
 def clip_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

@@ -39,11 +39,13 @@ class Findings:
 
     def report(self) -> bytes:
         """Return the report, one self-contained page of HTML. Raises `LookupError` if the job made no report."""
-        return Blobs(self.transport).fetch(self._blob("report"))
+        self._blob("report")
+        path = f"/projects/{self.job.project}/jobs/{self.job.id}/files/report"
+        return self.transport.send("GET", path, headers={"Accept": "text/html"}).content
 
     def save_report(self, path: str | Path) -> Path:
         """Write the report to a file, and return the path of the file."""
-        return self.save_file("report", path)
+        return saved(path, self.report())
 
     def save_file(self, name: str, path: str | Path) -> Path:
         """Write a file of the result, such as `report`; return its path. Raises `LookupError` without such a file."""

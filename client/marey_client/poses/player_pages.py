@@ -52,18 +52,20 @@ def read_template(transport: Transport) -> bytes:
         ) from error
 
 
-def page_with(template: bytes, title: str, motions: Sequence[ShownMotion]) -> bytes:
-    """Return a page that plays motions. Raises `MareyError` if the template has no element for their data.
+def page_data(title: str, motions: Sequence[ShownMotion]) -> str:
+    """Return the data of a page that plays motions as JSON. Each `<` is escaped, so that no name can end an element."""
+    content = {"format": FORMAT, "title": title, "motions": [one.packed() for one in motions]}
+    return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
-    Each `<` in the data is escaped, so that no name can end this element.
-    """
+
+def page_with(template: bytes, title: str, motions: Sequence[ShownMotion]) -> bytes:
+    """Return a page that plays motions. Raises `MareyError` if the template has no element for their data."""
     if template.count(_PLACE) != 1:
         raise MareyError(
             "the server's page has no element for motion, because client and server have different versions; upgrade "
             "the older one"
         )
-    content = {"format": FORMAT, "title": title, "motions": [one.packed() for one in motions]}
-    data = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    data = page_data(title, motions)
     return template.replace(_PLACE, _PLACE.replace(b"></", b">" + data.encode() + b"</"))
 
 

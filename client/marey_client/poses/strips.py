@@ -12,14 +12,14 @@ from marey_client.asynchronous.interruption import CallPool
 from marey_client.errors import BadArgument
 from marey_client.extras import room
 from marey_client.handles.clips import ClipHandle
-from marey_client.handles.evaluations import EvaluationHandle, name_of_trial
+from marey_client.handles.evaluations import EvaluationHandle, trial_rows, worst_rows_first
 from marey_client.handles.models import ModelHandle
 from marey_client.poses.kinematics import PosedSkeleton, read_rig
 from marey_client.poses.pictures import FIGURES_EXTRA, MOST_MOMENTS, READS_AT_ONCE
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
-from marey_schemas.wording import counted
+from marey_schemas.wording import counted, part_of
 
 MOST_ROWS = 24
 
@@ -154,7 +154,7 @@ def draw_worst_trials(
     shown = DisplayedFrames(evaluation, document)
     rows, times = [], []
     for one in ranked[:count]:
-        name = name_of_trial(one["trial"])
+        name = one["trial"]
         record = records[name]
         ticks = _spread(range(len(record["rows"])), moments, name)
         times = [tick / shown.rate_hz for tick in ticks]
@@ -162,14 +162,16 @@ def draw_worst_trials(
         limits = f"{counted(len(one['beyond_limits']), 'measure')} beyond limits"
         headings = np.asarray(record["headings"][ticks], dtype=np.float64)
         rows.append(strips.PoseRow(name, limits, poses, headings_rad=headings))
-    figure = strips.draw_pose_rows(rows, ["of the trial"] * len(times), [f"{time_s:.1f} s" for time_s in times])
+    about = f"{part_of(len(rows), len(ranked), 'trial')}, the worst first"
+    labels = [f"{time_s:.1f} s" for time_s in times]
+    figure = strips.draw_pose_rows(rows, ["of the trial"] * len(times), labels, about=about)
     return _written(figure, file_type, evaluation.path)
 
 
 def ranked_trials(evaluation: EvaluationHandle, document: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the ranked trials of an evaluation's document, the worst first. Raises `BadArgument` if there are none."""
-    ranked = sorted((one for one in document["trials"] if "worst_rank" in one), key=lambda one: one["worst_rank"])
-    if not ranked:
+    """Return the rows of an evaluation's trials, the worst first. Raises `BadArgument` if they are not ranked."""
+    ranked = worst_rows_first(trial_rows(document))
+    if not any("worst_rank" in one for one in ranked):
         raise BadArgument(f"{evaluation.path!r} does not say which trials are the worst; evaluate the clips again")
     return ranked
 

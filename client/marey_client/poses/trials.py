@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from marey_client.errors import BadArgument
 from marey_client.extras import room
 from marey_client.handles.clips import ClipHandle
-from marey_client.handles.evaluations import EvaluationHandle, name_of_trial
+from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.poses.pictures import FIGURES_EXTRA
 from marey_client.poses.player_pages import ShownMotion, shown_motion
 from marey_client.poses.strips import ClipOfStrip, DisplayedFrames, mirrored, ranked_trials
@@ -31,7 +31,7 @@ def motions_of_worst_trials(evaluation: EvaluationHandle, revision: int | None, 
     ranked = ranked_trials(evaluation, document)
     records = evaluation.records(revision=revision)
     recorded = _RecordedClips(DisplayedFrames(evaluation, document))
-    names = [name_of_trial(one["trial"]) for one in ranked[:count]]
+    names = [one["trial"] for one in ranked[:count]]
     return [recorded.motion(name, records[name]) for name in names]
 
 

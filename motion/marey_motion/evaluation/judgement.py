@@ -10,7 +10,7 @@ the trials with changes of speed. In tight turns, motion matching does not respo
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from marey_motion.evaluation.result import EvaluationResult, Metrics, TrialResult
 from marey_motion.evaluation.scenario import Trial
+from marey_schemas.documents.worst_first import worst_first
 from marey_schemas.options.verdict import VerdictLimits
 
 GRADES = ((0.75, "very good"), (0.55, "good"), (0.3, "usable in part"), (0.0, "poor"))
@@ -155,8 +156,22 @@ class Judgement:
 
     @property
     def ranked(self) -> tuple[TrialVerdict, ...]:
-        """The trials in descending order of their largest strain; trials with equal strain are ordered by name."""
-        return tuple(sorted(self.trials, key=lambda each: (-each.worst.strain, each.outcome.trial.name)))
+        """The trials from the worst to the best."""
+        return tuple(rank_trials(self.trials))
+
+
+def rank_trials(trials: Iterable[TrialVerdict]) -> list[TrialVerdict]:
+    """Sort judged trials from the worst to the best: by their largest strain, then by name.
+
+    Parameters
+    ----------
+    trials : iterable of TrialVerdict    the trials, in any order
+
+    Returns
+    -------
+    list of TrialVerdict    the same trials, in the order of `marey_schemas.documents.worst_first`
+    """
+    return worst_first(trials, lambda each: each.worst.strain, lambda each: each.outcome.trial.name)
 
 
 def judge(result: EvaluationResult) -> Judgement:

@@ -13,6 +13,7 @@ from marey_reports.comparisons.curves import draw_curves
 from marey_reports.comparisons.scatter import draw_scatter
 from marey_reports.comparisons.subjects import ComparedSubject, short, written
 from marey_reports.drawing.drawn import DrawnFigure, Sketch
+from marey_reports.drawing.head import ReportHead
 from marey_reports.drawing.markup import Content, element
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.paper import QUIET, SMALL, plain
@@ -148,7 +149,7 @@ def render_page(subject: ComparedSubject, plot: Plot | None, parameter: str | No
         sections.append(Section("means", "Means", _means(subject, fields)))
     sections.append(Section("runs", "Runs", _runs(comparison)))
     lead: Content = (element("p", _verdict(subject), class_="verdict"), _headline(comparison))
-    return page(f"Runs of {comparison.subject}", lead, sections, f"Written by Marey {code_version()}.")
+    return page(ReportHead("Comparison of runs", f"Runs of {comparison.subject}", code_version()), lead, sections)
 
 
 def _verdict(subject: ComparedSubject) -> str:

@@ -17,7 +17,7 @@ from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_reports.drawing.paper import HAIRLINE, INK, to_png
 from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, Stances, StickFigure, body_of, stances_at
-from marey_schemas.wording import counted
+from marey_schemas.wording import counted, part_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,6 +35,7 @@ ROW = TITLE + STAGE + CAPTION + GAP
 DPI = 110
 BONE_POINTS, EDGE_POINTS = 2.6, 5.0
 EDGE_STOPS = 0.07  # inches before a bone's ends
+PAD = 0.10  # inches between what is drawn and the border of its cell, more than half of the widest line
 
 CAMERA_TURN_RAD = np.radians(40.0)  # from where the body faces at first to where it is seen from, to its left
 CAMERA_TILT_RAD = np.radians(12.0)
@@ -53,13 +54,18 @@ class TakePair(NamedTuple):
 
 
 def contact_sheet(
-    takes: Sequence[TakePair], *, heading: str = "Retargeting", moments: int = 6, total: int | None = None
+    takes: Sequence[TakePair],
+    *,
+    heading: str = "Retargeting",
+    moments: int = 6,
+    total: int | None = None,
+    choice: str = "",
 ) -> bytes:
     """Draw a PNG with one row per take: at each of several times, the source and the result side by side.
 
     The result has a tinted background. The figures of a take have the same scale and the same view: from the front left
-    of the source in its first frame. Each figure is drawn over its own patch of the floor y = 0, with an arrow in its
-    facing direction.
+    of the source in its first frame, and nothing of a figure leaves its cell. Each figure is drawn over its own patch
+    of the floor y = 0, with an arrow in its facing direction.
 
     Parameters
     ----------
@@ -67,6 +73,7 @@ def contact_sheet(
     heading : title of the page
     moments : number of evenly spaced times at which a take is drawn, at most `MAX_MOMENTS` and one per frame
     total : number of takes from which the drawn takes were chosen; None if all takes are drawn
+    choice : order in which they were chosen, such as "the worst first"; written only if not all takes are drawn
 
     Raises
     ------
@@ -84,7 +91,7 @@ def contact_sheet(
     figure = Figure(figsize=(PAGE_WIDTH, height), dpi=DPI, facecolor="white")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, PAGE_WIDTH), ylim=(0.0, height))
     axes.axis("off")
-    _draw_header(axes, height, heading, _take_count(len(rows), total))
+    _draw_header(axes, height, heading, _shown_of(len(rows), total, choice))
     for number, row in enumerate(rows):
         _draw_row(axes, row, height - HEADER - number * ROW, (PAGE_WIDTH - 2 * MARGIN) / moments)
     return to_png(figure)
@@ -108,12 +115,45 @@ class _SheetRow:
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 
     @property
-    def reach_m(self) -> float:
-        """Greatest distance of a drawn point from the middle of its figure, to the left or right of the picture."""
-        return max(
-            float(np.abs(self.camera.seen(stances.points[:, body.bones.ravel()])[..., 0]).max(initial=0.0))
-            for body, stances in self.actors
-        )
+    def height_m(self) -> float:
+        """Height of the row's figures, by which their heads and their patches of floor are scaled."""
+        low, high = self.extent_m
+        return high - low
+
+    @property
+    def seen_extent_m(self) -> tuple[float, float, float]:
+        """Lowest and highest point in the picture and greatest distance to a side, from the floor under the pelvis.
+
+        Bones, heads, patches of floor and arrows count. The camera looks down, so what is near is lower in the picture.
+        """
+        spot, head = FLOOR_SHARE * self.height_m, HEAD_SHARE * self.height_m
+        corners = [np.array([[spot, spot * np.sin(self.camera.tilt_rad)]]), self._arrow_tips(spot)]
+        corners[0] = np.concatenate((corners[0], -corners[0]))
+        for body, stances in self.actors:
+            bones = self.camera.seen(stances.points[:, body.bones])[..., :2]
+            corners.append(bones.reshape(-1, 2))
+            if body.head is not None:
+                centres = _head_centre(body, bones)
+                corners += [centres + head, centres - head]
+        seen = np.concatenate(corners)
+        return float(seen[:, 1].min()), float(seen[:, 1].max()), float(np.abs(seen[:, 0]).max())
+
+    def _arrow_tips(self, spot_m: float) -> AnyFloats:
+        facings = [stances.facing for _, stances in self.actors if stances.facing is not None]
+        return np.concatenate([np.empty((0, 2)), *(_arrow_tip(self.camera, one, spot_m)[..., :2] for one in facings)])
+
+
+def _head_centre(body: StickFigure, bones: AnyFloats) -> AnyFloats:
+    """Return the centre of the head from the ends (..., n, 2, k) of all bones, (..., k)."""
+    assert body.head is not None
+    bone, share = body.head
+    return share * bones[..., bone, 0, :] + (1.0 - share) * bones[..., bone, 1, :]
+
+
+def _arrow_tip(camera: Camera, facing: AnyFloats, spot_m: float) -> AnyFloats:
+    """Return where the camera sees the tips of arrows in facing directions (..., 2), (..., 3) in metres."""
+    ahead = np.stack((facing[..., 0], np.zeros_like(facing[..., 0]), facing[..., 1]), axis=-1)
+    return camera.seen(1.15 * spot_m * ahead)
 
 
 def _staged(take: TakePair, moments: int) -> _SheetRow:
@@ -153,9 +193,11 @@ class _SheetCell:
         return seen[..., :2] * self.scale + self.centre
 
 
-def _take_count(shown: int, total: int | None) -> str:
-    """Return the number of takes in words, such as `8 of 24 takes`."""
-    return counted(shown, "take") if total is None or total == shown else f"{shown} of {counted(total, 'take')}"
+def _shown_of(shown: int, total: int | None, choice: str) -> str:
+    """Return the number of takes in words, such as "8 of 130 takes, the worst first"."""
+    if total is None or total == shown:
+        return counted(shown, "take")
+    return ", ".join(filter(None, (part_of(shown, total, "take"), choice)))
 
 
 def _draw_header(axes: Axes, top: float, heading: str, takes: str) -> None:
@@ -175,21 +217,23 @@ def _draw_header(axes: Axes, top: float, heading: str, takes: str) -> None:
 def _draw_row(axes: Axes, row: _SheetRow, top: float, cell: float) -> None:
     """Draw the row of a take: its title, and for each time a cell with source and result. `top` is in inches."""
     _draw_titles(axes, row, top)
-    low, high = row.extent_m
+    lowest, highest, aside = row.seen_extent_m
     width = 0.5 * cell
-    scale = min(0.80 * STAGE / max(high - low, 1e-6), 0.44 * width / max(row.reach_m, 1e-6))
+    scale = min((STAGE - 2 * PAD) / max(highest - lowest, 1e-6), (0.5 * width - PAD) / max(aside, 1e-6))
+    floor = max(0.12 * STAGE, PAD - lowest * scale)
+    floor = min(floor, STAGE - PAD - highest * scale)
     bottom = top - TITLE - STAGE
     for moment, time_s in enumerate(row.times_s):
         left = MARGIN + moment * cell
         _write(axes, (left + width, bottom - 0.21), f"{time_s:.2f} s", 9.5, QUIET, ha="center")
         for side, ground in enumerate(("white", TINT)):
             start = left + side * width
-            centre = (start + 0.5 * width, bottom + 0.12 * STAGE - low * scale)
+            centre = (start + 0.5 * width, bottom + floor)
             stage = _SheetCell(start, bottom, width, centre, scale, ground)
             body, stances = row.actors[side]
             facing = None if stances.facing is None else stances.facing[moment]
-            _draw_floor(axes, stage, row.camera, facing, FLOOR_SHARE * (high - low))
-            _draw_body(axes, stage, body, row.camera.seen(stances.points[moment]), HEAD_SHARE * (high - low))
+            _draw_floor(axes, stage, row.camera, facing, FLOOR_SHARE * row.height_m)
+            _draw_body(axes, stage, body, row.camera.seen(stances.points[moment]), HEAD_SHARE * row.height_m)
 
 
 def _draw_titles(axes: Axes, row: _SheetRow, top: float) -> None:
@@ -212,7 +256,7 @@ def _draw_floor(axes: Axes, stage: _SheetCell, camera: Camera, facing: AnyFloats
     spot = Ellipse(stage.centre, diameter, diameter * np.sin(camera.tilt_rad), facecolor=FLOOR, edgecolor="none")
     axes.add_patch(spot)
     if facing is not None:
-        tip = stage.placed(camera.seen(np.array((facing[0], 0.0, facing[1])) * 1.15 * radius_m))
+        tip = stage.placed(_arrow_tip(camera, facing, radius_m))
         axes.annotate("", tuple(tip), stage.centre, arrowprops=ARROW)
 
 
@@ -235,8 +279,7 @@ def _draw_body(axes: Axes, stage: _SheetCell, body: StickFigure, seen: AnyFloats
     widths = [EDGE_POINTS, BONE_POINTS] * len(order)
     axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=widths, capstyle="round"))
     if body.head is not None:
-        bone, share = body.head
-        centre = stage.placed(share * bones[bone, 0] + (1.0 - share) * bones[bone, 1])
+        centre = stage.placed(_head_centre(body, bones))
         colour = SIDE_COLOURS[CENTRE]
         circle = Circle(tuple(centre), head_m * stage.scale, facecolor=stage.ground, edgecolor=colour, lw=2.0, zorder=3)
         axes.add_patch(circle)

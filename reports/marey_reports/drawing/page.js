@@ -24,3 +24,30 @@ for (const table of document.querySelectorAll("table.sortable")) {
     });
   });
 }
+document.documentElement.classList.add("scripted");
+for (const box of document.querySelectorAll("figure > div, .table")) {
+  const measure = () => box.classList.toggle("scrolls", box.scrollWidth > box.clientWidth + 1);
+  new ResizeObserver(measure).observe(box);
+  measure();
+}
+const PLACE_OF_MOTION = 'id="motion">';
+const packed = document.getElementById("player");
+for (const box of packed === null ? [] : document.querySelectorAll(".player")) {
+  const button = document.createElement("button");
+  button.type = "button";
+  button.textContent = box.dataset.label;
+  box.append(button);
+  box.hidden = false;
+  button.addEventListener("click", async () => {
+    button.disabled = true;
+    const bytes = Uint8Array.from(atob(JSON.parse(packed.textContent)), (letter) => letter.charCodeAt(0));
+    const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const [before, after] = (await new Response(inflated).text()).split(PLACE_OF_MOTION);
+    const frame = document.createElement("iframe");
+    frame.title = box.dataset.label;
+    frame.setAttribute("sandbox", "allow-scripts");
+    frame.srcdoc = before + PLACE_OF_MOTION + box.querySelector("script").textContent + after;
+    button.replaceWith(frame);
+    frame.focus();
+  });
+}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -9,8 +11,10 @@ from importlib.resources import files
 from typing import NamedTuple
 
 from marey_reports.drawing.drawn import DrawnFigure
+from marey_reports.drawing.head import ReportHead
 from marey_reports.drawing.markup import Content, Html, element, joined
 from marey_reports.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET
+from marey_schemas.documents.report_pages import PLAYER_PLACE
 
 # The colours of figures that follow the page's theme.
 _THEMED = {
@@ -27,6 +31,7 @@ _NEEDLESS = re.compile(
 )
 _FONTS = re.compile(r"font-family: [^;\"]*;? ?")
 _BLANKS = re.compile(r"\s*\n\s*")
+_WIDTH = re.compile(r"<svg [^>]*?\bwidth=\"([\d.]+pt)\"")
 _STANDING = re.compile(r" transform=\"rotate\(-?0 [^)]*\)\"")
 _REFERENCE = re.compile(r"(?:href=\"|url\()#([^\")]+)")
 _ID = re.compile(r" id=\"([^\"]*)\"")
@@ -40,26 +45,39 @@ class Section(NamedTuple):
     content: Content
 
 
-def page(title: str, lead: Content, sections: Sequence[Section], ending: Content) -> str:
-    """Return a whole HTML document with the given sections."""
+def page(head: ReportHead, lead: Content, sections: Sequence[Section], *, plays_motion: bool = False) -> str:
+    """Return a whole HTML document: the head, a summary (`lead`) and the sections.
+
+    With `plays_motion`, the document has a place for the player, which is inserted when the report is handed out.
+    """
     links = [element("li", element("a", section.heading, href=f"#{section.anchor}")) for section in sections]
-    head = element(
+    declared = element(
         "head",
         element("meta", charset="utf-8"),
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", http_equiv="Content-Security-Policy", content=_POLICY),
-        element("title", title),
+        element("title", f"{head.title} – {head.subject}"),
         element("style", Html(_part("page.css"))),
     )
     body = element(
         "body",
-        element("header", element("h1", title), lead),
+        element("header", head.html(), lead),
         element("nav", element("ol", links), aria_label="Contents"),
         element("main", [_section(section) for section in sections]),
-        element("footer", ending),
+        Html(PLAYER_PLACE) if plays_motion else None,
         element("script", Html(_part("page.js"))),
     )
-    return f'<!DOCTYPE html>\n<html lang="en">\n{head}\n{body}\n</html>\n'
+    return f'<!DOCTYPE html>\n<html lang="en">\n{declared}\n{body}\n</html>\n'
+
+
+def scripts_of(page: str) -> tuple[str, ...]:
+    """Return the digest of the script of a page in the syntax of Content-Security-Policy; nothing without a script.
+
+    The script is the last `<script>` in the page, because earlier ones can be parts of names of clips.
+    """
+    _, found, rest = page.rpartition("<script>")
+    digest = hashlib.sha256(rest.partition("</script>")[0].encode()).digest()
+    return (f"sha256-{base64.b64encode(digest).decode()}",) if found else ()
 
 
 # Nothing is loaded from anywhere; images within figures are part of the file.
@@ -93,7 +111,9 @@ def _inline(figure: DrawnFigure, prefix: str) -> Html:
     svg = _REFERENCE.sub(lambda found: found[0].replace("#", f"#{prefix}"), svg)
     description = element("desc", figure.caption)
     svg = svg.replace("</title>", f"</title>{description}", 1)
-    return Html(svg.replace("<svg ", '<svg role="img" ', 1).strip())
+    natural = _WIDTH.search(svg)
+    style = f' style="--natural: {natural[1]}"' if natural else ""
+    return Html(svg.replace("<svg ", f'<svg role="img"{style} ', 1).strip())
 
 
 @cache

@@ -70,8 +70,20 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER)
 
 
-def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: str = "", grid: bool = True) -> Axes:
-    """Add axes with a title and labels at a place of the page, in the style of all figures; return the axes."""
+def add_panel(
+    figure: Figure,
+    place: Place,
+    *,
+    title: str = "",
+    x: str = "",
+    y: str = "",
+    grid: bool = True,
+    below_title: float = 7.0,
+) -> Axes:
+    """Add axes with a title and labels at a place of the page, in the style of all figures; return the axes.
+
+    `below_title` is the height between the axes and the title in points, for example for a legend.
+    """
     width, height = figure.get_size_inches()
     left, bottom, across, up = place
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height), facecolor="none")
@@ -84,7 +96,8 @@ def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: 
         axes.grid(visible=True, color=HAIRLINE, lw=0.5)
     axes.set_xlabel(x, fontsize=TEXT, color=INK, labelpad=4)
     axes.set_ylabel(y, fontsize=TEXT, color=INK, labelpad=4)
-    axes.set_title(plain(title), fontsize=HEADING, color=INK, loc="left", fontweight="bold", parse_math=False, pad=7)
+    axes.set_title(plain(title), fontsize=HEADING, color=INK, loc="left", fontweight="bold", parse_math=False,
+                   pad=below_title)  # fmt: skip
     return axes
 
 

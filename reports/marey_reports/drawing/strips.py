@@ -31,7 +31,7 @@ SIDE_COLOURS = {LEFT: COLOURS[0], CENTRE: INK, RIGHT: COLOURS[1]}
 CAMERA_TILT_RAD = np.radians(10.0)
 
 # In inches.
-MARGIN, HEADER, MOMENT, GAP = 0.10, 0.42, 0.40, 0.10
+MARGIN, HEADER, ABOUT, MOMENT, GAP = 0.10, 0.42, 0.22, 0.40, 0.10
 RIM_STOPS = 0.05  # before a bone's ends
 FLOOR_SHARE = 0.09  # of a cell's height: the floor's distance from its lower edge
 FILLED = 0.84  # of a cell's height, by the highest point
@@ -78,6 +78,8 @@ def draw_strips(
     *,
     cell_in: tuple[float, float],
     legend: Sequence[tuple[str, str]] = (),
+    about: str = "",
+    whole: bool = False,
 ) -> Figure:
     """Draw a page of strips, seen from `direction_rad` about +Y (0 is a view from +z).
 
@@ -85,20 +87,25 @@ def draw_strips(
     ----------
     cell_in : width and height of a cell, inches
     legend : further elements to name in the legend, besides the left and right sides: their names and colours
+    about : text above the rows, such as "5 of 162 trials, the worst first"
+    whole : whether every body fits its cell; otherwise, the sides of cells cut off bodies that are far from the others
     """
     width, height = cell_in
     columns = len(moments.names)
     labels = _label_width(rows)
-    page = (labels + columns * width + MARGIN, HEADER + len(rows) * (height + GAP) + MOMENT)
+    header = HEADER + (ABOUT if about else 0.0)
+    page = (labels + columns * width + MARGIN, header + len(rows) * (height + GAP) + MOMENT)
     figure = new_figure(*page)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, page[0]), ylim=(0.0, page[1]))
     axes.axis("off")
     camera = Camera(direction_rad, float(CAMERA_TILT_RAD))
-    scale = _scale(body, rows, moments, camera, cell_in)
+    scale = _scale(body, rows, moments, camera, cell_in, whole=whole)
     shapes = _shapes(body, rows)
     _draw_legend(axes, labels, page[1], legend)
+    if about:
+        write(axes, (labels + 0.05, page[1] - 0.17 - ABOUT), about, color=QUIET)
     for number, row in enumerate(rows):
-        bottom = page[1] - HEADER - (number + 1) * (height + GAP) + GAP
+        bottom = page[1] - header - (number + 1) * (height + GAP) + GAP
         _draw_label(axes, row, bottom + 0.5 * height)
         for column in range(columns):
             stage = _StripCell((labels + column * width, bottom), cell_in, moments.middles[column], camera, scale)
@@ -126,7 +133,8 @@ def draw_clip_strip(poses: Sequence[Clip], frames: Sequence[int], frame_rate_hz:
     labels = [f"{frame / frame_rate_hz:.2f} s" for frame in frames]
     moments = StripMoments(middles, [f"frame {frame}" for frame in frames], labels)
     row = StripRow("", "", points[None], np.empty((0, 0, 3)))
-    figure = draw_strips(body, [row], moments, _camera_direction(points, body.facing), cell_in=POSE_CELL_IN)
+    direction = _camera_direction(points, body.facing)
+    figure = draw_strips(body, [row], moments, direction, cell_in=POSE_CELL_IN, whole=True)
     return to_svg(figure, title)
 
 
@@ -149,7 +157,9 @@ class PoseRow:
     headings_rad: Floats | None = None
 
 
-def draw_pose_rows(rows: Sequence[PoseRow], names: Sequence[str], labels: Sequence[str], *, ghost: str = "") -> Figure:
+def draw_pose_rows(
+    rows: Sequence[PoseRow], names: Sequence[str], labels: Sequence[str], *, ghost: str = "", about: str = ""
+) -> Figure:
     """Draw motions of one skeleton at T moments, one in each row; each body is in the middle of its cell.
 
     A ghost (a body of another motion, drawn in grey behind) has the same offset from the body in front as in the data.
@@ -158,6 +168,7 @@ def draw_pose_rows(rows: Sequence[PoseRow], names: Sequence[str], labels: Sequen
     ----------
     names, labels : two texts for each of the T columns, written below the column
     ghost : name of the ghosts in the legend; empty: there are none
+    about : text above the rows
     """
     body = body_of(rows[0].poses[0].skeleton)
     drawn = []
@@ -172,7 +183,7 @@ def draw_pose_rows(rows: Sequence[PoseRow], names: Sequence[str], labels: Sequen
     moments = StripMoments(np.zeros((len(names), 2)), names, labels)
     direction = _camera_direction(drawn[0].bodies[0], body.facing)
     legend = [(ghost, REFERENCE)] if ghost else []
-    return draw_strips(body, drawn, moments, direction, cell_in=POSE_CELL_IN, legend=legend)
+    return draw_strips(body, drawn, moments, direction, cell_in=POSE_CELL_IN, legend=legend, about=about, whole=True)
 
 
 def _points_of(poses: Sequence[Clip]) -> Floats:
@@ -217,15 +228,30 @@ class _StripCell:
 
 
 def _scale(
-    body: StickFigure, rows: Sequence[StripRow], moments: StripMoments, camera: Camera, cell_in: tuple[float, float]
+    body: StickFigure,
+    rows: Sequence[StripRow],
+    moments: StripMoments,
+    camera: Camera,
+    cell_in: tuple[float, float],
+    *,
+    whole: bool,
 ) -> float:
-    """Compute the scale in inches per metre at which the highest point fits, and most figures fit in width."""
+    """Compute the scale in inches per metre at which the highest point fits, and most figures fit in width.
+
+    If `whole`, every point of every body fits, with its head.
+    """
     middles = np.stack((moments.middles[:, 0], np.zeros(len(moments.middles)), moments.middles[:, 1]), axis=1)
     drawn = np.unique(np.append(body.bones, body.pelvis))
     seen = np.concatenate([camera.seen(row.bodies[:, :, drawn] - middles[:, None]).reshape(-1, 3) for row in rows])
-    highest = max(float(np.quantile(seen[:, 1], 0.999)), 1e-6)
-    widest = max(2.0 * float(np.quantile(np.abs(seen[:, 0]), 0.995)), 1e-6)
-    return min(FILLED * cell_in[1] / highest, 0.96 * cell_in[0] / widest)
+    highest = max(float(np.quantile(seen[:, 1], 1.0 if whole else 0.999)), 1e-6)
+    widest = max(2.0 * float(np.quantile(np.abs(seen[:, 0]), 1.0 if whole else 0.995)), 1e-6)
+    if not whole:
+        return min(FILLED * cell_in[1] / highest, 0.96 * cell_in[0] / widest)
+    below = max(-float(seen[:, 1].min()), 1e-6)
+    head = HEAD_SHARE * highest
+    return min(
+        FILLED * cell_in[1] / highest, 0.92 * cell_in[0] / (widest + head), FLOOR_SHARE * cell_in[1] / (below + 1e-9)
+    )
 
 
 def _label_width(rows: Sequence[StripRow]) -> float:

@@ -24,12 +24,13 @@ from marey_reports.evaluation.figures import (
 )
 from marey_schemas.documents.evaluations import CONFIDENCE
 from marey_schemas.documents.replicates import LEAST_REPLICATES
+from marey_schemas.documents.worst_first import increase, worst_first
 from marey_schemas.options.verdict import VerdictLimits
 from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
 
-MOST_TRIALS = 15
+MOST_TRIALS = 10
 LEAST_SHIFT_M = 0.005  # what is written as 0.00 is neither good nor bad
 
 
@@ -132,9 +133,9 @@ def metric_chapter(
 def trial_chapter(
     before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, figures: Figures
 ) -> Section:
-    """Write the chapter on the trials that became better or worse, the largest changes first."""
+    """Write the chapter on the trials that became better or worse, those that became worse most first."""
     pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
-    pairs.sort(key=lambda pair: (-abs(_shift(*pair)), pair[0].trial.name))
+    pairs = worst_first(pairs, lambda pair: _shift(*pair), lambda pair: pair[0].trial.name)
     changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
     text = f"The motion of the character changed in {changed:,} of {counted(len(before.trials), 'trial')}"
     text += "." if before.replicates is None else ", in the first replicate; distances are means over all replicates."
@@ -144,10 +145,16 @@ def trial_chapter(
     listing: Content = None
     if pairs:
         rows = [_trial_row(old, new, before.options.limits, after.options.limits) for old, new in pairs]
-        listing = table("The largest changes", heads, rows[:MOST_TRIALS], numbers=(1, 2, 3))
-        if len(rows) > MOST_TRIALS:
-            everything = table("All changed trials", heads, rows, numbers=(1, 2, 3))
-            listing = (listing, folded(f"All {len(rows)} changed trials", everything))
+        if len(rows) <= 2 * MOST_TRIALS:
+            listing = table("The changed trials, the worst change first", heads, rows, numbers=(1, 2, 3))
+        else:
+            worst, best = rows[:MOST_TRIALS], rows[: -MOST_TRIALS - 1 : -1]
+            everything = table("All changed trials, the worst change first", heads, rows, numbers=(1, 2, 3))
+            listing = (
+                table(f"The {MOST_TRIALS} worst changes", heads, worst, numbers=(1, 2, 3)),
+                table(f"The {MOST_TRIALS} best changes", heads, best, numbers=(1, 2, 3)),
+                folded(f"All {len(rows)} changed trials", everything),
+            )
     pictures = shown(figures, "offsets", *SCENARIO_FIGURES, *TRIAL_FIGURES)
     return Section("trials", "Changed trials", (element("p", text), listing, pictures))
 
@@ -183,19 +190,18 @@ def _names(title: str, uids: Sequence[str], names: Mapping[str, str]) -> Html:
 def _trial_row(old: TrialResult, new: TrialResult, *limits: VerdictLimits) -> list[Cell]:
     offsets = [each.metrics.get("offset_mean") for each in (old, new)]
     shift = _shift(old, new)
-    look = "" if abs(shift) < LEAST_SHIFT_M else "good" if shift < 0.0 else "bad"
+    look = "" if shift is None or abs(shift) < LEAST_SHIFT_M else "good" if shift < 0.0 else "bad"
     return [
         element("span", demand(old.trial), title=old.trial.name),
         *(number(offset) for offset in offsets),
-        number(shift if None not in offsets else None, signed=True, look=look),
+        number(shift, signed=True, look=look),
         *("yes" if judge_trial(each, own).followed else "no" for each, own in zip((old, new), limits, strict=True)),
     ]
 
 
-def _shift(old: TrialResult, new: TrialResult) -> float:
-    """Compute the change of a trial's mean offset in metres; 0 if one of the two offsets is not defined."""
-    first, second = old.metrics.get("offset_mean"), new.metrics.get("offset_mean")
-    return 0.0 if first is None or second is None else second - first
+def _shift(old: TrialResult, new: TrialResult) -> float | None:
+    """Compute the change of a trial's mean offset in metres; None if one of the two offsets is not defined."""
+    return increase(old.metrics.get("offset_mean"), new.metrics.get("offset_mean"))
 
 
 def _interval(change: MetricChange | None, digits: int) -> Number:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from marey_motion.evaluation.compare import Comparison
 from marey_motion.evaluation.result import EvaluationResult
+from marey_reports.drawing.head import ReportHead, ReportInput
 from marey_reports.drawing.markup import element
 from marey_reports.drawing.page import Section, page
 from marey_reports.evaluation.chapters import (
@@ -29,22 +30,33 @@ from marey_reports.evaluation.comparison import (
 )
 from marey_reports.evaluation.definitions import definitions
 from marey_reports.evaluation.figures import DrawnFigure, draw_figures
+from marey_reports.evaluation.played import PlayedTrial, played_chapter
 from marey_reports.evaluation.provenance import provenance
 from marey_reports.evaluation.sentences import region_verdicts, verdict
 
 __all__ = ["compared", "render_comparison", "render_report"]
 
 
-def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str, DrawnFigure] | None = None) -> str:
+def render_report(
+    result: EvaluationResult,
+    *,
+    title: str,
+    figures: Mapping[str, DrawnFigure] | None = None,
+    inputs: Sequence[ReportInput] = (),
+    played: Sequence[PlayedTrial] = (),
+) -> str:
     """Render the report of one evaluation as an HTML document.
 
     Parameters
     ----------
     title : heading of the page, for example the name of the dataset
     figures : figures by name, as returned by `draw_figures`; if None, they are drawn. Missing figures are left out
+    inputs : the evaluated revisions, for the head
+    played : trials whose motion the page shows
     """
     drawn = draw_figures(result) if figures is None else figures
     sections = [
+        *([played_chapter(played, len(result.trials))] if played else []),
         coverage_chapter(result, drawn),
         error_chapter(result, drawn),
         load_chapter(result, drawn),
@@ -57,7 +69,8 @@ def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str,
     ]
     regions = element("ul", [element("li", region.sentence) for region in region_verdicts(result)], class_="regions")
     lead = element("p", verdict(result), class_="verdict"), regions, headline(result)
-    return page(title, lead, sections, f"Written by Marey {result.provenance.code_version}.")
+    head = ReportHead("Evaluation of clips", title, result.provenance.code_version, inputs)
+    return page(head, lead, sections, plays_motion=bool(played))
 
 
 def render_comparison(
@@ -68,6 +81,7 @@ def render_comparison(
     comparison: Comparison | None = None,
     labels: tuple[str, str] = ("before", "after"),
     figures: Mapping[str, DrawnFigure] | None = None,
+    inputs: Sequence[ReportInput] = (),
 ) -> str:
     """Render the report of two evaluations as an HTML document.
 
@@ -76,6 +90,7 @@ def render_comparison(
     comparison : comparison of `before` and `after`; adds confidence intervals, and marks trials that differ in any tick
     labels : names of both evaluations in figures and tables
     figures : figures by name, as returned by `draw_figures` for two results; if None, they are drawn
+    inputs : the two revisions, for the head
     """
     drawn = draw_figures(before, other=after, labels=labels) if figures is None else figures
     sections = [
@@ -87,4 +102,5 @@ def render_comparison(
         Section("provenance", "Provenance", provenance([before, after], labels)),
     ]
     lead = element("p", compared(before, after), class_="verdict"), headline_of_two(before, after, labels)
-    return page(title, lead, sections, f"Written by Marey {after.provenance.code_version}.")
+    head = ReportHead("Comparison of two evaluations", title, after.provenance.code_version, inputs)
+    return page(head, lead, sections)

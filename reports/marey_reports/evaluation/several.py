@@ -10,6 +10,7 @@ from marey_motion.evaluation.compare import Comparison
 from marey_motion.evaluation.judgement import judge
 from marey_motion.evaluation.relevance import recorded_rows, sum_by_source
 from marey_motion.evaluation.result import EvaluationResult, interval_of
+from marey_reports.drawing.head import ReportHead, ReportInput
 from marey_reports.drawing.markup import Html, element
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.tables import Cell, Number, number, table
@@ -28,6 +29,7 @@ def render_several(
     title: str,
     labels: Sequence[str],
     figures: Mapping[str, DrawnFigure] | None = None,
+    inputs: Sequence[ReportInput] = (),
 ) -> str:
     """Render the report of several evaluations under one normaliser as an HTML document.
 
@@ -37,6 +39,7 @@ def render_several(
     comparisons : comparisons of all others with the first
     labels : names of the evaluations, in the same order
     figures : figures by name, as returned by `draw_shared_figures`; if None, they are drawn
+    inputs : the compared revisions, for the head
     """
     drawn = draw_shared_figures(results, labels) if figures is None else figures
     said = [
@@ -50,12 +53,9 @@ def render_several(
         Section("definitions", "Definitions", definitions(results[0].options.limits)),
         Section("provenance", "Provenance", provenance(results, labels)),
     ]
-    return page(
-        title,
-        element("ul", said, class_="regions"),
-        sections,
-        f"Written by Marey {results[0].provenance.code_version}.",
-    )
+    subject = f"Comparison of {len(results)} evaluations"
+    head = ReportHead(subject, title, results[0].provenance.code_version, inputs)
+    return page(head, element("ul", said, class_="regions"), sections)
 
 
 def _sets(results: Sequence[EvaluationResult], labels: Sequence[str]) -> Html:

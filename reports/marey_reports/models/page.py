@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.modelling.verdict import verdict_of
 from marey_motion.version import code_version
 from marey_reports.drawing.drawn import DrawnFigure
+from marey_reports.drawing.head import ReportHead, ReportInput
 from marey_reports.drawing.markup import Html, element, joined
 from marey_reports.drawing.page import Section, page
 from marey_reports.drawing.tables import folded, table
@@ -35,6 +36,7 @@ def render_model_report(
     *,
     title: str,
     origin: Mapping[str, Any],
+    inputs: Sequence[ReportInput] = (),
 ) -> str:
     """Render the report of a model as an HTML document.
 
@@ -45,6 +47,7 @@ def render_model_report(
     figures : figures by name, as returned by `draw_alignment_figures` and `draw_model_figures`; some may be missing
     title : heading of the page, for example the name of the model
     origin : field `provenance` of the part `model`: origin of the model and of its examples
+    inputs : the revisions that the model was made from, for the head
     """
     sections = [
         warning_chapter(trained),
@@ -57,7 +60,7 @@ def render_model_report(
         Section("provenance", "Provenance", provenance(trained, origin)),
     ]
     lead = element("p", verdict_of(trained), class_="verdict"), headline(trained)
-    return page(title, lead, sections, f"Written by Marey {code_version()}.")
+    return page(ReportHead("Model of motion", title, code_version(), inputs), lead, sections)
 
 
 def provenance(trained: TrainedPrimitive, origin: Mapping[str, Any]) -> Html:

@@ -8,6 +8,7 @@ import numpy as np
 
 from marey_motion.version import code_version
 from marey_reports.drawing.drawn import DrawnFigure
+from marey_reports.drawing.head import ReportHead, ReportInput
 from marey_reports.drawing.markup import Html, element, joined
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.paper import labels_of
@@ -53,7 +54,9 @@ def draw_distance_figures(subject: ComparedSet) -> dict[str, DrawnFigure]:
     return figures
 
 
-def render_distances(subject: ComparedSet, figures: Mapping[str, DrawnFigure], *, title: str) -> str:
+def render_distances(
+    subject: ComparedSet, figures: Mapping[str, DrawnFigure], *, title: str, inputs: Sequence[ReportInput] = ()
+) -> str:
     """Render the report of a comparison as an HTML document.
 
     Parameters
@@ -61,6 +64,7 @@ def render_distances(subject: ComparedSet, figures: Mapping[str, DrawnFigure], *
     subject : clips with their distances
     figures : figures by name, as returned by `draw_distance_figures`
     title : heading of the page
+    inputs : the compared revisions, for the head
     """
     maps = [name for name in figures if name != "distances"]
     sections = [
@@ -71,7 +75,7 @@ def render_distances(subject: ComparedSet, figures: Mapping[str, DrawnFigure], *
         Section("metric", "The metric", _metric(subject)),
     ]
     lead = element("p", _verdict(subject), class_="verdict"), _headline(subject)
-    return page(title, lead, sections, f"Written by Marey {code_version()}.")
+    return page(ReportHead("Perceptual distances of clips", title, code_version(), inputs), lead, sections)
 
 
 def _verdict(subject: ComparedSet) -> str:

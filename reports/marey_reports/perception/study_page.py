@@ -12,6 +12,7 @@ from marey_motion.perception.ordering import MotionOrder
 from marey_motion.perception.study_analysis import FittedMetric, StudyAnalysis
 from marey_motion.version import code_version
 from marey_reports.drawing.drawn import DrawnFigure, Sketch
+from marey_reports.drawing.head import ReportHead, ReportInput
 from marey_reports.drawing.markup import Content, element, joined
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.paper import (
@@ -32,12 +33,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _BOUNDARY = "#009e73"
-_LEFT, _BOTTOM, _TOP, _PER_MOTION = 1.1, 1.15, 0.45, 0.26
+_LEFT, _BOTTOM, _TOP, _PER_MOTION = 1.1, 1.35, 0.45, 0.26
 _LEAST_SIDE = 3.2
 
 
 def render_study_report(
-    analysis: StudyAnalysis, names: Sequence[str], refusals: Sequence[str] = (), *, title: str
+    analysis: StudyAnalysis,
+    names: Sequence[str],
+    refusals: Sequence[str] = (),
+    *,
+    title: str,
+    inputs: Sequence[ReportInput] = (),
 ) -> str:
     """Render the report of a study as an HTML document.
 
@@ -47,6 +53,7 @@ def render_study_report(
     names : name of each motion, for people: its label in the study, or the name of the clip
     refusals : further reasons why a part of the analysis could not be computed
     title : heading of the page
+    inputs : the analysed revision of the study, for the head
     """
     figures: dict[str, DrawnFigure] = {}
     if analysis.order is not None:
@@ -60,7 +67,8 @@ def render_study_report(
         Section("fits", "Fitted metrics", _fits(analysis, refusals)),
         Section("reading", "How to read this", _reading()),
     ]
-    return page(title, _summary(analysis), sections, f"Written by Marey {code_version()}.")
+    head = ReportHead("Study of perceived differences", title, code_version(), inputs)
+    return page(head, _summary(analysis), sections)
 
 
 # -- figures ----------------------------------------------------------------------------------------------------------

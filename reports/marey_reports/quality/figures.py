@@ -28,7 +28,7 @@ from marey_schemas.documents.quality import (
     MeasuredSet,
     QualityDocument,
     QualityTotal,
-    worst_first,
+    worst_clips_first,
 )
 from marey_schemas.wording import counted
 
@@ -61,7 +61,7 @@ class _Bar(NamedTuple):
 
 def draw_clips(document: QualityDocument) -> Sketch:
     """Draw the totals and the worst clips as bars, with a line at the total of the reference."""
-    ordered = worst_first(document.measured.clips)
+    ordered = worst_clips_first(document.measured.clips)
     shown = ordered[:MOST_CLIPS_DRAWN]
     bars = [*_totals(document)]
     labels = labels_of([clip.name for clip in shown])
@@ -137,7 +137,7 @@ def draw_travel(document: QualityDocument) -> Sketch:
             other = _shares(getattr(document.reference, member))
             panel.stairs(other, edges, color=COLOURS[1], lw=1.6, label="reference")
             tables[name]["reference_percent"] = other
-            add_keys(panel, loc="upper right")
+            add_keys(panel, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     caption = (
         "Windows of one second by their mean speed and turn rate. Windows beyond the ends of an axis count in its "
         "outermost bins; clips shorter than a second have none."

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from marey_reports.drawing.drawn import DrawnFigure, as_csv
+from marey_reports.drawing.head import ReportHead, ReportInput
 from marey_reports.drawing.markup import Html, element, joined
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.tables import Cell, facts, folded, number, table
@@ -17,7 +18,7 @@ from marey_schemas.documents.quality import (
     QualityDocument,
     QualityTotal,
     command_with,
-    worst_first,
+    worst_clips_first,
 )
 from marey_schemas.wording import counted
 
@@ -32,7 +33,13 @@ def draw_quality_figures(document: QualityDocument) -> dict[str, DrawnFigure]:
     }
 
 
-def render_quality(document: QualityDocument, figures: Mapping[str, DrawnFigure], *, title: str) -> str:
+def render_quality(
+    document: QualityDocument,
+    figures: Mapping[str, DrawnFigure],
+    *,
+    title: str,
+    inputs: Sequence[ReportInput] = (),
+) -> str:
     """Render the report as an HTML document.
 
     Parameters
@@ -40,6 +47,7 @@ def render_quality(document: QualityDocument, figures: Mapping[str, DrawnFigure]
     document : the measured clips
     figures : figures by name, as returned by `draw_quality_figures`
     title : heading of the page
+    inputs : the measured revisions, for the head
     """
     sections = [
         Section("totals", "Totals", _totals(document)),
@@ -51,7 +59,7 @@ def render_quality(document: QualityDocument, figures: Mapping[str, DrawnFigure]
     if document.refused:
         sections.insert(2, Section("refused", "Clips that could not be measured", _refused(document)))
     lead = element("p", verdict(document), class_="verdict"), _headline(document)
-    return page(title, lead, sections, f"Written by Marey {document.code_version}.")
+    return page(ReportHead("Quality of clips", title, document.code_version, inputs), lead, sections)
 
 
 def quality_csv(document: QualityDocument) -> str:
@@ -152,7 +160,7 @@ def is_worse(name: str, change: QualityChange) -> bool:
 
 
 def _clips(document: QualityDocument) -> Html:
-    ordered = worst_first(document.measured.clips)
+    ordered = worst_clips_first(document.measured.clips)
     names = [*DRAWN_MEASURES, "speed_m_s"]
     heads = ("clip", "s", *(_headed(name) for name in names))
     rows: list[Sequence[Cell]] = [

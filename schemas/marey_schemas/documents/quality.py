@@ -9,6 +9,7 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.documents.worst_first import worst_first
 from marey_schemas.options.quality import QualityOptions
 
 QUALITY_CODE = "quality@1"
@@ -232,9 +233,9 @@ class QualityDocument(Request):
     refused: tuple[dict[str, str], ...] = Field((), description="Clips that could not be measured, with the reasons.")
 
 
-def worst_first(clips: Iterable[QualityRow]) -> list[QualityRow]:
-    """Sort clips by the main measure, the greatest value first."""
-    return sorted(clips, key=lambda clip: -(clip.values[MAIN_MEASURE] or 0.0))
+def worst_clips_first(clips: Iterable[QualityRow]) -> list[QualityRow]:
+    """Sort clips by the main measure, the greatest value first; clips without a value come last."""
+    return worst_first(clips, lambda clip: clip.values[MAIN_MEASURE], lambda clip: clip.name)
 
 
 def differing_conditions(one: QualityConditions, other: QualityConditions) -> dict[str, tuple[object, object]]:

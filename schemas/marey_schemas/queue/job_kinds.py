@@ -185,7 +185,7 @@ MODEL = KindDeclaration(
     description="Learns a generative model of one action from aligned clips.",
     params=job_params.ModelParams,
     implementation="marey_worker.kinds.model:run",
-    version=3,
+    version=4,
     inputs={
         "aligned": InputSpec(
             kind=Kind.PROCESSED, many=True, description="Clips of one action that were aligned with each other."
@@ -225,7 +225,7 @@ ANALYSE_STUDY = KindDeclaration(
     "jobs.",
     params=job_params.AnalyseStudyParams,
     implementation="marey_worker.kinds.analyse_study:run",
-    version=1,
+    version=2,
     inputs={"study": InputSpec(kind=Kind.STUDY, description="The study, at the revision that its participants saw.")},
     outputs={"document": "file", "report": "file", "fitted": "file"},
     never_cached_for=_reads_answers,

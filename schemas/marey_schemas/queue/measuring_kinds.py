@@ -35,7 +35,7 @@ EVALUATE = KindDeclaration(
     implementation="marey_worker.kinds.evaluate:run",
     gathering="marey_worker.kinds.evaluate:gather",
     task_count=job_params.count_evaluation_tasks,
-    version=5,
+    version=6,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
         "rig": RIG,
@@ -57,7 +57,7 @@ COMPARE = KindDeclaration(
     "evaluations are compared with the first one.",
     params=job_params.CompareParams,
     implementation="marey_worker.kinds.compare:run",
-    version=4,
+    version=5,
     inputs={
         "before": InputSpec(
             kind=Kind.EVALUATION,
@@ -84,7 +84,7 @@ DISTANCES = KindDeclaration(
     "registration curves.",
     params=job_params.DistancesParams,
     implementation="marey_worker.kinds.distances:run",
-    version=1,
+    version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to compare, all of one skeleton."),
         "metric": METRIC,
@@ -99,7 +99,7 @@ QUALITY = KindDeclaration(
     "exceeded joint limits; also speed and turn rate.",
     params=job_params.QualityParams,
     implementation="marey_worker.kinds.quality:run",
-    version=1,
+    version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to measure, of any skeletons."),
         "reference": InputSpec(

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
+from datetime import datetime
 from functools import partial
 from typing import Any, Literal
 
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.documents.report_pages import PLAYER_PLACE, ReportOrigin, with_origin, with_player
 from marey_schemas.documents.reports import REPORTS, StoredFigure, StoredFile
 from marey_schemas.documents.reports import Report as ReportDocument
+from marey_schemas.items import Revision
 from marey_schemas.kinds import Kind
+from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
+from marey_server.handlers.browser.pages import packed_player
 from marey_server.handlers.items import kind_of
-from marey_server.http.caching import caching_of_revision
+from marey_server.http.caching import REVALIDATED, caching_of_revision
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.queries import MAX_INTEGER
 from marey_server.http.reply import Rendered, Reply
@@ -21,7 +28,7 @@ from marey_server.http.resource import Resource
 from marey_server.http.streaming import BlobSender, attachment
 from marey_server.motions import walk_graphs
 from marey_server.motions.walk_graphs import MEDIA_TYPES, WalkGraphFormat
-from marey_server.store import items
+from marey_server.store import blobs, items
 from marey_server.store.transaction import Transaction
 
 FIGURE_TYPES = {
@@ -30,6 +37,9 @@ FIGURE_TYPES = {
     "csv": "text/csv; charset=utf-8",
     "json": "application/json",
 }
+PAGE_TYPE = "text/html; charset=utf-8"
+MOST_FILLED_BYTES = 16 * MIB
+"""Greatest size of a page that is read into memory to fill its places; reports of Marey have up to a few MB."""
 SHOWN_ONLY = "default-src 'none'; base-uri 'none'; form-action 'none'; style-src 'unsafe-inline'; img-src data:"
 """Content-Security-Policy that forbids the page to load, send or store anything."""
 
@@ -68,7 +78,50 @@ class StoredFileSender(BlobSender):
         )
 
 
-class ItemReport(StoredFileSender):
+class ReportSender(StoredFileSender):
+    """Base of resources that answer with the page of a report.
+
+    The stored page has empty places for its origin and for the player. They are filled here, because the stored bytes
+    depend only on what the report was computed from (decision record 0091).
+    """
+
+    async def send_report(
+        self, file: StoredFile, origin: ReportOrigin, scripts: Sequence[str] = ()
+    ) -> Reply | Rendered | None:
+        """Answer with a page and its origin; a page that runs `scripts` and has a place for the player also gets it.
+
+        `scripts` are digests of the page's scripts. Pages above `MOST_FILLED_BYTES` are sent as they are stored.
+        """
+        if file.size_bytes > MOST_FILLED_BYTES:
+            return await self.send_file(file, PAGE_TYPE, REVALIDATED, _sandbox(scripts))
+        self.holding.grow(2 * file.size_bytes)
+        page = with_origin(await self.look_up(_read_page, file.blob), origin)
+        if scripts and PLAYER_PLACE.encode() in page and (player := await self.compute(packed_player)) is not None:
+            self.holding.grow(len(player.content))
+            page, scripts = with_player(page, player.content), [*scripts, player.script]
+        headers = {
+            "Cache-Control": REVALIDATED,
+            "Content-Disposition": "inline",
+            "Content-Security-Policy": f"{SHOWN_ONLY}; {_sandbox(scripts)}",
+        }
+        return Reply(page, rev=hashlib.sha256(page).hexdigest()[:32], media_type=PAGE_TYPE, headers=headers)
+
+    def origin(self, project: str, author: str | None, made_at: datetime) -> ReportOrigin:
+        """Return the origin of a report, with the address at which the caller has reached the server."""
+        address = self.services.settings.public_url or f"{self.request.protocol}://{self.request.host}"
+        return ReportOrigin(project, address.rstrip("/"), author, made_at)
+
+
+def _sandbox(scripts: Sequence[str]) -> str:
+    """Return the part of the content security policy that allows only the scripts with these digests."""
+    return f"script-src {' '.join(map(repr, scripts))}; sandbox allow-scripts" if scripts else "sandbox"
+
+
+def _read_page(tx: Transaction, digest: str) -> bytes:
+    return blobs.read_blob(tx, digest, 0, blobs.require_readable(tx, digest))
+
+
+class ItemReport(ReportSender):
     """Report of an evaluation or a model."""
 
     path = "/projects/{project}/{kind}/{item}/report"
@@ -83,11 +136,11 @@ class ItemReport(StoredFileSender):
         also=((206, None), (416, None)),
         headers=("Range", "If-Range"),
     )
-    async def get(self, project: str, kind: str, item: str, query: ReportQuery) -> Rendered | None:
+    async def get(self, project: str, kind: str, item: str, query: ReportQuery) -> Reply | Rendered | None:
         """Return the report of an item (kinds `evaluations`, `models`) as one self-contained HTML page."""
-        report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
-        caching = caching_of_revision(query.revision)
-        return await self.send_file(report.html, "text/html; charset=utf-8", caching, _scripts(report))
+        report, revision = await self.look_up(read_report_of, project, kind_of(kind), item, query.revision)
+        origin = self.origin(project, revision.author, revision.created_at)
+        return await self.send_report(report.html, origin, report.scripts)
 
 
 class Figure(StoredFileSender):
@@ -112,17 +165,19 @@ class Figure(StoredFileSender):
         return await self.send_file(file, FIGURE_TYPES[query.format], caching_of_revision(query.revision), "sandbox")
 
 
-def _scripts(report: ReportDocument) -> str:
-    """Return the part of the content security policy that allows only the page's own scripts, listed by digest."""
-    if not report.scripts:
-        return "sandbox"
-    return f"script-src {' '.join(repr(digest) for digest in report.scripts)}; sandbox allow-scripts"
+def read_report_of(
+    tx: Transaction, project: str, kind: Kind, item_id: str, number: int | None
+) -> tuple[ReportDocument, Revision]:
+    """Return the report of an item, and the revision that it belongs to. Raises `NotFoundProblem`."""
+    part = items.read_part(tx, project, kind, item_id, "report", revision=number, arrays="none")
+    tree: dict[str, Any] = part.tree
+    report = _REPORT_OF[tree["schema"]].model_validate(tree)
+    return report, items.read_revision(tx, project, kind, item_id, part.revision)
 
 
 def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ReportDocument:
     """Return the report of an evaluation or a model. Raises `NotFoundProblem` if the item has no report."""
-    part: dict[str, Any] = items.read_part(tx, project, kind, item_id, "report", revision=revision, arrays="none").tree
-    return _REPORT_OF[part["schema"]].model_validate(part)
+    return read_report_of(tx, project, kind, item_id, revision)[0]
 
 
 _REPORT_OF = {str(one.model_fields["schema_"].default): one for one in REPORTS}

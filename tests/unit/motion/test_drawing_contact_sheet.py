@@ -3,21 +3,29 @@
 import io
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.text import Annotation
 from tests.support.present import present
+from tests.support.real_takes import read_takes
 
 from marey_motion import quaternions
 from marey_motion.arrays import AnyFloats, Ints
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
+from marey_motion.rigs import map_joints
 from marey_motion.skeleton import EndSite, Skeleton
 from marey_reports.drawing import contact_sheet as sheets
 from marey_reports.drawing.contact_sheet import (
+    BONE_POINTS,
     DPI,
     HEADER,
     MARGIN,
@@ -103,7 +111,9 @@ def test_a_title_is_taken_literally_and_a_long_one_is_cut(walk: Clip) -> None:
     contact_sheet([TakePair(r"cost $5 and \frac{1}{0} ^_ {", walk, walk), TakePair("x" * 5000, walk, walk)])
 
 
-@pytest.mark.parametrize(("total", "said"), [(None, "1 take, "), (1, "1 take, "), (24, "1 of 24 takes, ")])
+@pytest.mark.parametrize(
+    ("total", "said"), [(None, "1 take, each"), (1, "1 take, each"), (24, "1 of 24 takes, the worst first, each")]
+)
 def test_a_sheet_says_how_many_of_all_takes_it_shows(
     walk: Clip, monkeypatch: pytest.MonkeyPatch, total: int | None, said: str
 ) -> None:
@@ -115,7 +125,7 @@ def test_a_sheet_says_how_many_of_all_takes_it_shows(
         return original(axes, place, text, *arguments, **options)
 
     monkeypatch.setattr(sheets, "_write", written)
-    contact_sheet([TakePair("walk", walk, walk)], moments=1, total=total)
+    contact_sheet([TakePair("walk", walk, walk)], moments=1, total=total, choice="the worst first")
     assert any(text.startswith(said) for text in texts)
 
 
@@ -228,3 +238,76 @@ def test_a_body_lying_on_its_side_is_drawn_without_an_arrow() -> None:
 
     assert stances_at(lying, body_of(lying.skeleton), np.array([0])).facing is None
     assert contact_sheet([TakePair("lying", lying, clip)]).startswith(b"\x89PNG")
+
+
+def raised(clip: Clip, axis: tuple[float, float, float], turn_rad: float) -> Clip:
+    """Return a clip whose upper arms are turned about an axis, both alike."""
+    poses = clip.poses.copy()
+    mapping = map_joints(clip.skeleton)
+    for joint in mapping.indices(clip.skeleton, ["left_shoulder", "right_shoulder"]):
+        own = slice(3 + 4 * joint, 7 + 4 * joint)
+        poses[:, own] = quaternions.multiply(quaternions.from_axis_angle(axis, turn_rad), poses[:, own])
+    return replace(clip, poses=poses)
+
+
+def lifted(clip: Clip, metres: float) -> Clip:
+    poses = clip.poses.copy()
+    poses[:, 1] += metres
+    return replace(clip, poses=poses)
+
+
+def toppled(clip: Clip, axis: tuple[float, float, float]) -> Clip:
+    poses = clip.poses.copy()
+    poses[:, 3:7] = quaternions.multiply(quaternions.from_axis_angle(axis, np.pi / 2), poses[:, 3:7])
+    return replace(clip, poses=poses)
+
+
+def beyond_their_cells(figure: Figure) -> list[str]:
+    """Return the parts of bodies, floors and arrows that leave the cell in which most of them lies."""
+    (axes,) = figure.axes
+    cells = np.array([patch.get_bbox().get_points() for patch in axes.patches if isinstance(patch, Rectangle)])
+    parts: list[tuple[str, Any]] = []
+    for lines in axes.collections:
+        assert isinstance(lines, LineCollection)
+        parts.append(("bones", np.concatenate(lines.get_segments())))
+    for patch in axes.patches:
+        if isinstance(patch, Ellipse):  # heads and patches of floor
+            half = 0.5 * np.array((patch.width, patch.height))
+            parts.append((type(patch).__name__, np.stack((patch.center - half, patch.center + half))))
+    below = float(cells[:, 1, 1].max())
+    arrows = [note for note in axes.texts if isinstance(note, Annotation) and note.xy[1] < below]
+    parts += [("arrow", np.array((note.xy, note.xyann))) for note in arrows]
+    assert len(parts) >= 3 * len(cells)
+    line = 0.5 * BONE_POINTS / 72.0
+    found = []
+    for name, points in parts:
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        low, high = cells[np.argmin(np.linalg.norm(cells.mean(axis=1) - middle, axis=1))]
+        if (points < low + line).any() or (points > high - line).any():
+            found.append(name)
+    return found
+
+
+@pytest.mark.parametrize("moments", [6, 12])
+def test_no_pose_no_floor_and_no_arrow_leaves_its_cell(
+    walk: Clip, monkeypatch: pytest.MonkeyPatch, moments: int
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(sheets, "to_png", drawn.append)
+    upright, ahead, aside = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+    clips = [
+        walk, *(raised(walk, axis, turn) for axis in (upright, ahead, aside) for turn in (-2.5, -1.2, 1.2, 2.5)),
+        *(toppled(walk, axis) for axis in (ahead, aside)), lifted(walk, -1.5), lifted(walk, 2.0),
+    ]  # fmt: skip
+    for clip in clips:
+        contact_sheet([TakePair("a take", clip, walk)], moments=moments)
+    assert [beyond_their_cells(figure) for figure in drawn] == [[]] * len(clips)
+
+
+def test_no_real_pose_leaves_its_cell(mocap: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(sheets, "to_png", drawn.append)
+    takes = read_takes(mocap, "cmu-amc/49/*", "bandai-namco-1/*.bvh")[:12]
+    assert len(takes) > 3
+    contact_sheet([TakePair(take.name, take.clip, take.clip) for take in takes], total=130, choice="the worst first")
+    assert beyond_their_cells(drawn[0]) == []

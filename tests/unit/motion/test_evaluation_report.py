@@ -92,7 +92,8 @@ def test_without_figures_a_report_draws_them(
 
 
 def test_the_page_opens_with_the_verdict(page: Page, result: EvaluationResult) -> None:
-    assert page.text.startswith("Walks Walks " + verdict(result))
+    head = "Walks – Evaluation of clips Evaluation of clips Walks Marey 1.2.3 "
+    assert page.text.startswith(head + verdict(result))
 
 
 def test_pictures_and_tables_can_be_read_aloud(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from collections.abc import Iterable
 from typing import Any
 
 from marey_reports.drawing.drawn import DrawnFigure
+from marey_reports.drawing.head import ReportInput
+from marey_reports.drawing.page import scripts_of
 from marey_schemas.documents.reports import Report, StoredFigure, StoredFile
 from marey_worker.context import Context
+
+
+def inputs_of(context: Context) -> tuple[ReportInput, ...]:
+    """Return the inputs of the job for the head of its report, in the order of the submission."""
+    pins = (pin for many in context.inputs.values() for pin in many)
+    return tuple(ReportInput(pin.kind.value, pin.path, pin.revision) for pin in pins)
 
 
 def store_report(
@@ -20,21 +26,11 @@ def store_report(
         {
             "title": title,
             "html": _stored(context, page.encode()),
-            "scripts": _scripts(page),
+            "scripts": scripts_of(page),
             "figures": tuple(stored_figure(context, figure, trial) for trial, figure in figures),
         }
     )
     return report.model_dump(mode="json", by_alias=True)
-
-
-def _scripts(page: str) -> tuple[str, ...]:
-    """Return the SHA-256 digest of the page's script, or an empty tuple if the page has none.
-
-    The script is the last `<script>` in the page, because earlier ones can be parts of names of clips.
-    """
-    _, found, rest = page.rpartition("<script>")
-    digest = hashlib.sha256(rest.partition("</script>")[0].encode()).digest()
-    return (f"sha256-{base64.b64encode(digest).decode()}",) if found else ()
 
 
 def stored_figure(context: Context, figure: DrawnFigure, trial: str | None = None) -> StoredFigure:

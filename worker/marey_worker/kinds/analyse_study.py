@@ -37,6 +37,7 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import store_document, store_file
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.stored_reports import inputs_of
 
 
 def run(context: Context, params: AnalyseStudyParams) -> dict[str, Any]:
@@ -63,7 +64,8 @@ def run(context: Context, params: AnalyseStudyParams) -> dict[str, Any]:
         result["fitted"] = store_document(context, metric_to_tree(analysis, analysis.fits[0], ref))
     if params.report:
         context.progress(0, None, "writing the report")
-        page = render_study_report(analysis, _names(context, study), refusal, title=params.title or study.title)
+        title, names = params.title or study.title, _names(context, study)
+        page = render_study_report(analysis, names, refusal, title=title, inputs=inputs_of(context))
         result["report"] = store_file(context, page.encode())
     return result
 

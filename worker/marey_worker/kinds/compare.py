@@ -9,6 +9,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import Comparison, compare_several, require_same_conditions
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree
 from marey_motion.evaluation.result import EvaluationResult
+from marey_reports.drawing.head import ReportInput
 from marey_reports.evaluation.page import render_comparison
 from marey_reports.evaluation.several import render_several
 from marey_schemas.documents.evaluations import MOST_EVALUATIONS_COMPARED
@@ -17,6 +18,7 @@ from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import read_result, store_document, store_file
 from marey_worker.job_io.matching_clips import refusing_motion_errors
+from marey_worker.job_io.stored_reports import inputs_of
 
 
 def run(context: Context, params: CompareParams) -> dict[str, Any]:
@@ -47,7 +49,8 @@ def run(context: Context, params: CompareParams) -> dict[str, Any]:
         result["others"] = [{"evaluation": pin.path, **_counts(one)} for one, pin in counts]
     if params.report:
         context.progress(len(pins) + 1, len(pins) + 2, "writing the report")
-        result["report"] = store_file(context, _report(params, pins, results, comparisons).encode())
+        page = _report(params, pins, results, comparisons, inputs_of(context))
+        result["report"] = store_file(context, page.encode())
     return result
 
 
@@ -74,15 +77,16 @@ def _report(
     pins: Sequence[PinnedInput],
     results: Sequence[EvaluationResult],
     comparisons: Sequence[Comparison],
+    inputs: Sequence[ReportInput],
 ) -> str:
     names = [pin.name for pin in pins]
     paths = [pin.path for pin in pins]
     title = params.title or f"{', '.join(paths[:-1])} and {paths[-1]}"
     if len(pins) > 2:
         labels = names if len(set(names)) == len(names) else paths
-        return render_several(results, comparisons, title=title, labels=labels)
+        return render_several(results, comparisons, title=title, labels=labels, inputs=inputs)
     pair = (names[0], names[1]) if names[0] != names[1] else ("before", "after")
-    return render_comparison(results[0], results[1], title=title, comparison=comparisons[0], labels=pair)
+    return render_comparison(results[0], results[1], title=title, comparison=comparisons[0], labels=pair, inputs=inputs)
 
 
 def _counts(comparison: Comparison) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from marey_worker.job_io.evaluated_set import store_document, store_file
 from marey_worker.job_io.matching_clips import ClipSet, common_rig, is_loop, read_motions, refusing_motion_errors
 from marey_worker.job_io.refusals import Refusals
 from marey_worker.job_io.skeleton_cache import read_rigged
-from marey_worker.job_io.stored_reports import stored_figure
+from marey_worker.job_io.stored_reports import inputs_of, stored_figure
 
 Prepared = tuple[PinnedInput, ComparableClip]
 
@@ -59,7 +59,8 @@ def run(context: Context, params: DistancesParams) -> dict[str, Any]:
         context.progress(0, None, "writing the report")
         title = params.title or " and ".join(clip.name for clip in clips[:2]) + (" …" if len(clips) > 2 else "")
         figures = draw_distance_figures(subject)
-        result["report"] = store_file(context, render_distances(subject, figures, title=title).encode())
+        page = render_distances(subject, figures, title=title, inputs=inputs_of(context))
+        result["report"] = store_file(context, page.encode())
         stored = [stored_figure(context, figure) for figure in figures.values()]
         result["figures"] = [figure.model_dump(mode="json", by_alias=True) for figure in stored]
     return result

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+from marey_client.poses.player_pages import ShownMotion, page_data
+from marey_motion.clip import Clip
+from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_motion.evaluation.held_out import take_trials
 from marey_motion.evaluation.judgement import judge
 from marey_motion.evaluation.perceived import PerceivedRows
@@ -14,14 +18,17 @@ from marey_motion.evaluation.relevance import recorded_rows, sum_by_source
 from marey_motion.evaluation.replicates import MeasuredReplicates, run_replicates
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
-from marey_motion.evaluation.scenario import Trial, suite_trials
+from marey_motion.evaluation.scenario import Trial, demand, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
 from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.display import displayed_clip
 from marey_motion.matching.record import TrialRecord
 from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
 from marey_reports.evaluation.page import render_report
+from marey_reports.evaluation.played import PlayedTrial, choose_played
 from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_schemas.documents.evaluations import HEADLINE_METRICS
+from marey_schemas.documents.references import OutputRef
 from marey_schemas.documents.reports import EvaluationReport
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.kinds import Kind
@@ -32,9 +39,15 @@ from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.chosen_metric import read_metric
 from marey_worker.job_io.matching_clips import read_clips, refusing_motion_errors, uid_of, wanted_clips
-from marey_worker.job_io.stored_reports import store_report
+from marey_worker.job_io.stored_reports import inputs_of, store_report
 
 GATHERING_STEPS = 4
+MOST_RATE_HZ = 30.0
+"""Greatest frame rate of a played trial."""
+MOST_BYTES = 750_000
+"""Greatest size of a played trial in a page, if nothing could be compressed."""
+_ROTATION_BYTES, _TRANSLATION_BYTES = 8, 16
+"""Bytes in base64 of a packed rotation and of a packed translation that cannot be compressed."""
 Headline = dict[str, float | int | None]
 
 
@@ -103,7 +116,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     parts = {"evaluation": evaluation, "records": records_to_tree(trials, records)}
     if params.report:
         context.progress(3, GATHERING_STEPS, "writing the report")
-        parts["report"] = write_report(context, result, params)
+        parts["report"] = write_report(context, database, result, params)
     context.stage(
         [StagedOutput(name=params.name, kind=Kind.EVALUATION, item_name=params.name, tags=params.tags, parts=parts)]
     )
@@ -131,7 +144,9 @@ def _read_trials(
 ) -> tuple[list[TrialRecord], MeasuredReplicates | None]:
     """Read the results of the tasks: the record of each trial, and those of its further replicates, if any."""
     found = [decode_tree(context.blob(result["measured"]["blob"]), MSGPACK) for result in results]
-    known = {name: record for one in found if one for name, record in records_from_tree(one["records"]).items()}
+    known = {
+        name: record for one in found if "records" in one for name, record in records_from_tree(one["records"]).items()
+    }
     trees = [one["replicates"] for one in found if "replicates" in one]
     return [known[trial.name] for trial in trials], MeasuredReplicates.from_trees(trees, trials)
 
@@ -173,10 +188,13 @@ def facets_of(result: EvaluationResult, pins: Sequence[PinnedInput]) -> tuple[It
     )
 
 
-def write_report(context: Context, result: EvaluationResult, params: EvaluateParams) -> dict[str, Any]:
+def write_report(
+    context: Context, database: MatchingDatabase, result: EvaluationResult, params: EvaluateParams
+) -> dict[str, Any]:
     """Draw all figures, write the page, and store both as files; return the document that refers to these files."""
     figures = draw_figures(result)
-    page = render_report(result, title=params.name, figures=figures)
+    played = play_trials(database, result)
+    page = render_report(result, title=params.name, figures=figures, inputs=inputs_of(context), played=played)
     drawn = [*((None, figure) for figure in figures.values()), *_trial_figures(result, params)]
     return store_report(context, EvaluationReport, params.name, page, drawn)
 
@@ -188,3 +206,28 @@ def _trial_figures(result: EvaluationResult, params: EvaluateParams) -> Iterator
         for name, kind in FIGURES.items():
             if kind.trials == "any" or (kind.trials == "one" and families[trial] in kind.families):
                 yield trial, draw_figure(name, result, trial=trial)
+
+
+def play_trials(database: MatchingDatabase, result: EvaluationResult) -> list[PlayedTrial]:
+    """Make the displayed motion of the worst and of a typical trial; none if the trials have no records."""
+    hierarchy = skeleton_to_document(database.body.skeleton).model_dump(mode="json", by_alias=True, exclude_none=True)
+    played = []
+    for role, judged, record in choose_played(result):
+        clip = displayed_clip(database, record, result.options.controller)
+        name = f"{demand(judged.outcome.trial)}, {role} trial"
+        played.append(PlayedTrial(role, judged, record, clip, _packed(name, clip, hierarchy)))
+    return played
+
+
+def _packed(name: str, clip: Clip, hierarchy: dict[str, Any]) -> str:
+    motion = clip_to_document(thinned(clip), OutputRef(output="skeleton"))
+    return page_data(name, [ShownMotion(name, motion, hierarchy)])
+
+
+def thinned(clip: Clip) -> Clip:
+    """Keep every n-th frame of a clip, with the least n that meets `MOST_RATE_HZ` and `MOST_BYTES`."""
+    moved = len(clip.translated_joints)
+    frame_bytes = _ROTATION_BYTES * clip.skeleton.joint_count + _TRANSLATION_BYTES * (1 + moved)
+    step = max(math.ceil(clip.frame_rate_hz / MOST_RATE_HZ), math.ceil(clip.frame_count * frame_bytes / MOST_BYTES))
+    translations = None if clip.translations is None else clip.translations[::step]
+    return replace(clip, frame_rate_hz=clip.frame_rate_hz / step, poses=clip.poses[::step], translations=translations)

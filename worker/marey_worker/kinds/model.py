@@ -28,7 +28,7 @@ from marey_schemas.queue.job_params import ModelParams
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
-from marey_worker.job_io.stored_reports import store_report
+from marey_worker.job_io.stored_reports import inputs_of, store_report
 
 
 def run(context: Context, params: ModelParams) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def write_model_report(
     check = _checked(context, trained, aligned) if params.search_check else None
     subject = ModelSubject(trained.primitive, aligned, trained.report, check, context.seed)
     figures = {**draw_alignment_figures(aligned), **draw_model_figures(subject)}
-    page = render_model_report(trained, subject, figures, title=title, origin=origin)
+    page = render_model_report(trained, subject, figures, title=title, origin=origin, inputs=inputs_of(context))
     return store_report(context, ModelReport, title, page, ((None, figure) for figure in figures.values()))
 
 

@@ -27,7 +27,7 @@ from marey_schemas.documents.quality import (
     QualityDocument,
     QualityRow,
     QualityTotal,
-    worst_first,
+    worst_clips_first,
 )
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.options.quality import QualityOptions
@@ -39,7 +39,7 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import store_document, store_file
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.skeleton_cache import Rig, Rigged, read_rigged
-from marey_worker.job_io.stored_reports import stored_figure
+from marey_worker.job_io.stored_reports import inputs_of, stored_figure
 
 
 def run(context: Context, params: QualityParams) -> dict[str, Any]:
@@ -221,7 +221,7 @@ def _set(found: _Found, drawn: DrawnTotals) -> MeasuredSet:
 
 
 def _result(context: Context, params: QualityParams, document: QualityDocument) -> dict[str, Any]:
-    reference, worst = document.reference, worst_first(document.measured.clips)[0]
+    reference, worst = document.reference, worst_clips_first(document.measured.clips)[0]
     result = {
         "clips": len(document.measured.clips),
         "reference_clips": 0 if reference is None else len(reference.clips),
@@ -237,7 +237,8 @@ def _result(context: Context, params: QualityParams, document: QualityDocument) 
         context.progress(0, None, "writing the report")
         title = params.title or f"Quality of {counted(len(document.measured.clips), 'clip')}"
         figures = draw_quality_figures(document)
-        result["report"] = store_file(context, render_quality(document, figures, title=title).encode())
+        page = render_quality(document, figures, title=title, inputs=inputs_of(context))
+        result["report"] = store_file(context, page.encode())
         stored = [stored_figure(context, figure) for figure in figures.values()]
         result["figures"] = [figure.model_dump(mode="json", by_alias=True) for figure in stored]
     return result

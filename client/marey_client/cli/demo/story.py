@@ -152,7 +152,7 @@ class Story:
         load = _clip_loader(self.project)
         takes = [figures.TakePair(source.name, load(source), load(result)) for source, result in pairs]
         path = self.data / "contact-sheet.png"
-        path.write_bytes(figures.contact_sheet(takes, heading="Takes and their results", total=total))
+        path.write_bytes(figures.contact_sheet(takes, heading="Takes and their results", total=total, choice=CHOICE))
         return path
 
 
@@ -212,6 +212,10 @@ def _demo_project(marey: Marey) -> ProjectHandle:
 def _source_path(result: ClipHandle) -> str:
     """Return the path of the take that was retargeted: the path of the result without the first folder."""
     return result.path.removeprefix(f"{RESULTS}/")
+
+
+CHOICE = "evenly spaced in the order of their paths"
+"""Order in which `_evenly` chooses clips, in words."""
 
 
 def _evenly(clips: Sequence[ClipHandle], most: int) -> list[ClipHandle]:

@@ -133,9 +133,9 @@ def _print_totals(document: QualityDocument, changes: Mapping[str, tuple[float, 
 
 
 def _print_clips(document: QualityDocument) -> None:
-    from marey_schemas.documents.quality import MAIN_MEASURE, MEASURES, worst_first
+    from marey_schemas.documents.quality import MAIN_MEASURE, MEASURES, worst_clips_first
 
-    measure, clips = MEASURES[MAIN_MEASURE], worst_first(document.measured.clips)
+    measure, clips = MEASURES[MAIN_MEASURE], worst_clips_first(document.measured.clips)
     rows = [(clip.name, _number(clip.values[MAIN_MEASURE], measure.digits)) for clip in clips[:CLIPS_SHOWN]]
     print_table(("worst clips", f"{measure.title} {measure.unit}"), rows, right=(f"{measure.title} {measure.unit}",))
     if len(clips) > CLIPS_SHOWN:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,6 +21,8 @@ from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 
 if TYPE_CHECKING:
+    from marey_client.marey import Marey
+    from marey_schemas.documents.report_pages import ReportOrigin
     from marey_schemas.queue.comparisons import ComparedColumn, RunComparison
 
 CHARTS = ("html", "svg", "png")
@@ -99,8 +102,9 @@ def compare(
     with connect(context) as marey:
         script = marey.project(project).scripts.at(name)
         found = script.compare(sort=sort, limit=limit, fields=fields or (), goals=goals, curves=chart is not None)
-    if chart is not None:
-        _draw(found, chart, {"file_type": ending, "plot": plot, "parameter": parameter, "log": log})
+        if chart is not None:
+            options = {"file_type": ending, "plot": plot, "parameter": parameter, "log": log}
+            _draw(found, chart, options, _origin(marey, project) if ending == "html" else None)
     if as_json:
         return print_json(found)
     columns = shown_columns(found, every=every_column)
@@ -116,12 +120,22 @@ def _ending_of(chart: Path | None) -> str:
     return ending
 
 
-def _draw(found: RunComparison, chart: Path, options: dict[str, Any]) -> None:
+def _origin(marey: Marey, project: str) -> ReportOrigin:
+    """Return the origin of a page that this command draws now."""
+    from marey_schemas.documents.report_pages import ReportOrigin
+
+    user = marey.me().user
+    return ReportOrigin(project, marey.transport.url, None if user is None else user.name, datetime.now(UTC))
+
+
+def _draw(found: RunComparison, chart: Path, options: dict[str, Any], origin: ReportOrigin | None) -> None:
     from marey_client import embedded
+    from marey_schemas.documents.report_pages import with_origin
 
     if not found.runs:
         return print_message("there is nothing to draw; no run has succeeded")
-    chart.write_bytes(embedded.draw_comparison(found, **options))
+    drawn = embedded.draw_comparison(found, **options)
+    chart.write_bytes(drawn if origin is None else with_origin(drawn, origin))
     return print_message(f"wrote {chart}")
 
 

@@ -1,4 +1,8 @@
-"""Figure 1: the speeds and turn rates of every clip, distinguished by colour and marker."""
+"""Figure 1: the speeds and turn rates of every clip.
+
+Up to `MOST_COLOURED` clips differ by colour and marker in one panel. More clips get a small panel each, with
+the name above it, because a reader cannot match more colours with a legend.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,8 @@ from marey_reports.drawing.paper import (
     MARKERS,
     QUIET,
     REFERENCE,
+    SMALL,
+    TEXT,
     Place,
     add_keys,
     add_panel,
@@ -29,10 +35,20 @@ from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 MOST_POINTS = 6_000  # per subject; more only cover each other
 DRAWN_AS_SHAPES = 800  # beyond, the points are one image inside the SVG
-CATEGORIES = len(COLOURS) * len(MARKERS)
+MOST_COLOURED = len(COLOURS)
+MOST_PANELS = 24
+BEHIND = 700  # grey points in each small panel, which show all clips
+SMALL_NAME = 22  # characters of a name above a small panel
+ACROSS = 5  # small panels side by side
+
+
+Limits = tuple[tuple[float, float], tuple[float, float]]
+"""Ends of the horizontal and of the vertical axis."""
 
 
 class _Points(NamedTuple):
@@ -44,12 +60,34 @@ class _Points(NamedTuple):
 
 def draw_points(subjects: Sequence[Subject], _trial: str | None, options: FigureOptions) -> Sketch:
     """Draw a point for each window of one second; of more than `MOST_POINTS` windows, only some at even intervals."""
-    chosen = _choose(subjects, min(options.most_clips, CATEGORIES))
+    chosen = _choose(subjects, min(options.most_clips, MOST_PANELS))
+    limits = _limits(subjects)
+    sketched = (
+        _draw_small(subjects, chosen, limits)
+        if _named(subjects, chosen)[MOST_COLOURED:]
+        else _draw_together(subjects, chosen, limits)
+    )
+    return Sketch(sketched, {"points": _table(subjects, chosen)}, _caption(subjects, chosen, limits))
+
+
+def _named(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> list[tuple[str, str]]:
+    """Return the uid and the name of each clip with its own colour or panel, those with most data first."""
+    found = {
+        subject.result.clips[clip].uid: subject.result.clips[clip].name
+        for subject, points in reversed(list(zip(subjects, chosen, strict=True)))
+        for clip in points.named
+    }
+    order = {subject.result.clips[clip].uid: place for subject, points in zip(subjects, chosen, strict=True)
+             for place, clip in enumerate(points.named)}  # fmt: skip
+    return sorted(found.items(), key=lambda item: (order[item[0]], item[0]))
+
+
+def _draw_together(subjects: Sequence[Subject], chosen: Sequence[_Points], limits: Limits) -> Figure:
+    """Draw a panel for each subject, in which clips have colours and markers."""
     width = 9.6 if len(subjects) > 1 else 8.6
     keys = 2.5
     each = (width - 0.75 - keys - 0.45 * (len(subjects) - 1)) / len(subjects)
     figure = new_figure(width, 4.9 if len(subjects) > 1 else 4.65)
-    limits = _limits(subjects)
     styles: dict[str, int] = {}  # a clip looks the same in both panels
     for number, (subject, points) in enumerate(zip(subjects, chosen, strict=True)):
         place = Place(0.65 + number * (each + 0.45), 0.55, each, 3.85)
@@ -60,7 +98,59 @@ def draw_points(subjects: Sequence[Subject], _trial: str | None, options: Figure
         panel.set(xlim=limits[0], ylim=limits[1])
         mark_sides(panel)
     _draw_keys(figure.axes[-1], subjects, chosen, styles)
-    return Sketch(figure, {"points": _table(subjects, chosen)}, _caption(subjects, chosen, limits))
+    return figure
+
+
+def _draw_small(subjects: Sequence[Subject], chosen: Sequence[_Points], limits: Limits) -> Figure:
+    """Draw a small panel for each clip, its points before those of all clips, and one for the other clips."""
+    named = _named(subjects, chosen)
+    rest = max(_other_clips(subject, points) for subject, points in zip(subjects, chosen, strict=True))
+    labels = labels_of([name for _, name in named], SMALL_NAME)
+    tiles: list[tuple[str, str | None]] = [(label, uid) for label, (uid, _) in zip(labels, named, strict=True)]
+    tiles += [(counted(rest, "other clip"), None)] * bool(rest)
+    bands = -(-len(tiles) // ACROSS)
+    width, height, gap, between, top = 1.58, 1.18, 0.16, 0.32, 0.35 if len(subjects) == 1 else 0.62
+    bottom = 0.62
+    figure = new_figure(0.72 + ACROSS * (width + gap), bottom + bands * (height + between) - between + top)
+    for number, (label, uid) in enumerate(tiles):
+        band, column = divmod(number, ACROSS)
+        place = Place(0.66 + column * (width + gap), bottom + (bands - 1 - band) * (height + between), width, height)
+        panel = add_panel(figure, place)
+        panel.set_title(plain(label), fontsize=SMALL, color=INK, loc="left", parse_math=False, pad=4)
+        panel.tick_params(labelleft=column == 0, labelbottom=number + ACROSS >= len(tiles))
+        _draw_tile(panel, subjects, chosen, uid)
+        panel.set(xlim=limits[0], ylim=limits[1])
+        panel.locator_params(nbins=4)
+    figure.text(0.5, 0.16 / figure.get_figheight(), TURN_RATE, ha="center", fontsize=TEXT, color=INK)
+    figure.text(0.2 / figure.get_figwidth(), 0.5, SPEED, va="center", rotation=90, fontsize=TEXT, color=INK)
+    if len(subjects) > 1:
+        keys = [_key(COLOURS[number], "o") for number in range(len(subjects))]
+        add_keys(figure.axes[0], handles=keys, labels=[plain(subject.label) for subject in subjects], loc="lower left",
+                 bbox_to_anchor=(-0.05, 1.13), ncols=len(subjects), handletextpad=0.2)  # fmt: skip
+    return figure
+
+
+def _draw_tile(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Points], uid: str | None) -> None:
+    """Draw the windows of one clip in colour, or those of the unnamed clips if `uid` is None, before all windows."""
+    for number, (subject, points) in enumerate(zip(subjects, chosen, strict=True)):
+        coverage = subject.result.coverage
+        step = max(1, -(-len(points.windows) // BEHIND))
+        behind = points.windows[::step]
+        turn_deg_s, speed = np.degrees(coverage.turn_rate_rad_s), coverage.speed_m_s
+        grey: dict[str, Any] = {"s": 2, "c": REFERENCE, "alpha": 0.4, "lw": 0, "rasterized": True, "zorder": 2}
+        panel.scatter(turn_deg_s[behind], speed[behind], **grey)
+        clips = coverage.clip[points.windows]
+        uids = [clip.uid for clip in subject.result.clips]
+        mine = ~np.isin(clips, points.named) if uid is None else clips == (uids.index(uid) if uid in uids else -1)
+        own = points.windows[mine]
+        look: dict[str, Any] = {"s": 5, "c": COLOURS[number], "alpha": 0.8, "lw": 0, "zorder": 3}
+        panel.scatter(turn_deg_s[own], speed[own], rasterized=len(own) > BEHIND, **look)
+
+
+def _key(colour: str, marker: str, size: float = 5.0) -> Line2D:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], ls="", color=colour, marker=marker, markersize=size, markeredgewidth=0)
 
 
 def _choose(subjects: Sequence[Subject], most_clips: int) -> list[_Points]:
@@ -80,7 +170,7 @@ def _choose(subjects: Sequence[Subject], most_clips: int) -> list[_Points]:
     return chosen
 
 
-def _limits(subjects: Sequence[Subject]) -> tuple[tuple[float, float], tuple[float, float]]:
+def _limits(subjects: Sequence[Subject]) -> Limits:
     coverages = [subject.result.coverage for subject in subjects]
     turns = np.concatenate([np.abs(np.degrees(coverage.turn_rate_rad_s)) for coverage in coverages])
     speeds = np.concatenate([coverage.speed_m_s for coverage in coverages])
@@ -98,33 +188,25 @@ def _draw(panel: Axes, subject: Subject, points: _Points, styles: dict[str, int]
     panel.scatter(turn[others], speed[others], s=6, c=REFERENCE, alpha=0.5, lw=0, rasterized=as_image, zorder=2)
     for clip in reversed(points.named):  # the clip with most data lies below the others
         mine = clips == clip
-        style = styles.setdefault(subject.result.clips[clip].uid, len(styles) % CATEGORIES)
+        style = styles.setdefault(subject.result.clips[clip].uid, len(styles))
         panel.scatter(turn[mine], speed[mine], s=13, alpha=0.75, lw=0, rasterized=as_image, zorder=3, **_look(style))
 
 
 def _look(style: int) -> dict[str, Any]:
-    """Return the colour and the marker for a style number; consecutive numbers differ in both."""
-    row = style // len(COLOURS)
-    return {"c": COLOURS[style % len(COLOURS)], "marker": MARKERS[(style + row) % len(MARKERS)]}
+    return {"c": COLOURS[style], "marker": MARKERS[style]}
 
 
 def _draw_keys(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Points], styles: dict[str, int]) -> None:
-    from matplotlib.lines import Line2D
-
-    names = {
-        subject.result.clips[clip].uid: subject.result.clips[clip].name
-        for subject, points in zip(subjects, chosen, strict=True)
-        for clip in points.named
-    }
     keys, labels = [], []
-    names = dict(zip(names, labels_of(list(names.values())), strict=True))
+    named = _named(subjects, chosen)
+    names = dict(zip((uid for uid, _ in named), labels_of([name for _, name in named]), strict=True))
     for uid, style in styles.items():
         look = _look(style)
-        keys.append(Line2D([], [], ls="", color=look["c"], marker=look["marker"], markersize=5, markeredgewidth=0))
+        keys.append(_key(look["c"], look["marker"]))
         labels.append(plain(names[uid]))
     rest = max(_other_clips(subject, points) for subject, points in zip(subjects, chosen, strict=True))
     if rest:
-        keys.append(Line2D([], [], ls="", color=REFERENCE, marker="o", markersize=3.5, markeredgewidth=0))
+        keys.append(_key(REFERENCE, "o", 3.5))
         labels.append(counted(rest, "other clip"))
     if not keys:
         panel.text(0.5, 0.5, "no clip of one second or more", transform=panel.transAxes, ha="center", color=QUIET)
@@ -152,7 +234,7 @@ def _table(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> dict[str, 
 def _caption(
     subjects: Sequence[Subject],
     chosen: Sequence[_Points],
-    limits: tuple[tuple[float, float], tuple[float, float]],
+    limits: Limits,
 ) -> str:
     parts = []
     for subject, points in zip(subjects, chosen, strict=True):
@@ -162,4 +244,6 @@ def _caption(
         beyond = int(np.count_nonzero((np.abs(turn) > limits[0][1]) | (speed > limits[1][1])))
         outside = f"; {beyond:,} are outside the axes" if beyond else ""
         parts.append(f"{subject.prefix}{total:,} windows from {counted(held, 'clip')}, {drawn} drawn{outside}.")
-    return "Each point shows the mean speed and turn rate of a window of one second. " + " ".join(parts)
+    many = len(_named(subjects, chosen)) > MOST_COLOURED
+    panels = " Each panel shows one clip, with the windows of all clips in grey." if many else ""
+    return f"Each point shows the mean speed and turn rate of a window of one second.{panels} {' '.join(parts)}"

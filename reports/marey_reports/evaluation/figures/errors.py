@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 BINS = 48
 LEAST_BIN = 0.001  # m/s or deg/s
 FINE = 400
+KEYS_POINTS = 32.0
+"""Height of the keys between a panel and its title, in points."""
 
 
 class _Errors(NamedTuple):
@@ -42,8 +44,8 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
         (f"speed error (m/s), {meaning}", "m/s"),
         (f"turn rate error (deg/s, left positive), {meaning}", "deg/s"),
     )
-    height, gap = (3.2, 0.0) if len(subjects) == 1 else (2.3, 0.75)
-    figure = new_figure(9.6, len(subjects) * (height + gap) + 1.15 - gap)
+    height, gap = (3.0, 0.0) if len(subjects) == 1 else (2.1, 1.0)
+    figure = new_figure(9.6, len(subjects) * (height + gap) + 1.4 - gap)
     tables: dict[str, dict[str, list[object]]] = {
         "histogram": {name: [] for name in ("dataset", "quantity", "low", "high", "seconds")},
         "fits": {name: [] for name in ("dataset", "quantity", "components", "weight", "mean", "deviation")},
@@ -60,6 +62,7 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
                 title=(view.subject.label or demand(chosen)) if column == 0 else "",
                 x=label if last else "",
                 y="seconds" if column == 0 else "",
+                below_title=KEYS_POINTS,
             )
             heights = np.histogram(pair[column].values, edges)[0] / view.record.rate_hz
             _draw(panel, pair[column], edges, heights, view, COLOURS[row], unit)
@@ -69,7 +72,7 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
             panels.append(panel)
         top = max(panel.get_ylim()[1] for panel in panels)
         for panel in panels:
-            panel.set_ylim(0.0, 1.25 * top)
+            panel.set_ylim(0.0, 1.03 * top)
     return Sketch(figure, tables, _caption(demand(chosen), views, errors))
 
 
@@ -121,7 +124,7 @@ def _draw(
         panel.plot(fine, curve, label=f"{name}: {moments} {unit}", **look)
     panel.axvline(0.0, color=REFERENCE, lw=0.8, zorder=1)
     panel.set_xlim(edges[0], edges[-1])
-    add_keys(panel, loc="upper right", borderaxespad=0.1)
+    add_keys(panel, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.1)
 
 
 def _tabulate(

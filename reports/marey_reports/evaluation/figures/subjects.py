@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.judgement import judge_trial
+from marey_motion.evaluation.judgement import judge_trial, rank_trials
 from marey_motion.evaluation.metrics import TrialSeries, trial_series
 from marey_motion.evaluation.relevance import count_switches, measure_usage
 from marey_motion.evaluation.result import ClipUsage, EvaluationResult
@@ -121,7 +121,7 @@ def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequen
         candidates = [each for each in shared if each.trial.family == family and name in (None, each.trial.name)]
         if candidates:
             limits = subjects[0].result.options.limits
-            return min(candidates, key=lambda each: (-judge_trial(each, limits).worst.strain, each.trial.name)).trial
+            return rank_trials(judge_trial(each, limits) for each in candidates)[0].outcome.trial
     wanted = f"trial {name!r}" if name is not None else "trial"
     owner = "the evaluation has" if len(subjects) == 1 else "the two evaluations share"
     raise MotionError(

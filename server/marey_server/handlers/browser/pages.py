@@ -9,6 +9,9 @@ from __future__ import annotations
 import gzip
 import hashlib
 import mimetypes
+import re
+import zlib
+from base64 import b64encode
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -34,6 +37,8 @@ _POLICY = (
 )
 _PLAYER_POLICY = "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'"
 """Content security policy of a page with inline scripts; `sandbox` keeps the page from using browser sessions."""
+_SCRIPT_DIGEST = re.compile(rb"script-src '(sha256-[A-Za-z0-9+/]{43}=)'")
+"""Digest of the player's script, in the content security policy that the build writes into the page."""
 _MISSING = "This installation contains no pages. Install Node 20.19 or newer, and run `make web` in the source tree."
 _TEXTS = ("text/", "application/javascript", "image/svg+xml")
 
@@ -70,6 +75,28 @@ def _read(file: Path) -> WebFile:
     is_text = kind.startswith(_TEXTS)
     media_type = f"{kind}; charset=utf-8" if is_text else kind
     return WebFile(media_type, content, gzip.compress(content, mtime=0) if is_text else None)
+
+
+@dataclass(frozen=True, slots=True)
+class PackedPlayer:
+    """Page that plays motion, as reports contain it: compressed by zlib, in base64; and the digest of its script."""
+
+    content: str
+    script: str
+
+
+def packed_player() -> PackedPlayer | None:
+    """Return the player for reports; None if the pages were not built."""
+    found = built_files().get("player.html")
+    return None if found is None else _packed(found.content)
+
+
+@lru_cache(maxsize=1)
+def _packed(page: bytes) -> PackedPlayer | None:
+    script = _SCRIPT_DIGEST.search(page)
+    if script is None:
+        return None
+    return PackedPlayer(b64encode(zlib.compress(page, 9)).decode(), script[1].decode())
 
 
 class WebPage(Resource):

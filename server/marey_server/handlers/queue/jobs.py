@@ -23,7 +23,7 @@ from marey_schemas.queue.jobs import (
 )
 from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
-from marey_server.handlers.reports import StoredFileSender
+from marey_server.handlers.reports import ReportSender
 from marey_server.http.caching import REVALIDATED
 from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
 from marey_server.http.queries import CommaSeparated, CommaSeparatedOf, CountedPageQuery, PageQuery
@@ -41,7 +41,7 @@ LOOK_AGAIN_S = 15.0
 
 MAX_SUBMISSION_BYTES = 32 * MIB
 RESULT_TYPES = {
-    "report": "text/html; charset=utf-8", "document": "application/json", "fitted": "application/json",
+    "document": "application/json", "fitted": "application/json",
 }  # fmt: skip
 """Media types of the files in a job's result, by the name of the file in the result; other files have no known type."""
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,4})(?:$|[,;\s])")
@@ -248,7 +248,7 @@ class JobResults(Resource):
         return await self.answer(reading.list_results, job, query.cursor, query.limit)
 
 
-class JobFile(StoredFileSender):
+class JobFile(ReportSender):
     """File of the result of a job."""
 
     path = "/projects/{project}/jobs/{job}/files/{file}"
@@ -262,9 +262,11 @@ class JobFile(StoredFileSender):
         also=((206, None), (416, None)),
         headers=("Range", "If-Range"),
     )
-    async def get(self, project: str, job: str, file: str) -> Rendered | None:
+    async def get(self, project: str, job: str, file: str) -> Reply | Rendered | None:
         """Return a file of a job's result: its `report` as HTML, its `document` as JSON, or another member."""
-        found = await self.look_up(reading.read_result_file, project, job, file)
+        found, made = await self.look_up(reading.read_result_file, project, job, file)
+        if file == "report":
+            return await self.send_report(found, self.origin(project, made.author, made.finished_at or made.created_at))
         return await self.send_file(found, RESULT_TYPES.get(file, "application/octet-stream"), REVALIDATED, "sandbox")
 
 

@@ -84,13 +84,14 @@ def list_jobs(
     return Page(items=tuple(as_documents(tx, rows)), next_cursor=next_cursor, count=total)
 
 
-def read_result_file(tx: Transaction, project: str, job_id: str, name: str) -> StoredFile:
-    """Return the reference to a file of a job's result. Raises `NotFoundProblem`."""
+def read_result_file(tx: Transaction, project: str, job_id: str, name: str) -> tuple[StoredFile, Job]:
+    """Return the reference to a file of a job's result, and the job. Raises `NotFoundProblem`."""
     row, project_row = find_job(tx, job_id)
-    entry = as_documents(tx, [row])[0].result or {}
+    found = as_documents(tx, [row])[0]
+    entry = found.result or {}
     if project_row.name == project:
         try:
-            return StoredFile.model_validate(entry.get(name))
+            return StoredFile.model_validate(entry.get(name)), found
         except ValidationError:
             files = ", ".join(other for other, value in entry.items() if isinstance(value, dict) and "blob" in value)
             raise NotFoundProblem(

@@ -1,0 +1,56 @@
+"""Places in stored reports that are filled when a report is handed out.
+
+The bytes of a stored report depend only on inputs, parameters, seed and version of the code, so that identical jobs can
+share it. Who asked for it, when, and in which project are facts about a job. So a stored page has an empty place for
+them, and for the program that plays motion. The server, or the command that draws a page, fills both places.
+"""
+
+from __future__ import annotations
+
+import html
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+ORIGIN_PLACE = '<template id="origin"></template>'
+"""Place in the head of a page, inside a `dl`. Text of a report cannot contain it, because every `<` is escaped."""
+PLAYER_PLACE = '<template id="player"></template>'
+"""Place of the player; only pages with motion have it."""
+
+
+class ReportOrigin(NamedTuple):
+    """Origin of a report: facts that its bytes do not depend on.
+
+    Parameters
+    ----------
+    project : name of the project
+    address : address of the server, without a slash at the end
+    author : name of the user who asked for the report; None if it is not known, as of a user who no longer exists
+    made_at : time at which the result was published, or at which a report was drawn that is not stored
+    """
+
+    project: str
+    address: str
+    author: str | None
+    made_at: datetime
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the facts as pairs of a name and a text."""
+        written = self.made_at.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
+        place = f"{self.project} on {self.address}" if self.address else self.project
+        author = [] if self.author is None else [("requested by", self.author)]
+        return [("project", place), *author, ("date", written)]
+
+
+def with_origin(page: bytes, origin: ReportOrigin) -> bytes:
+    """Return a page with its origin; pages without a place for it stay as they are."""
+    groups = (f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>" for name, value in origin.facts())
+    return page.replace(ORIGIN_PLACE.encode(), "".join(groups).encode(), 1)
+
+
+def with_player(page: bytes, packed: str) -> bytes:
+    """Return a page with the program that plays its motion; pages without motion stay as they are.
+
+    `packed` is the page `player.html`, compressed by zlib and encoded in base64.
+    """
+    filled = f'<script type="application/json" id="player">"{packed}"</script>'
+    return page.replace(PLAYER_PLACE.encode(), filled.encode(), 1)

@@ -1,0 +1,155 @@
+/** Reports in a real Chromium: pages of every kind on a phone and on a desk, and the motion that they play. */
+import { readFileSync } from "node:fs";
+import { type Browser, type BrowserContextOptions, chromium, type Page } from "playwright-core";
+import { afterAll, beforeAll, expect, it, vi } from "vitest";
+import { faults, launch, picture, shownColours } from "./looking";
+
+interface Given {
+  chromium: string;
+  /** Address of the folder with a page for each name, and `played`: the report of an evaluation with the player. */
+  folder: string;
+  names: string[];
+  /** Page as a server has sent it, with its content security policy. */
+  served: { file: string; policy: string };
+}
+
+const GIVEN = JSON.parse(process.env["MAREY_WEB_GIVEN"]!) as Given;
+const WIDTHS = [390, 1280];
+const HINT = "Scroll sideways";
+
+vi.setConfig({ testTimeout: 180_000 });
+let browser: Browser;
+
+beforeAll(async () => {
+  browser = await launch(GIVEN.chromium);
+});
+
+afterAll(() => browser.close());
+
+async function opened(name: string, width: number, options: BrowserContextOptions = {}): Promise<Page> {
+  const context = await browser.newContext({ viewport: { width, height: 844 }, ...options });
+  const page = await context.newPage();
+  page.on("pageerror", (error) => expect.fail(`${name}: ${error.message}`));
+  page.on("request", (request) => {
+    if (!request.url().startsWith("data:") && !request.url().startsWith(GIVEN.folder)) expect.fail(request.url());
+  });
+  await page.goto(`${GIVEN.folder}/${name}.html`);
+  return page;
+}
+
+/** Return by how much the page is wider than the window, and the boxes whose content is cut off without a way to scroll. */
+const tooWide = (page: Page) =>
+  page.evaluate(() => {
+    const root = document.scrollingElement!;
+    const cut = [...document.querySelectorAll("header *, main *")].filter((one) => {
+      const right = one.getBoundingClientRect().right;
+      return right > innerWidth + 1 && one.closest("figure > div, .table") === null;
+    });
+    return { beyond: Math.max(root.scrollWidth - innerWidth, 0), cut: cut.map((one) => one.outerHTML.slice(0, 80)) };
+  });
+
+it.each(GIVEN.names)("shows the report %s on a phone and on a desk", async (name) => {
+  for (const width of WIDTHS) {
+    const page = await opened(name, width);
+    for (const colorScheme of ["light", "dark"] as const) {
+      await page.emulateMedia({ colorScheme });
+      expect(await tooWide(page), `${name} at ${width}`).toEqual({ beyond: 0, cut: [] });
+      await picture(page, `report-${name}-${width}-${colorScheme}`, true);
+    }
+    await page.context().close();
+  }
+});
+
+it.each(GIVEN.names)("gives a hint for each box of the report %s that scrolls, and for no other", async (name) => {
+  const page = await opened(name, 390);
+  const boxes = await page.evaluate(() =>
+    [...document.querySelectorAll("figure > div, .table")]
+      .filter((one) => one.checkVisibility())
+      .map((one) => [one.scrollWidth > one.clientWidth + 1, getComputedStyle(one, "::before").content !== "none"]),
+  );
+  expect(boxes.length).toBeGreaterThan(0);
+  expect(boxes.filter(([scrolls, hint]) => scrolls !== hint)).toEqual([]);
+  expect(await page.evaluate(() => getComputedStyle(document.querySelector(".scrolls")!, "::before").content)).toContain(HINT);
+  await page.context().close();
+});
+
+it.each(GIVEN.names)("shows the report %s without its script, and on paper", async (name) => {
+  const page = await opened(name, 390, { javaScriptEnabled: false });
+  for (const text of ["lab on https://marey.example", "rita", "2026-11-29 14:05 UTC"]) {
+    expect(await page.locator("header").innerText()).toContain(text);
+  }
+  expect(await page.locator("figure svg").first().isVisible()).toBe(true);
+  expect(await page.locator(".player button").count()).toBe(0);
+  await page.context().close();
+  const printed = await opened(name, 794);
+  await printed.emulateMedia({ media: "print" });
+  expect(await tooWide(printed)).toEqual({ beyond: 0, cut: [] });
+  await picture(printed, `report-${name}-print`, true);
+  await printed.context().close();
+});
+
+it("has no fault that axe finds, in light and in dark colours", async () => {
+  const page = await opened("played", 390);
+  for (const colorScheme of ["light", "dark"] as const) {
+    await page.emulateMedia({ colorScheme });
+    expect(await faults(page)).toEqual([]);
+  }
+  await page.context().close();
+});
+
+/** Least number of colours of a picture with a lit mannequin; a picture without one has the few of buttons and texts. */
+const LIT = 300;
+
+/** Start the first trial; return what runs in its frame. */
+async function playing(page: Page) {
+  expect(await page.locator("iframe").count()).toBe(0); // nothing runs before somebody asks for it
+  await page.getByRole("button", { name: /Play \d+ s of the worst trial/ }).click();
+  const handle = await page.locator("iframe").elementHandle();
+  const frame = (await handle!.contentFrame())!;
+  await frame.getByRole("button", { name: "Pause" }).waitFor();
+  return frame;
+}
+
+it("plays the worst trial from disk, beside the desired path", async () => {
+  for (const width of WIDTHS) {
+    const page = await opened("played", width);
+    const frame = await playing(page);
+    await expect.poll(() => shownColours(frame.locator("canvas").last()), { timeout: 60_000 }).toBeGreaterThan(LIT);
+    const position = () => frame.locator("footer .position").innerText();
+    const before = await position();
+    await expect.poll(position).not.toBe(before);
+    expect(await tooWide(page)).toEqual({ beyond: 0, cut: [] });
+    expect(await page.getByRole("img", { name: "Paths of the worst trial" }).isVisible()).toBe(true);
+    await page.locator("#motion").scrollIntoViewIfNeeded();
+    await picture(page, `report-playing-${width}`);
+    await page.context().close();
+  }
+});
+
+it("plays a trial as the server sends the report, under its content security policy", async () => {
+  const context = await browser.newContext({ viewport: { width: 1280, height: 844 } });
+  const page = await context.newPage();
+  const complaints: string[] = [];
+  page.on("console", (message) => message.type() === "error" && complaints.push(message.text()));
+  await page.route("**/*", (route) =>
+    route.fulfill({
+      body: readFileSync(GIVEN.served.file),
+      headers: { "Content-Type": "text/html; charset=utf-8", "Content-Security-Policy": GIVEN.served.policy },
+    }),
+  );
+  await page.goto("http://marey.example/report");
+  const frame = await playing(page);
+  await expect.poll(() => shownColours(frame.locator("canvas").last()), { timeout: 60_000 }).toBeGreaterThan(LIT);
+  expect(complaints).toEqual([]);
+  await context.close();
+});
+
+it("plays a trial without WebGL, seen from the side", async () => {
+  const plain = await chromium.launch({ executablePath: GIVEN.chromium, args: ["--no-sandbox", "--disable-3d-apis"] });
+  const page = await (await plain.newContext()).newPage();
+  await page.goto(`${GIVEN.folder}/played.html`);
+  const frame = await playing(page);
+  await frame.getByText("This browser offers no WebGL").waitFor();
+  await expect.poll(() => shownColours(frame.locator("canvas").last())).toBeGreaterThan(10);
+  await plain.close();
+});
