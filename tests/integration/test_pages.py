@@ -33,6 +33,8 @@ from marey_schemas.encoding.codecs import MSGPACK, decode_tree
 from marey_server.handlers.browser import pages
 from marey_server.store.database.connections import Database
 
+pytestmark = pytest.mark.timeout(900)
+
 HOSTILE_NAME = "</script><img src=x onerror='window.harmed = true'><!--<script>"
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}
 
@@ -327,7 +329,7 @@ def _run_vitest(project: str, *files: str, **variables: str) -> None:
     command = ["node", "node_modules/vitest/vitest.mjs", "run", "--project", project, *files]
     done = subprocess.run(
         command, cwd=SOURCES, env=os.environ | variables | {"NO_COLOR": "1"}, check=False, capture_output=True,
-        text=True, timeout=290,
+        text=True, timeout=840,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     print(*(line for line in done.stdout.splitlines() if line.startswith("time: ")), sep="\n")  # pytest -s shows them
