@@ -22,6 +22,8 @@ from marey_schemas.queue.jobs import Job, JobState
 
 pytestmark = pytest.mark.timeout(900)
 
+PATIENCE_S = 240.0
+
 LONG: dict[str, Any] = {
     "name": "walks-eval",
     "speeds_m_s": (1.0, 1.25, 1.5, 1.75, 2.0),
@@ -70,7 +72,7 @@ def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
     return project
 
 
-def wait_until(condition: Callable[[], bool], seconds: float = 120) -> None:
+def wait_until(condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
@@ -145,7 +147,7 @@ def test_a_cancelled_evaluation_leaves_nothing_and_is_done_again_from_where_it_w
     job = lab.evaluate("walks", **LONG)
     wait_until(lambda: marey.jobs.get(job.id).children.get("succeeded", 0) >= 3)
     marey.jobs.cancel(job.id)
-    ended = marey.jobs.wait(job.id, timeout_s=60, require_success=False)
+    ended = marey.jobs.wait(job.id, timeout_s=PATIENCE_S, require_success=False)
     assert ended.state is JobState.CANCELLED
     assert list(lab.evaluations.list()) == []
     done = ended.children["succeeded"]

@@ -9,7 +9,7 @@ from concurrent.futures import TimeoutError as StillRunning
 from typing import Any
 
 import pytest
-from tests.support.interleaving import HEAD_START_S, Abandoned, Step, interleave
+from tests.support.interleaving import HEAD_START_S, PATIENCE_S, Abandoned, Step, interleave
 from tests.support.store_fixtures import WRITE, Lab, declared, requiring, skeleton_tree
 
 from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, Role
@@ -219,5 +219,5 @@ def test_an_item_of_a_protected_folder_is_not_changed_while_the_folder_moves(
         monkeypatch.setattr(module, "rights_of_caller", slow_rights)
         with pytest.raises(ForbiddenProblem):
             lab.write(function, *args, who=lab.maintainer, required=WRITE, **state)
-        moving[0].result(20)
+        moving[0].result(PATIENCE_S)
     assert "b/x" in living(lab)

@@ -31,6 +31,7 @@ from marey_server.store.object_storage.client import Bucket, ObjectStorage, Obje
 
 pytestmark = pytest.mark.xdist_group("object storage")
 
+PATIENCE_S = 120.0
 DATA = os.urandom(100_000)
 DIGEST = digest_of(DATA)
 OLD_S = 2 * 24 * 3600.0
@@ -116,16 +117,16 @@ def test_other_writes_and_reads_go_on_while_the_storage_is_silent(remote: Lab, p
     waiting = [queue_write(one, remote.owner, partial(blobs.put_blob, content=one.key.encode())) for one in callers]
     reading = [queue_read(one, remote.owner, lambda tx: blobs.read_blob(tx, DIGEST)) for one in callers]
     for _ in range(10):
-        assert proxy.silent.acquire(timeout=30)
+        assert proxy.silent.acquire(timeout=PATIENCE_S)
     made = remote.database.submit_write(remote.owner, projects.create_project, ProjectCreate(name="other"))
-    assert made.result(30).name == "other"
+    assert made.result(PATIENCE_S).name == "other"
     seen = queue_read(Client("reader"), remote.owner, lambda tx: projects.read_project(tx, "other"))
-    assert seen.result(30).name == "other"
+    assert seen.result(PATIENCE_S).name == "other"
     assert not any(future.done() for future in waiting)
     assert not any(future.done() for future in reading)
     proxy.go_on.set()
-    assert [future.result(60) for future in waiting] == [digest_of(one.key.encode()) for one in callers]
-    assert [future.result(60) for future in reading] == [DATA] * 5
+    assert [future.result(PATIENCE_S) for future in waiting] == [digest_of(one.key.encode()) for one in callers]
+    assert [future.result(PATIENCE_S) for future in reading] == [DATA] * 5
 
 
 def test_bytes_that_were_cut_off_on_the_way_are_read_again(remote: Lab, proxy: FaultyS3) -> None:

@@ -26,6 +26,8 @@ from marey_schemas.queue.pipelines import PipelineCreate
 
 pytestmark = pytest.mark.timeout(900)
 
+PATIENCE_S = 240.0
+
 StartWorker = Callable[..., WorkerProcess]
 
 
@@ -115,7 +117,7 @@ def test_a_server_killed_where_a_job_gets_its_inputs_goes_on_with_all_of_them_or
         start_worker("steady")
         assert server.wait_until_dead() == -signal.SIGKILL
         server.start()
-        run.wait(timeout_s=120)
+        run.wait(timeout_s=PATIENCE_S)
         assert_made_once(marey.project("lab"), run, takes)
     server.check_database()
 
@@ -134,10 +136,10 @@ def test_a_server_killed_where_a_pipeline_is_handed_in_has_all_of_it_or_nothing(
         handing_in = pool.submit(lab.pipeline, game_twice(lab, few_takes, tmp_path))
         assert server.wait_until_dead() == -signal.SIGKILL
         server.start()
-        run = handing_in.result(60)  # the client asks again, with the same Idempotency-Key
+        run = handing_in.result(PATIENCE_S)  # the client asks again, with the same Idempotency-Key
         assert len(list(marey.project("lab").jobs())) == 3
         start_worker("steady")
-        run.wait(timeout_s=120)
+        run.wait(timeout_s=PATIENCE_S)
         assert_made_once(marey.project("lab"), run, few_takes)
     server.check_database()
 
@@ -163,6 +165,6 @@ def test_a_worker_killed_under_a_pipeline_is_replaced_and_nothing_is_there_twice
         for worker in dying:
             assert worker.wait_until_dead() == -signal.SIGKILL
         start_worker("healthy")
-        run.wait(timeout_s=120)
+        run.wait(timeout_s=PATIENCE_S)
         assert_made_once(lab, run, takes)
     server.check_database()

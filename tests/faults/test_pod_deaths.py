@@ -15,6 +15,7 @@ from tests.support.attached_worker import python_path
 from tests.support.cluster.admission import admit
 from tests.support.cluster.kubelet import MAREY
 from tests.support.cluster.objects import Document
+from tests.support.cluster.quick_pools import QuickPoolsServer
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
 from tests.support.server_process import QUICK_LEASES, ServerProcess
 
@@ -43,6 +44,18 @@ httpx.post(place, json={}, headers=headers, timeout=60).raise_for_status()
 """Program that claims a job, sends one heartbeat, and exits with status 0 as if it had completed the job."""
 
 
+class FirstLies(dict[str, tuple[str, ...]]):
+    """Commands by image, of which the first that is run is `LIES` instead."""
+
+    told = False
+
+    def __getitem__(self, image: str) -> tuple[str, ...]:
+        if self.told:
+            return super().__getitem__(image)
+        self.told = True
+        return (sys.executable, "-c", LIES)
+
+
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[StubCluster]:
     with running_cluster(tmp_path / "cluster") as stub:
@@ -58,7 +71,7 @@ def server(tmp_path: Path, database_url: str, cluster: StubCluster) -> Iterator[
         "MAREY_LAUNCHER_OPTIONS": json.dumps(options),
         "MAREY_POOLS": json.dumps([{"name": "crew", "most": 1, "idle_s": 1, "kinds": ["misbehave"]}]),
     }
-    process = ServerProcess(tmp_path, database_url, PYTHONPATH=python_path(), **launching, **QUICK_LEASES)
+    process = QuickPoolsServer(tmp_path, database_url, PYTHONPATH=python_path(), **launching, **QUICK_LEASES)
     yield process
     process.stop()
 
@@ -124,14 +137,13 @@ def test_two_pods_of_one_job_do_its_work_once(cluster: StubCluster, server: Serv
 def test_a_pod_that_exits_with_status_0_has_not_completed_its_job(
     cluster: StubCluster, server: ServerProcess, tmp_path: Path
 ) -> None:
-    cluster.kubelet.images[IMAGE] = (sys.executable, "-c", LIES)
+    cluster.kubelet.images = FirstLies({IMAGE: MAREY})
     server.start()
     folder = tmp_path / "job"
     with server.client() as marey:
         job = submit(marey, folder)
         ended = cluster.wait_for(lambda: ended_pods(cluster), PATIENCE_S)
         assert ended[0]["status"]["phase"] == "Succeeded", cluster.described()
-        cluster.kubelet.images[IMAGE] = MAREY
         assert finish(marey, job, folder) == ["lost", "succeeded"]
     server.check_database()
 

@@ -32,6 +32,8 @@ from marey_schemas.queue.jobs import Job, JobCreate, JobState
 
 pytestmark = pytest.mark.timeout(900)
 
+PATIENCE_S = 240.0
+
 
 @pytest.fixture(scope="session")
 def takes(tmp_path_factory: pytest.TempPathFactory) -> list[LocalFile]:
@@ -134,14 +136,14 @@ def assert_made_from_their_clips(marey: Marey, jobs: list[Job]) -> None:
         assert clip["item"] in {edge.item for edge in marey.project("lab").clips.get(output.item).lineage().inputs}
 
 
-def wait_until(condition: Callable[[], bool], seconds: float = 60) -> None:
+def wait_until(condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.1)
 
 
-def ended(marey: Marey, jobs: list[Job], seconds: float = 120) -> list[Job]:
+def ended(marey: Marey, jobs: list[Job], seconds: float = PATIENCE_S) -> list[Job]:
     deadline = time.monotonic() + seconds
     found = []
     for each in jobs:
@@ -167,7 +169,7 @@ def test_a_server_killed_among_many_uploads_keeps_what_it_acknowledged(
         with server.client(patient=False) as marey:
             for take in takes:
                 if take is takes[-1]:
-                    killed.wait(240)
+                    killed.wait(PATIENCE_S)
                 try:
                     [entry] = marey.project("lab").imports.upload([take])
                 except MareyError:
@@ -183,7 +185,7 @@ def test_a_server_killed_among_many_uploads_keeps_what_it_acknowledged(
     wait_until(lambda: len(acknowledged) >= few)
     server.kill()
     killed.set()
-    uploading.join(60)
+    uploading.join(PATIENCE_S)
     assert few <= len(acknowledged) < len(takes)
 
     server.start()
@@ -201,7 +203,6 @@ def test_a_server_killed_among_many_uploads_keeps_what_it_acknowledged(
     server.check_database()
 
 
-@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["publish.before_commit", "publish.after_commit", "blob.put.before_commit"])
 def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
     server: ServerProcess, takes: list[LocalFile], place: str
@@ -222,7 +223,6 @@ def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
     server.check_database()
 
 
-@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["complete.before_commit@3", "complete.after_commit@6"])
 def test_a_server_killed_among_many_completes_publishes_each_result_once(
     server: ServerProcess,
@@ -260,7 +260,6 @@ def test_a_server_killed_among_many_completes_publishes_each_result_once(
 # -- the worker dies, sleeps, or is cut off ----------------------------------------------------------------------------
 
 
-@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["after_claim", "after_blob", "before_complete", "after_complete"])
 def test_a_job_of_a_killed_worker_is_finished_by_another_with_one_result(
     server: ServerProcess,
@@ -459,7 +458,7 @@ def test_a_database_that_is_away_for_a_while_delays_work_and_loses_none(
         uploading = threading.Thread(target=lambda: uploaded.extend(lab.imports.upload(sent)))
         uploading.start()
         _disturb(database_url, seconds=5)
-        uploading.join(120)
+        uploading.join(PATIENCE_S)
         # an import that was cut short and sent again finds what went in before
         assert len(uploaded) == len(sent)
         assert {entry.status for entry in uploaded} <= {"created", "unchanged"}

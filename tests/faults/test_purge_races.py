@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 from tests.support.committing_desk import CommittingDesk
-from tests.support.interleaving import HEAD_START_S, Step, interleave
+from tests.support.interleaving import HEAD_START_S, PATIENCE_S, Step, interleave
 from tests.support.queue_desk import Desk, document, output
 from tests.support.store_fixtures import ALL_RIGHTS, WRITE, motion_tree, requiring, skeleton_tree
 
@@ -126,7 +126,7 @@ class Scene:
 
         def go_on_later(*args: Any) -> Any:
             paused.set()
-            may_go_on.wait(20)
+            may_go_on.wait(PATIENCE_S)
             return function(*args)
 
         def run_purge(tx: Transaction) -> Any:
@@ -142,12 +142,12 @@ class Scene:
         function = getattr(*before)
         with ThreadPoolExecutor(2) as pool:
             purging_ = pool.submit(self.other.write, self.desk.user, run_purge)
-            assert paused.wait(20)
+            assert paused.wait(PATIENCE_S)
             acting = pool.submit(self.desk.database.write, self.desk.user, run_act)
             with contextlib.suppress(StillRunning):
                 acting.exception(HEAD_START_S)
             may_go_on.set()
-            outcomes = [future.exception(60) or future.result() for future in (acting, purging_)]
+            outcomes = [future.exception(PATIENCE_S) or future.result() for future in (acting, purging_)]
         assert sorted(runs) == ["act", "purge"], "two transactions waited for each other"
         return outcomes[0], outcomes[1]
 
@@ -487,7 +487,7 @@ def test_a_commit_of_many_outputs_waits_for_a_purge_before_it_locks_its_job(
         begin_purge(tx, project_id)
         begun.set()
         if tx.is_postgres:
-            assert planned.wait(20)
+            assert planned.wait(PATIENCE_S)
         threading.Event().wait(HEAD_START_S)
         free = select(job.c.id).where(job.c.id == made).with_for_update(skip_locked=True)
         return list(tx.execute(free).scalars())
@@ -495,10 +495,10 @@ def test_a_commit_of_many_outputs_waits_for_a_purge_before_it_locks_its_job(
     monkeypatch.setattr(faults, "point", passed)
     with ThreadPoolExecutor(2) as pool:
         purging_ = pool.submit(scene.other.write, scene.desk.user, purge)
-        assert begun.wait(20)
+        assert begun.wait(PATIENCE_S)
         committing = pool.submit(commit_deferred, scene.desk.database)
-        assert purging_.result(60) == [made]
-        assert committing.result(60) == 1
+        assert purging_.result(PATIENCE_S) == [made]
+        assert committing.result(PATIENCE_S) == 1
     assert scene.desk.state(made) == "succeeded"
 
 

@@ -67,7 +67,7 @@ def test_nothing_that_several_users_do_on_two_servers_diverges_from_the_model(
     with mortal_hosts(databases, tmp_path) as hosts:
         world = World(hosts)
         try:
-            run_programs(world, examples(2, soak=10), steps(40))
+            run_programs(world, examples(1, soak=10), steps(40))
         finally:
             world.close()
             print(dict(sorted(world.counts.items())))

@@ -4,20 +4,20 @@ import contextlib
 import json
 import os
 import shutil
-import subprocess
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import pytest
 from tests.support.command_line import run_here
+from tests.support.forked_programs import nursery
 
 from marey_client.cli.demo import evaluation
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = pytest.mark.timeout(900)
 
 SMALL: dict[str, Any] = {"speeds_m_s": (1.5,), "turn_rates_deg_s": (0.0,), "duration_s": 5.0, "replicates": 1}
 """Options of an evaluation with two trials, for runs in which its result does not matter."""
@@ -27,14 +27,30 @@ def surroundings() -> dict[str, str]:
     return {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
 
 
+@dataclass(frozen=True)
+class Told:
+    """Output and error output of a run."""
+
+    output: str
+    errors: str
+
+
 @pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
-    """The folder of a first run in a process of its own, and the result of this run."""
+def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Told]:
+    """The folder of a first run in a process of its own, and the output of this run."""
     folder = tmp_path_factory.mktemp("demo")
-    command = [sys.executable, "-m", "marey_client.cli", "demo", "--data", str(folder / "data")]
-    done = subprocess.run(command, env=surroundings(), capture_output=True, text=True, cwd=folder, timeout=240)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return folder, done
+    command = ["marey_client.cli", "demo", "--data", str(folder / "data")]
+    with (folder / "output").open("wb") as output, (folder / "errors").open("wb") as errors, contextlib.chdir(folder):
+        process = nursery().start(
+            command, surroundings(), output=output.fileno(), errors=errors.fileno(), with_stdin=False
+        )
+        try:
+            status = process.wait()
+        finally:
+            process.kill()
+    told = Told((folder / "output").read_text("utf-8"), (folder / "errors").read_text("utf-8"))
+    assert status == 0, told
+    return folder, told
 
 
 def demo_again(folder: Path, *arguments: str) -> dict[str, Any]:
@@ -48,11 +64,11 @@ def demo_again(folder: Path, *arguments: str) -> dict[str, Any]:
 
 
 def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(
-    first: tuple[Path, subprocess.CompletedProcess[str]],
+    first: tuple[Path, Told],
 ) -> None:
-    folder, done = first
-    told = done.stdout
-    assert f"ls demo --token-file {folder}/data/admin.token" in done.stderr
+    folder, shown = first
+    told = shown.output
+    assert f"ls demo --token-file {folder}/data/admin.token" in shown.errors
     sentence = told.splitlines()[0]
     assert "trajectories" in sentence
     assert "retargeted clips: those whose root moves at least 0.5 m within 1 s" in told
@@ -71,7 +87,7 @@ def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(
 
 
 def test_a_run_with_other_files_reports_on_these_alone(
-    first: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    first: tuple[Path, Told], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, _ = first
     shutil.copytree(folder / "data", tmp_path / "data")

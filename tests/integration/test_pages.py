@@ -32,6 +32,8 @@ from marey_schemas.encoding.codecs import MSGPACK, decode_tree
 from marey_server.handlers.browser import pages
 from marey_server.store.database.connections import Database
 
+pytestmark = pytest.mark.timeout(900)
+
 HOSTILE_NAME = "</script><img src=x onerror='window.harmed = true'><!--<script>"
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}
 

@@ -7,8 +7,6 @@ import re
 import signal
 import socket
 import stat
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -18,6 +16,7 @@ from typing import Any
 import httpx
 import psutil
 import pytest
+from tests.support.forked_programs import nursery
 from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_client.cli.doctor import check_server
@@ -32,8 +31,6 @@ from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
 from marey_server.store.monitoring.figures import Figures
 
-SERVE = "import asyncio; from marey_server.app import serve; from marey_server.process.settings import Settings; "
-
 
 class Process:
     """A server in a separate process, started as by an operator."""
@@ -41,34 +38,33 @@ class Process:
     def __init__(self, folder: Path, *, warm_up: bool = False, **environment: str) -> None:
         """Start the server; with `warm_up`, it warms up at the start, which is the default of servers."""
         self.folder = folder
-        own = {"MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json"}
+        own = {"MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json", "MAREY_LOCAL_WORKERS": "0"}
         if not warm_up:
             own["MAREY_WARM_UP"] = "false"
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", SERVE + "asyncio.run(serve(Settings()))"],
-            env={**os.environ, **own, **environment},
-            stderr=subprocess.PIPE,
-            text=True,
+        reading, writing = os.pipe()
+        self.process = nursery().start(
+            ["marey_client.cli", "serve"], {**os.environ, **own, **environment}, output=writing, with_stdin=False
         )
+        os.close(writing)
         self.lines: list[dict[str, Any]] = []
         self.no_json: list[str] = []
         self._listening = threading.Event()
-        self._reader = threading.Thread(target=self._read)
+        self._reader = threading.Thread(target=self._read, args=[reading])
         self._reader.start()
         assert self._listening.wait(PATIENCE_S), self.lines
         found = [found[1] for line in self.lines if (found := re.search(r"(http://\S+)", line["message"]))]
         assert found, f"the server has ended: {self.lines} {''.join(self.no_json)}"
         self.address = found[0]
 
-    def _read(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            if line.startswith("{"):
-                self.lines.append(json.loads(line))
-            else:
-                self.no_json.append(line)
-            if "listening" in line:
-                self._listening.set()
+    def _read(self, descriptor: int) -> None:
+        with open(descriptor, encoding="utf-8") as log:
+            for line in log:
+                if line.startswith("{"):
+                    self.lines.append(json.loads(line))
+                else:
+                    self.no_json.append(line)
+                if "listening" in line:
+                    self._listening.set()
         self._listening.set()  # the server has ended
 
     @property

@@ -14,6 +14,7 @@ KINDS_OF_TESTS = Path(__file__).parents[1] / "unit" / "worker" / "thirdparty"
 """Distribution with the kinds of job that only tests know."""
 NAMES_OF_KINDS = ("add", "misbehave", "tally", "make")
 """Names of these kinds. Their modules take less time to load than the modules of the built-in kinds."""
+PATIENCE_S = 240.0
 
 
 def python_path() -> str:
@@ -61,7 +62,7 @@ class AttachedWorker:
     def stop(self) -> int:
         """Stop the worker with SIGTERM, and return its exit status."""
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(60)
+        return self.process.wait(PATIENCE_S)
 
     def close(self) -> None:
         """Kill the worker if it is still running."""

@@ -239,6 +239,7 @@ def _run(module: str, arguments: list[str], environment: dict[str, str], program
     sys.argv = [module, *arguments]
     if program:
         fork_children()
+        sys.modules.pop(module, None)  # `runpy` warns about a module that is loaded already
         runpy.run_module(module, run_name="__main__", alter_sys=True)
     else:
         importlib.import_module(module).main()

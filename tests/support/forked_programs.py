@@ -25,6 +25,7 @@ import sys
 import threading
 from collections.abc import Mapping, Sequence
 from io import FileIO
+from pathlib import Path
 
 from tests.support.awaited_programs import AwaitedProgram
 from tests.support.forked_children import (
@@ -41,9 +42,10 @@ from tests.support.forked_children import MODULES as CHILDREN_RUN
 MODULES = (
     "marey_client.cli.app", "marey_client.embedded", "marey_server.app", "marey_server.commands",
     "marey_worker.commands", *CHILDREN_RUN, "psycopg", "sqlalchemy.dialects.postgresql", "sqlalchemy.dialects.sqlite",
-    "uvloop",
+    "uvloop", "matplotlib.backends.backend_agg", "matplotlib.backends.backend_svg", "matplotlib.figure",
+    "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.signal",
 )  # fmt: skip
-"""Modules of servers, workers and their children, and further modules that they import at their start."""
+"""Modules of servers, workers and their children, and further modules that they import at their start or for jobs."""
 STANDARD_ERROR = 2
 _STATUS = struct.Struct("<i")
 
@@ -111,6 +113,7 @@ class Nursery:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "tests.support.forked_programs", str(theirs.fileno()), " " * LONGEST_NAME],
                 env=surroundings | {"OPENBLAS_NUM_THREADS": "1"},
+                cwd=Path(__file__).parents[2],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
@@ -129,12 +132,14 @@ class Nursery:
         *,
         output: int,
         with_stdin: bool,
+        errors: int | None = None,
         own_children: bool = False,
         own_group: bool = False,
     ) -> ForkedProgram:
         """Start `python -m` with `arguments`; the output is written to the descriptor `output`.
 
-        With `own_children`, the program starts its child processes as new processes, instead of forking them. With
+        The error output is written to the descriptor `errors` if it is given, otherwise to `output`, too. With
+        `own_children`, the program starts its child processes as new processes, instead of forking them. With
         `own_group`, it is the first process of a process group.
         """
         order = json.dumps(
@@ -151,7 +156,7 @@ class Nursery:
         taken, given = os.pipe() if with_stdin else (os.open(os.devnull, os.O_RDONLY), None)
         try:
             with self._ordering:
-                socket.send_fds(self._orders, [order], [taken, output, ending])
+                socket.send_fds(self._orders, [order], [taken, output, output if errors is None else errors, ending])
                 answer = self._orders.recv(PID.size)
         finally:
             os.close(ending)
@@ -182,12 +187,13 @@ async def start_program(
 
 
 def load_modules() -> None:
-    """Import the modules of a server and of a worker."""
+    """Import the modules of a server, of a worker, and of all kinds of jobs."""
     from marey_schemas.processes.forking import require_one_thread
     from marey_schemas.processes.memory import loading_modules
+    from marey_schemas.queue.job_kinds import BUILT_IN
 
     with loading_modules():
-        for name in MODULES:
+        for name in (*MODULES, *(kind.implementation.partition(":")[0] for kind in BUILT_IN)):
             importlib.import_module(name)
         importlib.import_module(KERNELS).load_kernels()
     require_one_thread()
@@ -209,27 +215,28 @@ def main() -> list[str]:
             woken.recv(4096)
             tell_statuses(running)
         if orders in ready:
-            order, descriptors, _, _ = socket.recv_fds(orders, LONGEST_ORDER, 3)
+            order, descriptors, _, _ = socket.recv_fds(orders, LONGEST_ORDER, 4)
             if not order:  # the test process has ended
                 sys.exit()
-            taken, output, ending = descriptors
+            *streams, ending = descriptors
             ordered = json.loads(order)
             pid = os.fork()
             if pid == 0:
                 signal.set_wakeup_fd(-1)
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                for source, to in ((taken, 0), (output, 1), (output, 2)):
+                for to, source in enumerate(streams):
                     os.dup2(source, to)
+                sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", buffering=1)  # may be pipes from now on
                 for unused in (orders, woken, wake):
                     unused.close()
-                for descriptor in (taken, output, ending, *running.values()):
+                for descriptor in (*descriptors, *running.values()):
                     os.close(descriptor)
                 return adopt(**ordered)
             if ordered["own_group"]:  # the caller may send a signal to the group before the process has run
                 os.setpgid(pid, pid)
             running[pid] = ending
-            os.close(taken)
-            os.close(output)
+            for descriptor in streams:
+                os.close(descriptor)
             orders.send(PID.pack(pid))
 
 

@@ -23,6 +23,7 @@ from tornado.testing import bind_unused_port
 from tornado.web import Application, RequestHandler
 
 CLIENT, SECRET = "marey", "s3cret: with & odd characters"
+PATIENCE_S = 120.0
 
 
 @cache
@@ -167,11 +168,11 @@ def provider_running() -> Iterator[FakeProvider]:
 
     thread = threading.Thread(target=loop.run_until_complete, args=(main(),), name="marey-test-provider")
     thread.start()
-    assert ready.wait(20)
+    assert ready.wait(PATIENCE_S)
     try:
         yield provider
     finally:
         provider.released.set()
         loop.call_soon_threadsafe(stop.set)
-        thread.join(20)
+        thread.join(PATIENCE_S)
         loop.close()

@@ -20,6 +20,7 @@ Action = Callable[..., Any]
 
 HEAD_START_S = 0.1
 """Time for which the second transaction may run, or wait for locks of the first, before the first one commits."""
+PATIENCE_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,14 @@ def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, 
             answer = first.action(tx)
         finally:
             wrote.set()
-        may_end.wait(20)
+        may_end.wait(PATIENCE_S)
         if not commit:
             raise Abandoned
         return answer
 
     with ThreadPoolExecutor(2) as pool:
         one = pool.submit(first.database.write, first.principal, held_open)
-        assert wrote.wait(20)
+        assert wrote.wait(PATIENCE_S)
         two = pool.submit(second.database.write, second.principal, second.action)
         with contextlib.suppress(StillRunning):
             two.exception(HEAD_START_S)
@@ -61,6 +62,6 @@ def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, 
 
 def _outcome(future: Future[Any]) -> Any:
     try:
-        return future.result(60)
+        return future.result(PATIENCE_S)
     except (ApiProblem, Abandoned) as error:
         return error

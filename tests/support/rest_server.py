@@ -134,14 +134,14 @@ def running(database: Database, folder: Path, **settings: Any) -> Iterator[Serve
 
     thread = threading.Thread(target=lambda: asyncio.run(main()), name="marey-test-server")
     thread.start()
-    assert ready.wait(20), "the server did not start"
+    assert ready.wait(PATIENCE_S), "the server did not start"
     assert started, "the server failed to start"
     server = Server(started["address"], database, started["app"], started["stop"])
     try:
         yield server
     finally:
         server.close()
-        thread.join(20)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive(), "the server did not stop"
 
 

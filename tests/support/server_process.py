@@ -25,7 +25,7 @@ from marey_server.store.fsck import check_store
 
 PORTS = range(20_000, 30_000)
 READY_S = 120.0
-"""Longest time in seconds until a server is ready; long, because the machine may be busy."""
+"""Longest wait in seconds until a server is ready, or a process has ended; long, because the machine may be busy."""
 
 PATIENT = Retries(tries=400, first_s=0.1, longest_s=1.0, total_s=1.5 * READY_S)
 """Retries that last longer than the slowest allowed restart of a server."""
@@ -68,9 +68,9 @@ class MareyProcess:
         assert self.process is not None
         with contextlib.suppress(ProcessLookupError):
             self.process.kill()
-        self.process.wait(30)
+        self.process.wait(READY_S)
 
-    def wait_until_dead(self, seconds: float = 60) -> int:
+    def wait_until_dead(self, seconds: float = READY_S) -> int:
         """Wait until the process has ended without a signal from the test; return its exit status."""
         assert self.process is not None
         return self.process.wait(seconds)
@@ -83,7 +83,7 @@ class MareyProcess:
             self.process.send_signal(signal.SIGCONT)
             self.process.terminate()
         try:
-            return self.process.wait(40)
+            return self.process.wait(READY_S)
         except subprocess.TimeoutExpired:
             self.kill()
             raise

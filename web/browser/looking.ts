@@ -3,13 +3,16 @@ import axe from "axe-core";
 import { mkdirSync } from "node:fs";
 import { join } from "node:path";
 import { type Browser, type BrowserContext, chromium, type Locator, type Page } from "playwright-core";
-import { expect } from "vitest";
+import { expect, vi } from "vitest";
 import type { SceneState } from "../src/player/testHandle";
 
 const FLAGS = [
   "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage",
   "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
 ];
+/** Longest wait for anything in a page, in milliseconds: long, because machines may be busy. */
+export const PATIENCE_MS = 240_000;
+vi.setConfig({ testTimeout: 2 * PATIENCE_MS, hookTimeout: 2 * PATIENCE_MS });
 /** Folder for pictures of the pages; without it, none are taken. */
 const PICTURES = process.env["MAREY_WEB_PICTURES"] ?? null;
 

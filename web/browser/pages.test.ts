@@ -1,7 +1,7 @@
 /** The pages in a real Chromium, against a real server that pytest has started and filled (tests/integration/test_pages.py). */
 import { type Browser, type BrowserContext, type Page } from "playwright-core";
 import { afterAll, beforeAll, expect, it } from "vitest";
-import { colours, faults, launch, picture, scene, signOut, tellFirstPose } from "./looking";
+import { colours, faults, launch, PATIENCE_MS, picture, scene, signOut, tellFirstPose } from "./looking";
 
 interface Given {
   chromium: string;
@@ -26,6 +26,7 @@ const complaints: string[] = [];
 beforeAll(async () => {
   browser = await launch(GIVEN.chromium);
   context = await browser.newContext({ viewport: { width: 1280, height: 800 }, colorScheme: "dark" });
+  context.setDefaultTimeout(PATIENCE_MS);
   page = await context.newPage();
   page.on("console", (message) => message.type() === "error" && complaints.push(message.text()));
   page.on("pageerror", (error) => complaints.push(error.message));
@@ -50,7 +51,7 @@ it("draws both clips with WebGL, with every joint where the server computes it",
     expect(errors.length).toBe(expected.length);
     expect(Math.max(...errors), `frame ${frame}`).toBeLessThan(TOLERANCE_M);
   }
-  await expect.poll(() => colours(page), { timeout: 20_000 }).toBeGreaterThan(30);
+  await expect.poll(() => colours(page), { timeout: PATIENCE_MS }).toBeGreaterThan(30);
   await picture(page, "view-mannequins");
 });
 
@@ -104,7 +105,7 @@ it("draws side views where there is no WebGL", async () => {
   await plain.goto(page.url());
   const state = await scene(plain, (one) => one.actors.length === 2);
   expect(state.stage).toBe("canvas");
-  await expect.poll(() => colours(plain), { timeout: 20_000 }).toBeGreaterThan(5);
+  await expect.poll(() => colours(plain), { timeout: PATIENCE_MS }).toBeGreaterThan(5);
   await plain.getByText("This browser offers no WebGL").waitFor();
   await picture(plain, "view-without-webgl");
   await plain.close();
@@ -112,6 +113,7 @@ it("draws side views where there is no WebGL", async () => {
 
 it("says what to do without a session, and for a link that was used", async () => {
   const stranger = await browser.newContext({ viewport: { width: 1280, height: 800 } });
+  stranger.setDefaultTimeout(PATIENCE_MS);
   const other = await stranger.newPage();
   await other.goto(GIVEN.link); // its code was used above
   await other.getByText("This link is not valid").waitFor();

@@ -2,7 +2,7 @@
 import { type Browser, type BrowserContext, type Page } from "playwright-core";
 import { afterAll, beforeAll, expect, it } from "vitest";
 import { LONGEST_STEP_S } from "../src/player/clock.svelte";
-import { colours, faults, launch, picture, scene } from "./looking";
+import { colours, faults, launch, PATIENCE_MS, picture, scene } from "./looking";
 
 interface Given {
   chromium: string;
@@ -28,6 +28,7 @@ const requests: string[] = [];
 beforeAll(async () => {
   browser = await launch(GIVEN.chromium);
   context = await browser.newContext({ viewport: { width: 1280, height: 800 }, colorScheme: "dark" });
+  context.setDefaultTimeout(PATIENCE_MS);
 });
 
 afterAll(() => browser.close());
@@ -73,7 +74,7 @@ it("plays a clip at its rate, with every joint near where the server computes it
     expect(errors.length).toBe(expected.length);
     expect(Math.max(...errors), `frame ${frame}`).toBeLessThan(TOLERANCE_M);
   }
-  await expect.poll(() => colours(page), { timeout: 20_000 }).toBeGreaterThan(30);
+  await expect.poll(() => colours(page), { timeout: PATIENCE_MS }).toBeGreaterThan(30);
   await picture(page, "player-alone");
   await page.close();
 });

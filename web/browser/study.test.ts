@@ -5,10 +5,10 @@
 import { createHash } from "node:crypto";
 import { readFileSync, writeFileSync } from "node:fs";
 import { type Browser, type BrowserContext, type Page } from "playwright-core";
-import { afterAll, beforeAll, expect, it, vi } from "vitest";
+import { afterAll, beforeAll, expect, it } from "vitest";
 import type { Differences } from "../src/study/conducting";
 import type { Trial } from "../src/study/participation";
-import { colours, faults, launch, picture, scene, signOut, tellFirstPose } from "./looking";
+import { colours, faults, launch, PATIENCE_MS, picture, scene, signOut, tellFirstPose } from "./looking";
 
 interface Given {
   chromium: string;
@@ -36,8 +36,6 @@ const GIVEN = JSON.parse(process.env["MAREY_WEB_GIVEN"]!) as Given;
 const SMALL = { width: 480, height: 360 }; // four figures without a graphics processor
 const SIZES = { 1280: { width: 1280, height: 800 }, 390: { width: 390, height: 844 } };
 
-vi.setConfig({ testTimeout: 180_000 });
-
 let browser: Browser;
 /** The page of the study as its owner sees it, open while participants answer. */
 let owner: { context: BrowserContext; page: Page };
@@ -54,7 +52,7 @@ afterAll(() => browser.close());
 /** Return a new profile of the browser, which shares nothing with the others. */
 async function profile(viewport = SMALL): Promise<{ context: BrowserContext; page: Page }> {
   const context = await browser.newContext({ viewport, colorScheme: "dark" });
-  context.setDefaultTimeout(60_000); // machines may be busy
+  context.setDefaultTimeout(PATIENCE_MS);
   const page = await context.newPage();
   page.on("pageerror", (error) => complaints.push(error.message));
   return { context, page };
@@ -178,7 +176,7 @@ it("records each trial that a participant answers, by keys and by clicks, also a
       trial = again;
     }
     if (index === 0) {
-      await expect.poll(() => colours(page), { timeout: 20_000 }).toBeGreaterThan(15);
+      await expect.poll(() => colours(page), { timeout: PATIENCE_MS }).toBeGreaterThan(15);
       expect(await faults(page)).toEqual([]);
       await page.keyboard.press("1");
       await pictures(page, "trial");
@@ -259,7 +257,7 @@ it("shows its owner what participants perceived, and both motions of a pair", as
   const pairs = found.shown.flatMap((row, one) => row.slice(one + 1));
   const missing = pairs.filter((count) => count === 0).length;
   await page.getByText(missing === 0 ? "Every pair was shown." : `${missing} of ${pairs.length} pairs were never shown together.`).waitFor();
-  await expect.poll(() => colours(page), { timeout: 20_000 }).toBeGreaterThan(15); // the picture of the table
+  await expect.poll(() => colours(page), { timeout: PATIENCE_MS }).toBeGreaterThan(15); // the picture of the table
   await page.getByText("All pairs as a table").click();
   const rows = page.getByRole("region", { name: "All pairs" }).getByRole("row");
   expect(await rows.count()).toBe(1 + pairs.length);
@@ -286,7 +284,7 @@ it("shows its owner the analysis, and ends the session by a button", async () =>
   const { context, page } = owner;
   await analyse();
   const report = page.getByRole("link", { name: "Report with figures" });
-  await report.waitFor({ timeout: 120_000 }); // until the page looks again
+  await report.waitFor(); // until the page looks again
   await page.getByRole("region", { name: "Fitted metrics, best first" }).waitFor();
   expect(await page.getByRole("row", { name: /^positions, manhattan/ }).count()).toBe(1);
   const opened = await context.newPage();

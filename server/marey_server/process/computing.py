@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import ParamSpec, TypeVar
@@ -78,9 +77,10 @@ def compute_on_one_thread_each() -> None:
 
 
 def leave() -> None:
-    """End this process without waiting for running computations; do nothing if none are running."""
-    if not any(thread.name.startswith(THREAD_NAME) for thread in threading.enumerate()):
-        return
+    """End this process at once, without waiting for running computations and without freeing its objects one by one.
+
+    Nothing needs their end: clients of the computations have disconnected, and freeing the objects takes 0.3 s.
+    """
     logging.shutdown()
     sys.stdout.flush()
     sys.stderr.flush()

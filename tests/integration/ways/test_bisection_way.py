@@ -36,6 +36,7 @@ WORDS = ("--speeds", "1", "--turns=-50,50", "--duration", "3", "--no-baseline")
 """The options of `GRID` on the command line."""
 BISECT_WITHOUT_LIMIT = ("dataset", "bisect", "lab/gaits", "--good", "v1", "--metric", "offset_mean_m", *WORDS)
 BISECT = (*BISECT_WITHOUT_LIMIT, "--half-way")
+PATIENCE_S = 240.0
 LONG = ("--speeds", "1:3:0.5", "--duration", "20", "--replicates", "3")
 """Options that make an evaluation take so long that it can be interrupted."""
 LEFT_TURNS = [f"raw/walk {speed} 60" for speed in ("1", "1.5", "2")]
@@ -193,7 +194,7 @@ def test_an_interrupted_search_is_continued_by_the_same_command(
             break
     running = wait_for_job(lab)
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
+    _, told = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     assert "the same command continues the search and reuses the 2 evaluations made so far" in told
     assert marey.jobs.wait(running, require_success=False).state is JobState.CANCELLED
@@ -205,11 +206,12 @@ def test_an_interrupted_search_is_continued_by_the_same_command(
 
 def wait_for_job(lab: ProjectHandle) -> str:
     """Wait until the third evaluation has been submitted, and return the id of its job."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         jobs = list(lab.jobs())
         if len(jobs) == 3:
             return jobs[0].id
+        time.sleep(0.1)
     raise AssertionError("the third evaluation was not submitted")
 
 

@@ -1,17 +1,18 @@
 """Workflow through all main features, with command line and SDK, on a real server with a real worker."""
 
+import contextlib
 import hashlib
 import json
 import os
 import re
 import subprocess
-import sys
 import zipfile
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
-from tests.support.command_line import CommandLine
+from tests.support.command_line import CommandLine, run_here
 from tests.support.present import present
 from tests.support.server_process import ServerProcess
 
@@ -31,6 +32,7 @@ from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.job_params import ImportParams
 from marey_schemas.queue.jobs import CollectionInput, ItemInput, JobCreate
 
+PATIENCE_S = 240.0
 pytestmark = pytest.mark.parametrize("server", ["sqlite"], indirect=True, scope="session")
 
 
@@ -264,7 +266,7 @@ def test_a_job_imports_what_a_request_would(project: ProjectHandle, marey: Marey
     blobs = [{"name": file.name, "blob": marey.blobs.put_file(file.path)} for file in files]
     params = ImportParams.model_validate({"files": blobs, "collection": "raw", "subject": "ada"})
     job = project.submit(JobCreate(kind="import", params=params.model_dump(mode="json", exclude_defaults=True)))
-    ended = marey.jobs.wait(job.id, timeout_s=60)
+    ended = marey.jobs.wait(job.id, timeout_s=PATIENCE_S)
     entries = {entry["name"]: entry for entry in present(ended.result)["entries"]}
     assert entries["broken.bvh"]["error"]["line"] == 4
     assert entries["walk.bvh"]["frames"] == 120
@@ -290,7 +292,7 @@ def test_an_archive_holds_every_clip_and_is_the_same_each_time(
             params={"format": file_format},
             cache="off",
         )
-        ended = marey.jobs.wait(project.submit(wanted).id, timeout_s=60)
+        ended = marey.jobs.wait(project.submit(wanted).id, timeout_s=PATIENCE_S)
         digests.append(present(ended.result)["archive"]["blob"])
     assert digests[0] == digests[1]
     archive = marey.blobs.fetch_to(digests[0], tmp_path / "clips.zip")
@@ -317,7 +319,8 @@ def test_a_clip_that_cannot_be_retargeted_is_a_refusal_and_the_others_are_made(
     }  # fmt: skip
     project.clips.create("tumbling", {"motion": motion}, collection="raw")
     inputs = {"clips": CollectionInput(collection="raw"), "skeleton": ItemInput(item=studio.id)}
-    ended = marey.jobs.wait(project.submit(JobCreate(kind="retarget", inputs=inputs, into="out")).id, timeout_s=60)
+    job = project.submit(JobCreate(kind="retarget", inputs=inputs, into="out"))
+    ended = marey.jobs.wait(job.id, timeout_s=PATIENCE_S)
     assert present(ended.result)["clips"] == 2
     (refusal,) = present(ended.result)["refused"]
     assert refusal["name"] == "raw/tumbling"
@@ -338,7 +341,7 @@ def test_retargeting_to_a_skeleton_without_a_body_fails_once_and_says_why(
     )
     inputs = {"clips": CollectionInput(collection="raw"), "skeleton": ItemInput(item=box.id)}
     with pytest.raises(errors.JobUnsuccessful, match="Sphere") as caught:
-        marey.jobs.wait(project.submit(JobCreate(kind="retarget", inputs=inputs, into="out")).id, timeout_s=60)
+        marey.jobs.wait(project.submit(JobCreate(kind="retarget", inputs=inputs, into="out")).id, timeout_s=PATIENCE_S)
     assert len(list(marey.jobs.attempts(caught.value.job.id))) == 1
 
 
@@ -346,7 +349,7 @@ def test_results_keep_the_licence_and_say_what_was_done(project: ProjectHandle, 
     options = ImportOptions(collection="raw", licence="CC BY-NC 4.0", subject="ada")
     project.imports.upload(find_files([takes / "walk.bvh"]).files, options)
     inputs = {"clips": CollectionInput(collection="raw"), "skeleton": ItemInput(item=target_skeleton(project).id)}
-    marey.jobs.wait(project.submit(JobCreate(kind="retarget", inputs=inputs, into="out")).id, timeout_s=60)
+    marey.jobs.wait(project.submit(JobCreate(kind="retarget", inputs=inputs, into="out")).id, timeout_s=PATIENCE_S)
     (result,) = project.clips.list(collection="out")
     info = result.info()
     assert (info.licence, info.subject) == ("CC BY-NC 4.0", "ada")
@@ -391,14 +394,12 @@ def test_the_log_of_a_job_can_be_read_and_followed(
 
 def test_logging_in_stores_a_token_for_its_owner_alone(marey: Marey, server: ServerProcess, tmp_path: Path) -> None:
     marey.users.create(UserCreate(name="grace", password="correct horse battery"))
-    surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-    environment = {**surroundings, "XDG_CONFIG_HOME": str(tmp_path), "HOME": str(tmp_path)}
+    environment = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+    environment |= {"XDG_CONFIG_HOME": str(tmp_path), "HOME": str(tmp_path)}
 
-    def command(*arguments: str, stdin: str | None = None) -> subprocess.CompletedProcess[str]:
-        whole = [sys.executable, "-m", "marey_client.cli", *arguments]
-        return subprocess.run(
-            whole, env=environment, input=stdin, capture_output=True, text=True, cwd=tmp_path, timeout=60
-        )
+    def command(*arguments: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
+        with mock.patch.dict(os.environ, environment, clear=True), contextlib.chdir(tmp_path):
+            return run_here(list(arguments), stdin)
 
     with server.client() as other:
         token = other.sign_in(Login(name="grace", password="correct horse battery")).secret
@@ -420,7 +421,7 @@ def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(
 
     def retargeted(into: str) -> ClipHandle:
         job = project.retarget([CollectionInput(collection="raw")], studio.id, into=into)
-        marey.jobs.wait(job.id, timeout_s=60)
+        marey.jobs.wait(job.id, timeout_s=PATIENCE_S)
         (clip,) = project.clips.list(collection=into)
         return clip
 
@@ -493,7 +494,7 @@ def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it
     source.put_mapping(source.mapping().model_copy(update={"confidence": 0.2}))
     sources = [CollectionInput(collection="raw")]
     with pytest.raises(errors.JobUnsuccessful, match="none of 1 clip can be retargeted") as doubtful:
-        marey.jobs.wait(project.retarget(sources, studio.id, into="doubtful").id, timeout_s=60)
+        marey.jobs.wait(project.retarget(sources, studio.id, into="doubtful").id, timeout_s=PATIENCE_S)
     assert doubtful.value.job.failure.code == "nothing-done"
     place = f"{project.name}/{source.id}"
     assert "revision 3" in run("skeleton", "map", place, "--confirm").stderr
@@ -501,5 +502,5 @@ def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it
     assert "nothing changes" in run("skeleton", "map", place, f"left_ankle={known}").stderr
     assert "did you mean left_ankle" in run("skeleton", "map", place, f"leftankle={known}", status=2).stderr
     assert project.skeletons.get(source.id).item.revision == 3
-    ended = marey.jobs.wait(project.retarget(sources, studio.id, into="confirmed").id, timeout_s=60)
+    ended = marey.jobs.wait(project.retarget(sources, studio.id, into="confirmed").id, timeout_s=PATIENCE_S)
     assert present(ended.result)["clips"] == 1

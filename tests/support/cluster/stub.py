@@ -76,7 +76,7 @@ class StubCluster:
             return function()
 
         assert self._loop is not None
-        return asyncio.run_coroutine_threadsafe(call(), self._loop).result(30)
+        return asyncio.run_coroutine_threadsafe(call(), self._loop).result(PATIENCE_S)
 
     def all(self, kind: str) -> list[Document]:
         """Return all objects of a kind, such as `jobs`."""
@@ -143,10 +143,10 @@ def running_cluster(folder: Path, certificate: Path | None = None) -> Iterator[S
 
     thread = threading.Thread(target=lambda: asyncio.run(main()), name="stub-cluster")
     thread.start()
-    assert ready.wait(20), "the stub cluster did not start"
+    assert ready.wait(PATIENCE_S), "the stub cluster did not start"
     try:
         yield stub
     finally:
         stops[0]()
-        thread.join(60)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive(), "the stub cluster did not stop"
