@@ -122,6 +122,9 @@ def _claims_of(metric: MetricDocument) -> Iterator[str]:
         f"The weights come from {who}: a distance estimates how rarely people would call two motions the most similar "
         f"of four, from 0 (always) to 1 (never).{mean}"
     )
+    if metric.origin == "fitted" and (metric.fit is None or metric.fit.noise_ceiling is None):
+        yield "The standard error of the judgements is not known, so small differences of distances may be noise."
+        return
     yield (
         f"The judgements themselves have a standard error of {metric.judgement_error:.2f}, so the metric cannot order "
         f"distances that differ by less than {2 * metric.judgement_error:.2f}."
