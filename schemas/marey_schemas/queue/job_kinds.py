@@ -225,7 +225,7 @@ ANALYSE_STUDY = KindDeclaration(
     "jobs.",
     params=job_params.AnalyseStudyParams,
     implementation="marey_worker.kinds.analyse_study:run",
-    version=1,
+    version=2,
     inputs={"study": InputSpec(kind=Kind.STUDY, description="The study, at the revision that its participants saw.")},
     outputs={"document": "file", "report": "file", "fitted": "file"},
     never_cached_for=_reads_answers,

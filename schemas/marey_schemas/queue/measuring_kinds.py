@@ -84,7 +84,10 @@ DISTANCES = KindDeclaration(
     "registration curves.",
     params=job_params.DistancesParams,
     implementation="marey_worker.kinds.distances:run",
-    version=1,
+    gathering="marey_worker.kinds.distances:gather",
+    task_count=job_params.count_distance_tasks,
+    counted="clips",
+    version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to compare, all of one skeleton."),
         "metric": METRIC,
