@@ -68,8 +68,8 @@ class GroupedExample:
     ----------
     example : Example    T samples
     groups : (T,) int64    number of the ball that encloses each sample
-    turns : (T,) int64    order in which single samples are compared with rows: samples in wide balls come first, because
-        their distances exceed the bounds of the ball most
+    turns : (T,) int64    order in which samples are compared with rows: those in wide balls come first, because their
+        distances exceed the bound of the ball most
     centres : (G, WIDTH) float32    centres of the balls
     reaches : (G, 41) float32    radii of the balls: of each vector, then of each rotation
     """
