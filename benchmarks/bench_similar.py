@@ -23,7 +23,7 @@ from marey_motion.similarity.example import Example, sample_offsets
 from marey_motion.similarity.features import JOINTS, ROTATED_JOINTS, ROTATIONS_AT, VECTORS, PoseFeatures, Rows
 from marey_motion.similarity.searching import search_windows
 from marey_motion.similarity.shard_search import SearchedShard
-from marey_motion.similarity.shards import FULL_SHARD_ROWS, Shard, presence, write_shard
+from marey_motion.similarity.shards import FULL_SHARD_ROWS, Runs, Shard, presence, write_shard
 
 GOAL_MS, GOAL_POSES = 200, 3_000_000
 POSES, SEARCHES, HITS, THREADS = 60_000, 30, 10, 2
@@ -53,7 +53,7 @@ def _written(folder: Path, features: Iterable[PoseFeatures]) -> Iterable[Searche
         write_shard(path, runs)
         ranks = np.arange(len(runs)) + 100_000 * written
         joints = np.full(len(runs), _ALL)
-        return SearchedShard(partial(Shard.open, path, lengths, joints), ranks, np.zeros(len(runs), np.bool_))
+        return SearchedShard(partial(Shard.open, path, Runs.of(lengths), joints), ranks, np.zeros(len(runs), np.bool_))
 
     for one in features:
         runs.append(one.rows)

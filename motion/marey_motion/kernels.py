@@ -21,6 +21,7 @@ compiled = _options()
 contracted = _options(fastmath={"contract"})
 # For functions with so many arguments that a call costs as much as their work.
 inlined = _options(forceinline=True)
+contracted_inlined = _options(forceinline=True, fastmath={"contract"})
 
 
 @_options(inline="always")

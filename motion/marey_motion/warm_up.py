@@ -252,7 +252,7 @@ def _find_similar(clip: Clip) -> None:
     from marey_motion.similarity.features import PoseFeatures, clip_features
     from marey_motion.similarity.searching import search_windows
     from marey_motion.similarity.shard_search import SearchedShard
-    from marey_motion.similarity.shards import Shard, presence, write_shard
+    from marey_motion.similarity.shards import Runs, Shard, presence, write_shard
 
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
     features = clip_features(Motion.of(clip), body, clip.frame_rate_hz)
@@ -261,7 +261,9 @@ def _find_similar(clip: Clip) -> None:
     with TemporaryDirectory() as folder:
         path, lengths, joints = Path(folder, "shard"), np.array([len(features.rows)]), np.array([presence(features)])
         write_shard(path, [features.rows])
-        searched = SearchedShard(lambda: Shard.open(path, lengths, joints), np.zeros(1, np.int64), np.zeros(1, bool))
+        searched = SearchedShard(
+            lambda: Shard.open(path, Runs.of(lengths), joints), np.zeros(1, np.int64), np.zeros(1, bool)
+        )
         search_windows([searched], example, published_metric(), 1)
 
 

@@ -114,7 +114,10 @@ class PurgeAnswer(Answer):
     """Outcome of a purge: the items that were (or would be) deleted for good, and the items that are still needed."""
 
     preview: bool
-    purged: tuple[PurgedItem, ...]
+    purged: tuple[PurgedItem, ...] = Field(
+        description="Items that were (or would be) deleted for good. They include indexes of motions that contain "
+        "poses of the purged clips, even if the indexes were not deleted before."
+    )
     refused: tuple[HeldItem, ...]
     freed_bytes: int = Field(
         description="Bytes that the next garbage collection can free: those of the documents, arrays and files to "

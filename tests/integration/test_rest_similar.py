@@ -11,11 +11,19 @@ import httpx
 import pytest
 from tests.support.studying import make_study
 
+from marey_motion.documents import clip_to_tree, skeleton_to_document
+from marey_motion.gait import generate_gait
+from marey_motion.matching.body import MatchingBody
+from marey_motion.motion import Motion
+from marey_motion.rigs import map_joints
+from marey_motion.similarity.features import clip_features
+from marey_motion.similarity.shards import write_shard
 from marey_schemas.documents.metrics import built_in_metric
 from marey_schemas.documents.motion_indexes import IndexShard, ShardClips
 from marey_schemas.search import SimilarRequest
 from marey_server.errors import NotFoundProblem
-from marey_server.motions.similar import ShardFiles, SimilarOrder, search_index
+from marey_server.motions.child import pack_tree
+from marey_server.motions.similar import FoundWindows, ShardFiles, SimilarOrder, search_index
 
 ONE = {"items": ["clip_a"], "revisions": [1], "rows": [60], "joints": [1], "frames": [60], "rates_hz": [30.0]}
 
@@ -80,3 +88,34 @@ def test_lists_of_clips_contain_only_possible_numbers(name: str, value: float) -
     file = {"blob": f"sha256:{'0' * 64}", "size_bytes": 1}
     with pytest.raises(ValueError, match="dropped"):
         IndexShard.model_validate({"clips": file, "poses": file, "rows": 1, "dropped": [-1]})
+
+
+def test_changed_dropped_and_left_out_clips_are_not_searched_and_unknown_ones_are_counted(tmp_path: Path) -> None:
+    clip = generate_gait(1.3, 0.2, 3.0, 30.0)
+    rows = clip_features(
+        Motion.of(clip), MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton)), 30.0
+    ).rows
+    shards = []
+    for number, ids in enumerate((("clip_a", "clip_b", "clip_c"), ("clip_d", "clip_e"))):
+        count = len(ids)
+        lists = {"items": ids, "revisions": [2] * count, "rows": [len(rows)] * count, "joints": [2**15 - 1] * count}
+        lists |= {"frames": [len(rows)] * count, "rates_hz": [30.0] * count}
+        clips, poses = tmp_path / f"clips{number}", tmp_path / f"poses{number}"
+        clips.write_text(json.dumps(lists))
+        write_shard(poses, [rows] * count)
+        shards.append(ShardFiles(clips=str(clips), poses=str(poses), dropped=(1,) if number == 0 else ()))
+    # clip_c was deleted, clip_d changed, clip_e was restored, and clip_f is new.
+    heads = {"clip_c": 0, "clip_d": 3, "clip_e": 2, "clip_f": 1}
+    for leave_out, expected in (("nothing", {"clip_a", "clip_e"}), ("clip", {"clip_e"})):
+        order = SimilarOrder(
+            request=SimilarRequest(clip="clip_a", frames=(30, 45), leave_out=leave_out, results=50),
+            metric=built_in_metric("published/positions-sigmoid"), revision=2,
+            motion=pack_tree(clip_to_tree(clip, {"item": "skeleton_a", "revision": 1})), first=30,
+            hierarchy=pack_tree(skeleton_to_document(clip.skeleton).model_dump(by_alias=True)), mapping=None,
+            shards=tuple(shards), heads=heads,
+        )  # fmt: skip
+        for _ in range(2):  # the second search uses what the first has kept
+            found = FoundWindows.unpack(search_index(order.pack()))
+            assert {one.clip for one in found.windows} == expected
+            assert (found.searched_clips, found.behind) == (len(expected), 2)
+            assert found.windows[0].distance == pytest.approx(0.0, abs=1e-3)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import combinations
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -64,6 +63,25 @@ class ClipDistances:
 
     totals: Floats
     by_component: Floats
+
+    @classmethod
+    def of(cls, count: int, pairs: Ints, found: Floats) -> Self:
+        """Make the tables of distances.
+
+        Parameters
+        ----------
+        count : int    number of clips N
+        pairs : (R, 2) int64    all pairs of the clips, each once
+        found : (R, 1 + C) float64    distances of the pairs, as `compare_pairs` returns them
+
+        Returns
+        -------
+        ClipDistances    symmetric tables
+        """
+        tables = np.zeros((found.shape[1], count, count))
+        for i, j in (pairs.T, pairs.T[::-1]):
+            tables[:, i, j] = found.T
+        return cls(tables[0], tables[1:])
 
     def pairs_by_distance(self) -> Ints:
         """List the pairs i < j, the nearest first.
@@ -162,29 +180,58 @@ def compare_clips(
 
     Raises
     ------
-    MotionError    if clips cannot be compared, or the motion maps of all pairs have more than `MOST_TABLE_CELLS` cells
+    MotionError    as for `compare_pairs`
     """
-    pairs = list(combinations(range(len(clips)), 2))
-    counts = np.array([clip.frame_count for clip in clips])
-    if (cells := (int(counts.sum()) ** 2 - int((counts**2).sum())) // 2) > MOST_TABLE_CELLS:
+    pairs = np.stack(np.triu_indices(len(clips), 1), axis=1)
+    by_number = dict(enumerate(clips))
+    return ClipDistances.of(
+        len(clips), pairs, compare_pairs(by_number, pairs, metric, threads=threads, progress=progress)
+    )
+
+
+def compare_pairs(
+    clips: Mapping[int, MeasuredClip],
+    pairs: Ints,
+    metric: PerceptualMetric,
+    *,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> Floats:
+    """Compute the perceptual distances of some pairs of clips.
+
+    Parameters
+    ----------
+    clips : mapping of int to MeasuredClip    clips by number
+    pairs : (R, 2) int64    numbers of the clips of each pair
+    metric : PerceptualMetric    metric of C components
+    threads : int    number of threads
+    progress : callable, optional    called with the number of pairs done, the number of all pairs, and a note
+
+    Returns
+    -------
+    (R, 1 + C) float64    distance of each pair, and its distances by each component alone, not multiplied by its share
+
+    Raises
+    ------
+    MotionError    if clips cannot be compared, or the motion maps of the pairs have more than `MOST_TABLE_CELLS` cells
+    """
+    cells = sum(clips[int(i)].frame_count * clips[int(j)].frame_count for i, j in pairs)
+    if cells > MOST_TABLE_CELLS:
         raise MotionError(
             f"the motion maps of {len(pairs):,} pairs would have {cells:,} cells, and at most {MOST_TABLE_CELLS:,} can "
             "be computed; compare fewer or shorter clips",
             code="too-many-frames",
         )
-    totals = np.zeros((len(clips), len(clips)))
-    parts = np.zeros((len(metric.components), len(clips), len(clips)))
+    found = np.empty((len(pairs), 1 + len(metric.components)))
     with ThreadPoolExecutor(threads) as pool:
-        found = pool.map(partial(_distance, clips, metric), pairs)
-        for done, ((i, j), distance) in enumerate(zip(pairs, found, strict=True)):
+        for done, distance in enumerate(pool.map(partial(_distance, clips, metric), pairs.tolist())):
             if progress is not None:
                 progress(done, len(pairs), f"comparing {len(clips)} clips")
-            totals[i, j] = totals[j, i] = distance.total
-            parts[:, i, j] = parts[:, j, i] = distance.by_component
-    return ClipDistances(totals, parts)
+            found[done] = distance.total, *distance.by_component
+    return found
 
 
-def _distance(clips: Sequence[MeasuredClip], metric: PerceptualMetric, pair: tuple[int, int]) -> ClipDistance:
+def _distance(clips: Mapping[int, MeasuredClip], metric: PerceptualMetric, pair: tuple[int, int]) -> ClipDistance:
     one, other = (clips[number] for number in pair)
     try:
         return clip_distance(one, other, metric)

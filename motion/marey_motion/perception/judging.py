@@ -15,6 +15,8 @@ from marey_motion.errors import MotionError
 from marey_schemas.documents.studies import SHOWN
 
 TRIALS = 63
+LEAST_REPEATS = 30
+"""Number of answers about pairs that others were asked about before, from which the noise is known within a quarter."""
 _CANDIDATE_DRAWS = 24
 _FIRST, _SECOND = np.triu_indices(SHOWN, 1)
 _PAIR_OF = {(int(one), int(other)): pair for pair, (one, other) in enumerate(zip(_FIRST, _SECOND, strict=True))}
@@ -73,12 +75,21 @@ class DifferenceTable:
     chosen: Ints
 
     @property
-    def noise_ceiling(self) -> float:
-        """Root mean square of the binomial standard errors of all pairs: the least error to expect of any fit."""
-        pairs = np.triu_indices(len(self.shown), 1)
-        shown, p = self.shown[pairs], self.differences[pairs]
-        seen = shown > 0
-        return float(np.sqrt(np.mean(p[seen] * (1.0 - p[seen]) / shown[seen])))
+    def noise_ceiling(self) -> float | None:
+        """Root mean square of the standard errors of the differences: the least error to expect of any fit.
+
+        The variance of a single answer is that of repeated answers about the same pair. A pair that was shown once has
+        the difference 0 or 1, which says nothing about its error, so the variance is estimated from all pairs together.
+        None if fewer than `LEAST_REPEATS` answers repeat a pair. How much people differ from each other is not
+        included.
+        """
+        shown = self.shown[np.triu_indices(len(self.shown), 1)]
+        p = self.differences[np.triu_indices(len(self.shown), 1)][shown > 0]
+        shown = shown[shown > 0]
+        repeats = np.sum(shown - 1)
+        if repeats < LEAST_REPEATS:
+            return None
+        return float(np.sqrt(np.sum(shown * p * (1.0 - p)) / repeats * np.mean(1.0 / shown)))
 
 
 def judgements_of(motion_count: int, answers: Sequence[Answer]) -> Judgements:

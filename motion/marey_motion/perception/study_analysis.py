@@ -38,6 +38,8 @@ from marey_schemas.documents.metrics import MetricDocument, Shaping
 SHAPINGS: tuple[Shaping, ...] = ("euclid", "manhattan", "sigmoid", "power")
 INTERVAL = (0.025, 0.975)
 """Quantiles of the resampled weights at the ends of their intervals."""
+FEWEST_FOR_INTERVALS = 5
+"""Least number of participants for intervals: the quantiles need 40 different draws, and four people have only 35."""
 
 Progress = Callable[[float, float, str], None]
 
@@ -252,7 +254,7 @@ def _intervals(
     judgements: Judgements, differences: PairDifferences, shaping: Shaping, draws: int, seed: int
 ) -> dict[str, tuple[float, float]]:
     """Return the 95 % interval of each weight, as a share of the sum of all weights, over draws of participants."""
-    if not draws:
+    if not draws or len(np.unique(judgements.participants)) < FEWEST_FOR_INTERVALS:
         return {}
     shown, chosen = pair_counts_by_participant(judgements)
     try:

@@ -17,20 +17,19 @@ import math
 
 import numpy as np
 
-from marey_motion.kernels import compiled, contracted
+from marey_motion.kernels import contracted, contracted_inlined
 from marey_motion.perception.map_kernels import ANGLE, EUCLID, MANHATTAN, ONE_MINUS_DOT, SIGMOID
 
 _CHUNK = 512
 """Number of balls that are computed at a time: large, for few calls, but small enough for the processor's cache."""
-_GAP = 32
-"""Largest number of balls between two ranges with which the ranges are joined."""
-_RANGE_COST, _STEP_COST = 60, 15
-"""Fixed time for each range of balls, and time to compare the rows of a step, relative to the time for a ball."""
 
 
-@contracted
-def _add_rotation_bounds(w, u, v, z, cw, cu, cv, cz, radii, reach, factor, measure, x):
-    """Add to x (n,) factor · lower bound of the distance from a rotation to the rotations in each of n balls."""
+@contracted_inlined
+def _add_rotation_bounds(w, u, v, z, cw, cu, cv, cz, radii, reach, factor, measure, more, x):
+    """Add to x (n,) factor · lower bound of the distance from a rotation to the rotations in each of n balls.
+
+    If `more` is false, x is overwritten instead.
+    """
     if measure == ANGLE:
         factor = factor * np.float32(2.0)
     for j in range(x.shape[0]):
@@ -38,18 +37,23 @@ def _add_rotation_bounds(w, u, v, z, cw, cu, cv, cz, radii, reach, factor, measu
         minus = (w - aw) * (w - aw) + (u - au) * (u - au) + (v - av) * (v - av) + (z - az) * (z - az)
         plus = (w + aw) * (w + aw) + (u + au) * (u + au) + (v + av) * (v + av) + (z + az) * (z + az)
         d = max(np.float32(math.sqrt(min(minus, plus))) - (radii[j] + reach), np.float32(0.0))
-        x[j] += factor * (np.float32(0.5) * d * d if measure == ONE_MINUS_DOT else d)
+        d = factor * (np.float32(0.5) * d * d if measure == ONE_MINUS_DOT else d)
+        x[j] = x[j] + d if more else d
 
 
-@contracted
-def _add_vector_bounds(u, v, z, cu, cv, cz, radii, reach, factor, x):
-    """Add to x (n,) factor · lower bound of the distance from a vector to the vectors in each of n balls."""
+@contracted_inlined
+def _add_vector_bounds(u, v, z, cu, cv, cz, radii, reach, factor, more, x):
+    """Add to x (n,) factor · lower bound of the distance from a vector to the vectors in each of n balls.
+
+    If `more` is false, x is overwritten instead.
+    """
     for j in range(x.shape[0]):
         du, dv, dz = u - cu[j], v - cv[j], z - cz[j]
-        x[j] += factor * max(np.float32(math.sqrt(du * du + dv * dv + dz * dz)) - (radii[j] + reach), np.float32(0.0))
+        d = factor * max(np.float32(math.sqrt(du * du + dv * dv + dz * dz)) - (radii[j] + reach), np.float32(0.0))
+        x[j] = x[j] + d if more else d
 
 
-@contracted
+@contracted_inlined
 def _add_shaped(x, weight, shaping, exponent, raw):
     """Add weight · F(x) to raw (n,), where F is the shaping."""
     if shaping == SIGMOID:
@@ -66,7 +70,7 @@ def _add_shaped(x, weight, shaping, exponent, raw):
             raw[j] += weight * np.float32(x[j] ** exponent)
 
 
-@contracted
+@contracted_inlined
 def _add_constant(constant, always, raw, total):
     """Add the distances by a component, raw (n,) and the constant, to total (n,)."""
     for j in range(raw.shape[0]):
@@ -84,7 +88,6 @@ def bounds_within(q, reaches, centres, radii, begin, end, tables, vectors, x, ra
     for c in range(constants.shape[0]):
         raw[:] = np.float32(0.0)
         for t in range(starts[c], starts[c + 1]):
-            x[:] = np.float32(0.0)
             for side in range(2):
                 p, factor = places[t, side], np.float32(factors[t, side])
                 if p >= 0 and rotated[t]:
@@ -92,13 +95,14 @@ def bounds_within(q, reaches, centres, radii, begin, end, tables, vectors, x, ra
                     _add_rotation_bounds(
                         q[at], q[at + 1], q[at + 2], q[at + 3], centres[at, begin:end], centres[at + 1, begin:end],
                         centres[at + 2, begin:end], centres[at + 3, begin:end], radii[r, begin:end], reaches[r], factor,
-                        measure, x,
+                        measure, side > 0, x,
                     )  # fmt: skip
                 elif p >= 0:
                     at = 3 * p
                     _add_vector_bounds(
                         q[at], q[at + 1], q[at + 2], centres[at, begin:end], centres[at + 1, begin:end],
-                        centres[at + 2, begin:end], radii[p, begin:end], reaches[p], factor, x,
+                        centres[at + 2, begin:end], radii[p, begin:end], reaches[p], factor, side > 0,
+                        x,
                     )  # fmt: skip
             _add_shaped(x, np.float32(weights[t]), shapings[c], exponents[c], raw)
         _add_constant(np.float32(constants[c]), always, raw, total)
@@ -153,57 +157,49 @@ def step_sums(poses, groups, steps, firsts, ball_firsts, per_ball, out):
             out[firsts[run] + place] = sums[place % per_ball, ball] if within else np.float32(np.inf)
 
 
-@compiled
-def _covering_ranges(balls, ranges):
-    """Fill `ranges` with ascending half-open ranges that cover the given balls.
+@contracted_inlined
+def _row_distances(sample, row, vectors, measure, distances):
+    """Fill distances (41,) with the distances between two rows in each vector and each rotation; chords for angles."""
+    for p in range(vectors):
+        u, v, z = sample[3 * p] - row[3 * p], sample[3 * p + 1] - row[3 * p + 1], sample[3 * p + 2] - row[3 * p + 2]
+        distances[p] = np.float32(math.sqrt(u * u + v * v + z * z))
+    one, other = sample[3 * vectors :], row[3 * vectors :]
+    factor = np.float32(2.0) if measure == ANGLE else np.float32(1.0)
+    for p in range(distances.shape[0] - vectors):
+        w, u, v, z = one[4 * p], one[4 * p + 1], one[4 * p + 2], one[4 * p + 3]
+        aw, au, av, az = other[4 * p], other[4 * p + 1], other[4 * p + 2], other[4 * p + 3]
+        minus = (w - aw) * (w - aw) + (u - au) * (u - au) + (v - av) * (v - av) + (z - az) * (z - az)
+        plus = (w + aw) * (w + aw) + (u + au) * (u + au) + (v + av) * (v + av) + (z + az) * (z + az)
+        square = min(minus, plus)
+        half = np.float32(0.5) * square
+        distances[vectors + p] = half if measure == ONE_MINUS_DOT else factor * np.float32(math.sqrt(square))
 
-    Returns the number of ranges, and the number of balls in all of them.
+
+@contracted
+def row_bound(sample, row, tables, vectors, distances):
+    """Compute a lower bound of the distance between two rows in single precision; distances (41,) is a scratch array.
+
+    The bound differs from the distance by rounding, and by chords in place of angles.
     """
-    count, covered = 0, 0
-    for place in range(balls.shape[0]):
-        if count and balls[place] <= ranges[count - 1, 1] + _GAP:
-            ranges[count - 1, 1] = balls[place] + 1
-        else:
-            covered += ranges[count - 1, 1] - ranges[count - 1, 0] if count else 0
-            ranges[count, 0], ranges[count, 1] = balls[place], balls[place] + 1
-            count += 1
-    return count, covered + (ranges[count - 1, 1] - ranges[count - 1, 0] if count else 0)
-
-
-@compiled
-def narrow_steps(query, shard, bounds, places, layout, tables, limit):
-    """Drop steps whose windows certainly have a sum of distances above `limit`, by bounds of single samples.
-
-    For one sample after the other, the bound of its group is replaced by the bound of the sample itself, which is
-    tighter. The function stops as soon as comparing the rows of the remaining steps takes less time.
-
-    query holds the samples (T, width), their offsets (T,) and groups (T,), an order that is not used, and the order
-    (T,) in which bounds of samples are computed. shard holds rows, centres and radii. bounds holds the bounds of groups
-    (G, balls), an array (T, balls) that is filled with the bounds of samples, and the sums (n,) of the steps. places
-    (n, 2) has, for each step, its ball, ascending, and its number within the ball.
-
-    Returns the indices (m,) of the remaining steps, and the number of samples whose bounds were computed.
-    """
-    samples, offsets, groups, _, turns = query
-    _, centres, radii = shard
-    by_group, by_sample, sums = bounds
-    size, per_ball, vectors, _ = layout
-    left = np.arange(sums.shape[0])
-    balls, ranges = np.empty_like(left), np.empty((left.shape[0], 2), np.int64)
-    reaches = np.zeros((1, radii.shape[0]), np.float32)
-    for turn in range(samples.shape[0]):
-        t = turns[turn]
-        for i in range(left.shape[0]):
-            balls[i] = places[left[i], 0] + (places[left[i], 1] + offsets[t] // size) // per_ball
-        count, covered = _covering_ranges(balls[: left.shape[0]], ranges)
-        if count * _RANGE_COST + covered > left.shape[0] * _STEP_COST:
-            return left, turn
-        pose_bounds(samples[t : t + 1], reaches, centres, radii, ranges[:count], tables, vectors, by_sample[t : t + 1])
-        kept = 0
-        for i in range(left.shape[0]):
-            sums[left[i]] += by_sample[t, balls[i]] - by_group[groups[t], balls[i]]
-            if sums[left[i]] <= limit:
-                left[kept] = left[i]
-                kept += 1
-        left = left[:kept]
-    return left, samples.shape[0]
+    rotated, places, factors, weights, starts, constants, shapings, exponents, measure, always = tables
+    _row_distances(sample, row, vectors, measure, distances)
+    total = np.float32(0.0)
+    for c in range(constants.shape[0]):
+        raw = np.float32(0.0)
+        for t in range(starts[c], starts[c + 1]):
+            first = vectors if rotated[t] else 0
+            x = np.float32(factors[t, 0]) * distances[first + places[t, 0]]
+            if places[t, 1] >= 0:
+                x += np.float32(factors[t, 1]) * distances[first + places[t, 1]]
+            if shapings[c] == SIGMOID:
+                raw += np.float32(weights[t]) * (x / (x + np.float32(1.0)))
+            elif shapings[c] == MANHATTAN:
+                raw += np.float32(weights[t]) * x
+            elif shapings[c] == EUCLID:
+                raw += np.float32(weights[t]) * x * x
+            else:
+                raw += np.float32(weights[t]) * np.float32(x ** exponents[c])
+        total += raw
+        if always or raw > np.float32(0.0):
+            total += np.float32(constants[c])
+    return total

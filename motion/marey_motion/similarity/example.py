@@ -17,7 +17,7 @@ MOST_SAMPLES = 32
 """Maximum number of compared poses of a window: one in each step, or in every second step, every third, and so on."""
 SHORTEST_SEPARATION_ROWS = 15
 """Least distance between the starts of two hits in a clip, in rows: half a second, even for a single pose."""
-_SAMPLES_PER_GROUP = 2.5
+_SAMPLES_PER_GROUP = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +68,8 @@ class GroupedExample:
     ----------
     example : Example    T samples
     groups : (T,) int64    number of the ball that encloses each sample
-    turns : (T,) int64    order in which bounds of single samples are computed: samples in wide balls come first,
-        because their own bounds are much tighter than those of the ball
+    turns : (T,) int64    order in which samples are compared with rows: those in wide balls come first, because their
+        distances exceed the bound of the ball most
     centres : (G, WIDTH) float32    centres of the balls
     reaches : (G, 41) float32    radii of the balls: of each vector, then of each rotation
     """

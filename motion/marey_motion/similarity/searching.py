@@ -216,4 +216,4 @@ class _Searches:
         assert known is not None, "hits are of skeletons that can be compared"
         rows = shard.rows[shard.runs.starts[window.run] + window.row + example.offsets]
         pairs = zip(example.poses.rows, rows, strict=True)
-        return float(np.mean([pose_distance(one, row, known[0], ROTATIONS_AT) for one, row in pairs]))
+        return float(np.mean([pose_distance(one, row, known, ROTATIONS_AT) for one, row in pairs]))

@@ -56,13 +56,11 @@ class ComparedRuns(NamedTuple):
     Parameters
     ----------
     tables : MetricTables    tables of the metric
-    columns : (n,) int64    columns of features that the tables use
     chosen : (R,) bool    True for the runs with these joints
     ranges : (n, 2) int64    half-open ranges of the balls of these runs
     """
 
     tables: MetricTables
-    columns: Ints
     chosen: Flags
     ranges: Ints
 
@@ -72,9 +70,9 @@ class Weighing:
 
     def __init__(self, metric: PerceptualMetric, examples: Sequence[PoseFeatures]) -> None:
         self._metric, self._present = metric, np.logical_and.reduce([one.present for one in examples])
-        self._known: dict[int, tuple[MetricTables, Ints] | None] = {}
+        self._known: dict[int, MetricTables | None] = {}
 
-    def tables(self, joints: int) -> tuple[MetricTables, Ints] | None:
+    def tables(self, joints: int) -> MetricTables | None:
         """Return the tables by which clips with certain joints are compared with the examples.
 
         Parameters
@@ -83,27 +81,27 @@ class Weighing:
 
         Returns
         -------
-        MetricTables and (n,) int64, or None    tables, and the columns of features that they use; None if the clips
-            lack joints that the metric needs
+        MetricTables or None    the tables; None if the clips lack joints that the metric needs
         """
         if joints not in self._known:
-            tables = metric_tables(self._metric, joints_of(joints) & self._present)
-            self._known[joints] = None if tables is None else (tables, tables.columns())
+            self._known[joints] = metric_tables(self._metric, joints_of(joints) & self._present)
         return self._known[joints]
 
-    def kinds(self, searched: SearchedShard, shard: Shard) -> list[ComparedRuns]:
+    def kinds(self, searched: SearchedShard, shard: Shard, length: int) -> list[ComparedRuns]:
         """Group the searched runs of a shard by the joints that their skeletons have.
 
         Parameters
         ----------
         searched : SearchedShard    the shard, with the runs that are not searched
         shard : Shard    content of the shard
+        length : int    rows from the first to the last compared pose of a window; shorter runs have no window
 
         Returns
         -------
         list of ComparedRuns    one for each set of joints
         """
-        joints, balls = np.where(searched.closed, -1, shard.joints), shard.runs.balls
+        short = np.diff(shard.runs.starts) <= length
+        joints, balls = np.where(searched.closed | short, -1, shard.joints), shard.runs.balls
         edges = np.concatenate(([0], np.flatnonzero(joints[1:] != joints[:-1]) + 1, [len(joints)]))
         values = joints[edges[:-1]]
         kinds = []
@@ -112,7 +110,7 @@ class Weighing:
             if known is not None:
                 mine = values == kind
                 ranges = np.stack([balls[edges[:-1][mine]], balls[edges[1:][mine]]], axis=1)
-                kinds.append(ComparedRuns(*known, joints == kind, ranges))
+                kinds.append(ComparedRuns(known, joints == kind, ranges))
         return kinds
 
 
@@ -134,7 +132,7 @@ class ShardSearch:
         self._searched, self._examples = searched, examples
         shard = searched.load()
         self._runs = shard.runs
-        self._kinds = weighing.kinds(searched, shard)
+        self._kinds = weighing.kinds(searched, shard, int(examples[0].example.offsets[-1]))
         self._bounds = [self._bound(one, shard) for one in examples]
         """Bounds of poses (G, balls) and of the sums of windows (S,), for each example."""
         sums = [each for _, each in self._bounds]
@@ -218,7 +216,7 @@ class ShardSearch:
         from marey_motion.similarity.bounding_kernels import pose_bounds, step_sums
 
         poses = np.full((len(query.centres), shard.centres.shape[1]), np.inf, np.float32)
-        for tables, _, _, ranges in self._kinds:
+        for tables, _, ranges in self._kinds:
             pose_bounds(query.centres, query.reaches, shard.centres, shard.radii, ranges, tables, VECTORS, poses)
         sums = np.empty(shard.runs.firsts[-1], np.float32)
         steps = query.example.offsets // STEP_ROWS
@@ -258,18 +256,17 @@ class ShardSearch:
         from marey_motion.similarity.similarity_kernels import step_distances
 
         shard = self._searched.load()
-        arrays = (shard.rows, shard.centres, shard.radii)
         out = np.full((len(steps), STEP_ROWS), np.inf)
-        for tables, columns, chosen, _ in self._kinds:
+        layout = (STEP_ROWS, STEPS_PER_BALL, VECTORS, np.empty(len(shard.radii), np.float32))
+        for tables, chosen, _ in self._kinds:
             mine = np.flatnonzero(chosen[runs])
             found = np.full((len(mine), STEP_ROWS), np.inf)
-            layout = (STEP_ROWS, STEPS_PER_BALL, VECTORS, columns)
             for query, (poses, sums) in zip(self._examples, self._bounds, strict=True):
                 one = query.example
                 samples = (one.poses.rows, one.offsets, query.groups, one.order, query.turns)
-                bounds = (poses, np.empty((len(query.groups), poses.shape[1]), np.float32), sums[steps[mine]])
+                bounds = (poses, sums[steps[mine]])
                 step_distances(
-                    samples, arrays, bounds, steps[mine], self._runs, layout, tables, ROTATIONS_AT, most, found
+                    samples, shard.rows, bounds, steps[mine], self._runs, layout, tables, ROTATIONS_AT, most, found
                 )
             out[mine] = found
         places, columns = np.nonzero(out < np.inf)

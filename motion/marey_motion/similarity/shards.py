@@ -85,13 +85,13 @@ class Shard:
     joints: Ints
 
     @classmethod
-    def open(cls, path: Path, lengths: Ints, joints: Ints) -> Self:
+    def open(cls, path: Path, runs: Runs, joints: Ints) -> Self:
         """Map the file of a shard into memory.
 
         Parameters
         ----------
         path : Path    file that `write_shard` has written
-        lengths : (R,) int64    numbers of rows of the runs
+        runs : Runs    where each run begins and ends
         joints : (R,) int64    joints of the skeleton of each clip, as encoded by `presence`
 
         Returns
@@ -104,7 +104,6 @@ class Shard:
         """
         with path.open("rb", buffering=0) as file:
             mapped = mmap(file.fileno(), 0, access=ACCESS_READ) if os.fstat(file.fileno()).st_size else b""
-        runs = Runs.of(lengths)
         mark, rows, balls = _HEAD.unpack(mapped[: _HEAD.size]) if len(mapped) >= _HEAD.size else (b"", 0, 0)
         size = _HEAD.size + 4 * (balls * (WIDTH + _RADII) + rows * WIDTH)
         if (mark, rows, balls, size) != (_MARK, runs.starts[-1], runs.balls[-1], len(mapped)):

@@ -8,10 +8,7 @@ import numpy as np
 
 from marey_motion.kernels import compiled, contracted, inlined
 from marey_motion.perception.map_kernels import ANGLE, EUCLID, MANHATTAN, ONE_MINUS_DOT, SIGMOID
-from marey_motion.similarity.bounding_kernels import bounds_within, narrow_steps
-
-_TILE = 128
-"""Number of windows that are compared at a time."""
+from marey_motion.similarity.bounding_kernels import row_bound
 
 
 @compiled
@@ -118,10 +115,10 @@ def _places_of(steps, runs, length, layout, places, rows):
 
 
 @compiled
-def _windows_in(left, rows, windows):
-    """Fill windows (n, 2) with step and first row of windows that start in the steps `left`; return their number."""
+def _windows_in(rows, windows):
+    """Fill windows (n, 2) with step and first row of the windows in ranges of rows; return their number."""
     count = 0
-    for place in left:
+    for place in range(rows.shape[0]):
         for row in range(rows[place, 0], rows[place, 1]):
             windows[count] = place, row
             count += 1
@@ -129,43 +126,30 @@ def _windows_in(left, rows, windows):
 
 
 @contracted
-def _still_near(query, rows, bounds, done, places, windows, layout, tables, limit):
+def _still_near(query, rows, bounds, places, windows, layout, tables, limit):
     """Return the indices of the windows whose sum of distances is not certainly above a limit.
 
-    For one sample after the other, the bound of its distance from a ball of rows is replaced, in the sum of each
-    window, by the distance from the exact row. The sums of the first `done` samples already contain bounds of single
-    samples; the sums of the others contain bounds of groups of samples.
+    For one sample after the other, the bound of its group is replaced, in the sum of the window, by the bound for the
+    exact row, until the sum is above the limit.
     """
     samples, offsets, groups, _, turns = query
-    by_group, by_sample, step_sums = bounds
-    size, per_ball, vectors, columns = layout
-    tile = np.zeros((rows.shape[1], _TILE), np.float32)
-    radii = np.zeros((vectors + (rows.shape[1] - 3 * vectors) // 4, _TILE), np.float32)
-    reaches = np.zeros(radii.shape[0], np.float32)
-    x, raw, total = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
-    left = np.arange(windows.shape[0])
-    sums = step_sums[windows[:, 0]]
-    for k in range(samples.shape[0]):
-        turn = (done + k) % samples.shape[0]
-        t = turns[turn]
-        known = by_sample[t] if turn < done else by_group[groups[t]]
-        kept = 0
-        for begin in range(0, left.shape[0], _TILE):
-            n = min(_TILE, left.shape[0] - begin)
-            for i in range(n):
-                row = windows[left[begin + i], 1] + offsets[t]
-                for c in columns:
-                    tile[c, i] = rows[row, c]
-            bounds_within(samples[t], reaches, tile, radii, 0, n, tables, vectors, x[:n], raw[:n], total[:n])
-            for i in range(n):
-                window = left[begin + i]
-                place = windows[window, 0]
-                sums[window] += total[i] - known[places[place, 0] + (places[place, 1] + offsets[t] // size) // per_ball]
-                if sums[window] <= limit:
-                    left[kept] = window
-                    kept += 1
-        left = left[:kept]
-    return left
+    by_group, step_sums = bounds
+    size, per_ball, vectors, distances = layout
+    near = np.empty(windows.shape[0], np.int64)
+    count = 0
+    for window in range(windows.shape[0]):
+        place, first = windows[window, 0], windows[window, 1]
+        total = step_sums[place]
+        for t in turns:
+            ball = places[place, 0] + (places[place, 1] + offsets[t] // size) // per_ball
+            exact = row_bound(samples[t], rows[first + offsets[t]], tables, vectors, distances)
+            total += exact - by_group[groups[t], ball]
+            if total > limit:
+                break
+        if total <= limit:
+            near[count] = window
+            count += 1
+    return near[:count]
 
 
 @compiled
@@ -176,29 +160,26 @@ def step_distances(query, shard, bounds, steps, runs, layout, tables, rotations_
     window exceeds its run.
 
     query holds samples (T, width), offsets (T,), groups (T,), the order in which the distances of samples are added,
-    and the order in which bounds of samples are computed. shard holds rows, and centres and radii of balls. bounds
-    holds the bounds of groups (G, balls), a scratch array (T, balls) for bounds of samples, and the sums of bounds (n,)
-    of the steps. steps (n,) are ascending. runs are the first rows, steps and balls of all runs. layout holds the
-    numbers of rows per step, of steps per ball and of vectors, and the columns of features that the tables use.
+    and the order in which their bounds are computed. bounds holds the bounds of groups (G, balls) and their sums (n,)
+    for the steps. steps (n,) are ascending. runs are the first rows, steps and balls of all runs. layout holds the
+    numbers of rows per step, of steps per ball and of vectors, and a scratch array with an element for each vector and
+    rotation.
     """
     samples, offsets, _, order, _ = query
     size, count = layout[0], samples.shape[0]
     places, rows = np.empty((steps.shape[0], 2), np.int64), np.empty((steps.shape[0], 2), np.int64)
     _places_of(steps, runs, np.max(offsets), layout, places, rows)
-    left, limit, done = np.arange(steps.shape[0]), loosened(most, count), 0
-    if most < np.inf and count > 1:
-        left, done = narrow_steps(query, shard, bounds, places, layout, tables, limit)
-    windows = np.empty((left.shape[0] * size, 2), np.int64)
-    windows = windows[: _windows_in(left, rows, windows)]
+    windows = np.empty((steps.shape[0] * size, 2), np.int64)
+    windows = windows[: _windows_in(rows, windows)]
     near = np.arange(windows.shape[0])
     if most < np.inf:
-        near = _still_near(query, shard[0], bounds, done, places, windows, layout, tables, limit)
+        near = _still_near(query, shard, bounds, places, windows, layout, tables, loosened(most, count))
     limit = most * count * (1.0 + 1e-12)
     for window in near:
         place, row = windows[window]
         total = 0.0
         for t in order:
-            total += pose_distance(samples[t], shard[0][row + offsets[t]], tables, rotations_at)
+            total += pose_distance(samples[t], shard[row + offsets[t]], tables, rotations_at)
             if total > limit:
                 break
         if total <= limit:

@@ -10,7 +10,7 @@ from marey_motion.arrays import Flags, Floats, Ints
 from marey_motion.errors import MotionError
 from marey_motion.perception.maps import ANGLE_NUMBERS, SHAPING_NUMBERS
 from marey_motion.perception.metric import JOINT_CLASSES, Component, PerceptualMetric
-from marey_motion.similarity.features import JOINTS, ROTATED_JOINTS, ROTATIONS_AT
+from marey_motion.similarity.features import JOINTS, ROTATED_JOINTS
 from marey_schemas.documents.metrics import classes_of
 
 
@@ -44,17 +44,6 @@ class MetricTables(NamedTuple):
     exponents: Floats
     angle: int
     always: bool
-
-    def columns(self) -> Ints:
-        """List the columns of features that the metric compares.
-
-        Returns
-        -------
-        (n,) int64    ascending
-        """
-        sides = [(turned, place) for turned, both in zip(self.rotated, self.places, strict=True) for place in both]
-        places = [(ROTATIONS_AT + 4 * place, 4) if turned else (3 * place, 3) for turned, place in sides if place >= 0]
-        return np.unique([first + i for first, length in places for i in range(length)])
 
 
 def require_searchable(metric: PerceptualMetric) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -22,6 +23,41 @@ MOST_DRAWN_FRAMES = 1200
 _PUBLISHED_MEAN = 5 / 6
 
 
+@dataclass(frozen=True)
+class ComparedClip:
+    """Facts about a compared clip.
+
+    Parameters
+    ----------
+    name : name shown to users
+    recorded_frames : number of frames of the whole clip, at the rate of the metric
+    compared_frames : number of frames of the part that was compared
+    cyclic : whether the compared part is a loop
+    period_frames, start_frame : period of the clip, and first frame of the loop that was cut out of it; None if no loop
+        was cut
+    """
+
+    name: str
+    recorded_frames: int
+    compared_frames: int
+    cyclic: bool
+    period_frames: int | None = None
+    start_frame: int | None = None
+
+    @classmethod
+    def of(cls, clip: ComparableClip) -> Self:
+        """Return the facts about a clip that is ready to be compared."""
+        loop = () if clip.period is None else (clip.period.frames, clip.period.start)
+        return cls(clip.name, clip.recorded.frame_count, clip.compared.frame_count, clip.compared.cyclic, *loop)
+
+
+def drawn_pairs(distances: ClipDistances) -> tuple[tuple[int, int], ...]:
+    """Return the pairs whose maps are drawn: the nearest and the farthest, or the only one."""
+    ranked = distances.pairs_by_distance()
+    chosen = ranked[:1] if len(ranked) == 1 else ranked[[0, -1]]
+    return tuple((int(i), int(j)) for i, j in chosen)
+
+
 @dataclass(frozen=True, eq=False)
 class ComparedSet:
     """N clips that were compared by a metric.
@@ -29,13 +65,15 @@ class ComparedSet:
     Parameters
     ----------
     metric : the metric
-    clips : the clips
+    clips : facts about the clips
+    drawn : the clips of `drawn_pairs`, by number
     distances : distances of all pairs
     options : options of the comparison
     """
 
     metric: MetricDocument
-    clips: Sequence[ComparableClip]
+    clips: Sequence[ComparedClip]
+    drawn: Mapping[int, ComparableClip]
     distances: ClipDistances
     options: DistanceOptions
 
@@ -44,26 +82,20 @@ class ComparedSet:
         """The metric in the form that functions of `marey_motion` accept."""
         return metric_of(self.metric)
 
-    def drawn_pairs(self) -> tuple[tuple[int, int], ...]:
-        """Return the pairs whose maps are drawn: the nearest and the farthest, or the only one."""
-        ranked = self.distances.pairs_by_distance()
-        chosen = ranked[:1] if len(ranked) == 1 else ranked[[0, -1]]
-        return tuple((int(i), int(j)) for i, j in chosen)
-
     def curve(self, pair: tuple[int, int]) -> RegistrationCurve:
         """Return the registration curve of a pair."""
-        return registration_curve(self.clips[pair[0]].compared, self.clips[pair[1]].compared, self.computed)
+        return registration_curve(self.drawn[pair[0]].compared, self.drawn[pair[1]].compared, self.computed)
 
     def drawable(self, pair: tuple[int, int]) -> tuple[NamedClip, NamedClip]:
         """Return the compared clips of a pair at one frame rate, with frames left out if there are too many to draw."""
-        clips = [self.clips[number] for number in pair]
+        clips = [self.drawn[number] for number in pair]
         step = -(-max(clip.compared.frame_count for clip in clips) // MOST_DRAWN_FRAMES)
         one, other = (NamedClip(clip.name, _thinned(clip.compared, step)) for clip in clips)
         return one, other
 
     def recorded(self, number: int) -> NamedClip:
         """Return a clip as it was recorded, with frames left out if there are too many to draw."""
-        clip = self.clips[number]
+        clip = self.drawn[number]
         return NamedClip(clip.name, _thinned(clip.recorded, -(-clip.recorded.frame_count // MOST_DRAWN_FRAMES)))
 
     def arrays(self, pair: tuple[int, int]) -> dict[str, np.ndarray]:
@@ -82,14 +114,14 @@ class ComparedSet:
 
     def missing_classes(self) -> tuple[str, ...]:
         """Return the joint classes that the metric gives a weight above 0, but that the skeleton of the clips lacks."""
-        has = self.clips[0].compared.classes
+        has = next(iter(self.drawn.values())).compared.classes
         weighted = [name for one in self.metric.components for name, weight in one.weights.items() if weight > 0]
         return tuple(dict.fromkeys(name for name in weighted if name not in has))
 
     def claims(self) -> Iterator[str]:
         """Yield texts of one or two sentences about what the metric can and cannot show for these clips."""
         yield from _claims_of(self.metric)
-        if self.options.cycles == "whole" and not all(clip.compared.cyclic for clip in self.clips):
+        if self.options.cycles == "whole" and not all(clip.cyclic for clip in self.clips):
             yield (
                 "Whole clips were compared from their first to their last frames. If they contain different numbers of "
                 "steps, moments that do not belong together are compared."
@@ -122,6 +154,9 @@ def _claims_of(metric: MetricDocument) -> Iterator[str]:
         f"The weights come from {who}: a distance estimates how rarely people would call two motions the most similar "
         f"of four, from 0 (always) to 1 (never).{mean}"
     )
+    if metric.origin == "fitted" and (metric.fit is None or metric.fit.noise_ceiling is None):
+        yield "The standard error of the judgements is not known, so small differences of distances may be noise."
+        return
     yield (
         f"The judgements themselves have a standard error of {metric.judgement_error:.2f}, so the metric cannot order "
         f"distances that differ by less than {2 * metric.judgement_error:.2f}."

@@ -23,6 +23,8 @@ MOST_WRITTEN = 24
 """Greatest number of clips for which the distances are written in the cells as numbers."""
 MOST_NAMED = 60
 _CELL, _SMALL_CELL, _SIGN, _BAR = 0.34, 0.13, 0.075, 0.14
+_MOST_SIDE = 16.0
+"""Greatest length of a side of the table, in inches."""
 _DARK_FROM = 0.43
 
 
@@ -32,7 +34,7 @@ def draw_distance_table(subject: ComparedSet) -> Sketch:
     totals = subject.distances.totals[order][:, order]
     names = [subject.clips[index].name for index in order]
     count = len(names)
-    side = count * (_CELL if count <= MOST_WRITTEN else _SMALL_CELL)
+    side = min(count * (_CELL if count <= MOST_WRITTEN else _SMALL_CELL), _MOST_SIDE)
     named = count <= MOST_NAMED
     labels = labels_of(names)
     left = 0.35 + (_SIGN * max(map(len, labels)) if named else 0.1)

@@ -13,7 +13,7 @@ from marey_reports.drawing.markup import Html, element, joined
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.paper import labels_of
 from marey_reports.drawing.tables import Cell, Number, facts, folded, number, table
-from marey_reports.perception.compared import ComparedSet
+from marey_reports.perception.compared import ComparedSet, drawn_pairs
 from marey_reports.perception.distance_table import draw_distance_table
 from marey_reports.perception.motion_maps import draw_components, draw_registration
 from marey_schemas.documents.metrics import JOINT_CLASS_NAMES, MetricComponent, MetricIdentity
@@ -31,7 +31,7 @@ def draw_distance_figures(subject: ComparedSet) -> dict[str, DrawnFigure]:
     if len(subject.clips) > 2:
         sketch = draw_distance_table(subject)
         figures["distances"] = DrawnFigure(sketch, "distances", "4", "Distances of all pairs")
-    pairs = subject.drawn_pairs()
+    pairs = drawn_pairs(subject.distances)
     words = ("nearest", "farthest") if len(pairs) > 1 else ("",)
     for word, pair in zip(words, pairs, strict=True):
         one, other = subject.drawable(pair)
@@ -40,7 +40,7 @@ def draw_distance_figures(subject: ComparedSet) -> dict[str, DrawnFigure]:
             one,
             other,
             subject.computed,
-            subject.clips[pair[0]].period,
+            subject.drawn[pair[0]].period,
             subject.curve(pair),
             recorded=subject.recorded(pair[0]),
             rate_hz=subject.metric.frame_rate_hz,
@@ -93,7 +93,7 @@ def _verdict(subject: ComparedSet) -> str:
 def _headline(subject: ComparedSet) -> Html:
     totals = subject.distances.totals[np.triu_indices(len(subject.clips), 1)]
     span = f"{totals.min():.3f} to {totals.max():.3f}" if len(totals) > 1 else f"{totals[0]:.3f}"
-    cut = sum(clip.period is not None for clip in subject.clips)
+    cut = sum(clip.period_frames is not None for clip in subject.clips)
     return facts(
         (
             ("clips", str(len(subject.clips)), f"{counted(cut, 'loop')} of one cycle" if cut else "compared whole"),
@@ -132,9 +132,9 @@ def _clips(subject: ComparedSet) -> Html:
     rows: list[Sequence[Cell]] = [
         (
             clip.name,
-            number(clip.recorded.frame_count / rate, 2),
-            number(clip.compared.frame_count / rate, 2),
-            number(None if clip.period is None else clip.period.start / rate, 2),
+            number(clip.recorded_frames / rate, 2),
+            number(clip.compared_frames / rate, 2),
+            number(None if clip.start_frame is None else clip.start_frame / rate, 2),
         )
         for clip in subject.clips
     ]

@@ -128,8 +128,8 @@ class MetricFit(Request):
     spearman: _Number | None = Field(None, description="Rank correlation of fitted and perceived differences.")
     noise_ceiling: _Amount | None = Field(
         None,
-        description="Standard error of the perceived differences. A fit with a smaller error than this "
-        "describes noise.",
+        description="Standard error of the perceived differences by chance. A fit with a smaller error than this "
+        "describes noise. Null: too few answers repeat a pair to know it.",
     )
     left_out_rmse: _Amount | None = Field(
         None,
@@ -196,7 +196,7 @@ class MetricDocument(Request):
 
     @property
     def judgement_error(self) -> float:
-        """The standard error of the judgements that the weights were fitted to."""
+        """The standard error of the judgements that the weights were fitted to; if unknown, that of the paper's."""
         known = None if self.fit is None else self.fit.noise_ceiling
         return PUBLISHED_ERROR if known is None else known
 

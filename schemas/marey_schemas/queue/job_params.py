@@ -221,8 +221,10 @@ class AnalyseStudyParams(Request):
     )
 
 
-MOST_COMPARED_CLIPS = 300
+MOST_COMPARED_CLIPS = 500
 """Greatest number of clips of a table of perceptual distances."""
+CLIPS_PER_BLOCK = 50
+"""Greatest number of clips of a block; a task compares the clips of two blocks with each other, or of one block."""
 
 
 class DistancesParams(DistanceOptions, MetricChoice):
@@ -233,6 +235,14 @@ class DistancesParams(DistanceOptions, MetricChoice):
     )
     title: str = Field("", max_length=200, description="Title of the report; default: the names of the clips.")
     report: bool = Field(True, description="Write the report, a self-contained HTML page, and its figures.")
+
+
+def count_distance_tasks(_params: DistancesParams, clips: int) -> int:
+    """Return the number of tasks of a comparison: one for each pair of blocks of clips, and for each block alone."""
+    if clips > MOST_COMPARED_CLIPS:  # a single task refuses the job
+        return 1
+    blocks = max(1, -(-clips // CLIPS_PER_BLOCK))
+    return blocks * (blocks + 1) // 2
 
 
 class QualityParams(QualityOptions):

@@ -1,6 +1,6 @@
 """Declaration of a kind of job: its inputs, parameters and outputs, how it is split, and when results are reused."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal
@@ -29,7 +29,8 @@ class KindDeclaration:
     * With `task_count`, a function that returns the number of tasks for given parameters, each task gets all inputs.
       `context.task` says which task it is. When all tasks have succeeded, a worker calls
       `gather(context, params, results)`, the function that `gathering` names, with their results in order. If there is
-      only one task, a single job runs both `run` and `gather`.
+      only one task, a single job runs both `run` and `gather`. If `counted` names an input, the function gets the
+      number of items of this input as its second argument.
 
     A job reuses the results of an identical job. Jobs are identical if they have the same parameters, the same seed,
     and as inputs the same items with the same names, places and contents. A kind can declare further facts that must be
@@ -72,7 +73,8 @@ class KindDeclaration:
     facets: Mapping[str, str] = field(default_factory=dict)
     fan_out: str | None = None
     batch_size: int = 1
-    task_count: Callable[[Any], int] | None = None
+    task_count: Callable[..., int] | None = None
+    counted: str | None = None
     gathering: str | None = None
     deterministic: bool = True
     place_counts: bool = False
@@ -91,11 +93,11 @@ class KindDeclaration:
             raise ValueError(
                 f"job kind {self.name}: fan_out names {self.fan_out!r}, which must be an input that takes many items"
             )
-        for name in (*self.never_cached_without, *filter(None, [self.named_after, self.exports])):
+        for name in (*self.never_cached_without, *filter(None, [self.named_after, self.exports, self.counted])):
             if name not in self.inputs and name != EVERY_INPUT:
                 raise ValueError(
-                    f"job kind {self.name}: never_cached_without, named_after and exports must name inputs of the "
-                    f"kind, and {name!r} is none of them"
+                    f"job kind {self.name}: never_cached_without, named_after, exports and counted must name inputs of "
+                    f"the kind, and {name!r} is none of them"
                 )
         if self.exports is not None and not issubclass(self.params, ConsentOverride):
             raise ValueError(f"job kind {self.name}: the parameters of a kind with exports must extend ConsentOverride")
@@ -118,6 +120,12 @@ class KindDeclaration:
             raise ValueError(f"job kind {self.name}: declare either both of task_count and gathering, or neither")
         if self.task_count is not None and self.fan_out is not None:
             raise ValueError(f"job kind {self.name}: declare fan_out or task_count, not both")
+
+    def count_tasks(self, params: Any, inputs: Mapping[str, Sequence[Any]]) -> int:
+        """Return the number of tasks of a job with these parameters and inputs, if `task_count` determines it."""
+        if self.task_count is None:
+            return 1
+        return self.task_count(params, *([] if self.counted is None else [len(inputs.get(self.counted, ()))]))
 
     def is_exported(self, name: str) -> bool:
         """Return whether the job writes the clips of an input to files."""

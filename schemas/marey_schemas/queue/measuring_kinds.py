@@ -84,6 +84,9 @@ DISTANCES = KindDeclaration(
     "registration curves.",
     params=job_params.DistancesParams,
     implementation="marey_worker.kinds.distances:run",
+    gathering="marey_worker.kinds.distances:gather",
+    task_count=job_params.count_distance_tasks,
+    counted="clips",
     version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to compare, all of one skeleton."),

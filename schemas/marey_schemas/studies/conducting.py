@@ -85,7 +85,8 @@ class StudyDifferences(Answer):
         description="Motions along the first principal component of the differences; null: some motion is in no trial."
     )
     noise: float | None = Field(
-        description="Standard error of the differences (root mean square), which follows from the number of trials."
+        description="Standard error of the differences by chance (root mean square), without how much people differ "
+        "from each other; null: too few answers repeat a pair to know it."
     )
 
 

@@ -149,5 +149,5 @@ def search_clips(packed: bytes) -> bytes:
             below=order.below,
             threads=THREADS,
         )
-        clips = tuple(search.lists[shard].items[run] for shard, run in found)
+        clips = tuple(search.lists[shard].clips.items[run] for shard, run in found)
         return AlikeClips(clips=clips, behind=search.behind(order.heads)).pack()

@@ -40,7 +40,7 @@ SEARCH_INDEX = "marey_server.motions.similar:search_index"
 THREADS = 2
 CONTEXT_READ_S = 1.5
 """Seconds that are read before and after the example; the nearest second influences the features of the example."""
-_CLIPS_CACHE_BYTES = 64 * MIB
+_LISTS_CACHE_BYTES = 64 * MIB
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,8 +183,34 @@ def _invalid(pointer: str, detail: str, code: str = "no-frames") -> InvalidProbl
 
 # -- in the child ------------------------------------------------------------------------------------------------------
 
-_CLIPS: LruCache[str, ShardClips] = LruCache(max_bytes=_CLIPS_CACHE_BYTES, size_of=lambda clips: 300 * len(clips.items))
+
+class ListedShard:
+    """List of the clips of a shard, with what every search needs of it."""
+
+    def __init__(self, clips: ShardClips) -> None:
+        import numpy as np
+
+        from marey_motion.similarity.shards import Runs
+
+        self.clips = clips
+        self.runs, self.joints = Runs.of(np.array(clips.rows, np.int64)), np.array(clips.joints, np.int64)
+        self.places: dict[str, list[int]] = {}
+        """Positions of each clip in the list."""
+        for place, item in enumerate(clips.items):
+            self.places.setdefault(item, []).append(place)
+
+    @classmethod
+    def read(cls, path: str) -> ListedShard:
+        """Read the list from a file. Raises `ValidationError` if it is damaged."""
+        return cls(ShardClips.model_validate_json(Path(path).read_bytes()))
+
+
+_LISTS: LruCache[str, ListedShard] = LruCache(
+    max_bytes=_LISTS_CACHE_BYTES, size_of=lambda shard: 600 * len(shard.clips.items)
+)
 """Cache of a child process: lists of clips by the path of their file, which never changes."""
+_RANKS: LruCache[tuple[str, ...], list[Any]] = LruCache(max_entries=4)
+"""Cache of a child process: the results of `_ranks`, by the paths of all lists."""
 
 
 def search_index(packed: bytes) -> bytes:
@@ -202,7 +228,7 @@ def search_index(packed: bytes) -> bytes:
 class OpenedSearch:
     """Input of a search in a child process: the shards, the clips of each, the example and the metric."""
 
-    lists: list[ShardClips]
+    lists: list[ListedShard]
     shards: list[SearchedShard]
     example: Example
     rate_hz: float
@@ -213,8 +239,13 @@ class OpenedSearch:
 
         `heads` maps the id of a clip to the number of its newest revision.
         """
-        known = {place for clips in self.lists for place in zip(clips.items, clips.revisions, strict=True)}
-        return sum(head > 0 and (clip, head) not in known for clip, head in heads.items())
+        known = {
+            clip
+            for one in self.lists
+            for clip in heads.keys() & one.places.keys()
+            if any(one.clips.revisions[place] == heads[clip] for place in one.places[clip])
+        }
+        return sum(head > 0 and clip not in known for clip, head in heads.items())
 
 
 @contextmanager
@@ -234,9 +265,10 @@ def opened(order: SimilarOrder) -> Iterator[OpenedSearch]:
     except MotionError as error:
         raise _invalid("/metric", f"The index cannot be searched by this metric: {error}", error.code) from error
     try:
-        lists = [_clips_of(files) for files in order.shards]
+        lists = [_list_of(files) for files in order.shards]
         example, rate_hz = _example(order)
-        parts = zip(order.shards, lists, _ranks(lists), strict=True)
+        ranks = _RANKS.get_or_make(tuple(files.clips for files in order.shards), lambda: _ranks(lists))
+        parts = zip(order.shards, lists, ranks, strict=True)
         yield OpenedSearch(lists, [_searched(order, *one, rate_hz, example) for one in parts], example, rate_hz, metric)
     except MotionError as error:
         raise _invalid("/clip", f"The example cannot be searched for: {error}", error.code) from error
@@ -255,36 +287,36 @@ def _search(order: SimilarOrder, search: OpenedSearch) -> FoundWindows:
     )
     length_s = (request.frames[1] - request.frames[0] - 1) / search.rate_hz
     return FoundWindows(
-        windows=tuple(_window(hit, search.lists[hit.shard], length_s) for hit in hits),
+        windows=tuple(_window(hit, search.lists[hit.shard].clips, length_s) for hit in hits),
         searched_clips=sum(int((~shard.closed).sum()) for shard in search.shards),
         behind=search.behind(order.heads),
     )
 
 
-def _clips_of(files: ShardFiles) -> ShardClips:
+def _list_of(files: ShardFiles) -> ListedShard:
     """Read the list of clips of a shard, which may come from any user. Raises `NotFoundProblem` if it is invalid."""
     path = files.clips
     try:
-        clips = _CLIPS.get_or_make(path, lambda: ShardClips.model_validate_json(Path(path).read_bytes()))
+        shard = _LISTS.get_or_make(path, lambda: ListedShard.read(path))
     except ValidationError as error:
         raise _damaged() from error
-    if any(number >= len(clips.items) for number in files.dropped):
+    if any(number >= len(shard.clips.items) for number in files.dropped):
         raise _damaged()
-    return clips
+    return shard
 
 
 def _damaged() -> NotFoundProblem:
     return NotFoundProblem("A list of clips in the index is damaged; build the index again.", code="no-index")
 
 
-def _ranks(lists: list[ShardClips]) -> list[Any]:
+def _ranks(lists: list[ListedShard]) -> list[Any]:
     """Number the clips of all shards in the order of their ids."""
     import numpy as np
 
     if not lists:
         return []
-    sizes = np.cumsum([len(clips.items) for clips in lists])[:-1]
-    ids = np.array([one for clips in lists for one in clips.items])
+    sizes = np.cumsum([len(one.clips.items) for one in lists])[:-1]
+    ids = np.array([item for one in lists for item in one.clips.items])
     ranks = np.empty(len(ids), np.int64)
     ranks[np.argsort(ids, kind="stable")] = np.arange(len(ids))
     return np.split(ranks, sizes)
@@ -313,7 +345,7 @@ def _example(order: SimilarOrder) -> tuple[Example, float]:
 
 
 def _searched(
-    order: SimilarOrder, files: ShardFiles, clips: ShardClips, ranks: Any, rate_hz: float, example: Example
+    order: SimilarOrder, files: ShardFiles, listed: ListedShard, ranks: Any, rate_hz: float, example: Example
 ) -> SearchedShard:
     """Return a shard to search, without its dropped clips and the clips that changed since the index was updated."""
     import numpy as np
@@ -321,16 +353,18 @@ def _searched(
     from marey_motion.similarity.shard_search import SearchedShard
     from marey_motion.similarity.shards import Shard
 
-    changed = [order.heads.get(one, number) != number for one, number in zip(clips.items, clips.revisions, strict=True)]
-    closed = np.array(changed, np.bool_)
+    closed = np.zeros(len(listed.clips.items), np.bool_)
     closed[list(files.dropped)] = True
+    for clip in order.heads.keys() & listed.places.keys():
+        for place in listed.places[clip]:
+            closed[place] |= listed.clips.revisions[place] != order.heads[clip]
     windows: dict[int, tuple[int, int]] = {}
-    if order.request.leave_out != "nothing" and order.request.clip in clips.items:
-        own = clips.items.index(order.request.clip)
-        closed[own] |= order.request.leave_out == "clip"
-        windows[own] = example.rows_around(order.request.frames[0], rate_hz)
-    path, rows, joints = Path(files.poses), np.array(clips.rows), np.array(clips.joints)
-    return SearchedShard(lambda: Shard.open(path, rows, joints), ranks, closed, windows)
+    if order.request.leave_out != "nothing":
+        for own in listed.places.get(order.request.clip, ()):
+            closed[own] |= order.request.leave_out == "clip"
+            windows[own] = example.rows_around(order.request.frames[0], rate_hz)
+    path = Path(files.poses)
+    return SearchedShard(lambda: Shard.open(path, listed.runs, listed.joints), ranks, closed, windows)
 
 
 def _window(hit: Hit, clips: ShardClips, length_s: float) -> FoundWindow:

@@ -2,8 +2,9 @@
 
 It reclaims expired leases, and shares cached results with waiting jobs. It commits the outputs of jobs that have many
 outputs, merges waiting proposals, and submits the jobs of due schedules. It deletes old or unreferenced data. Only the
-leading process does this work, but concurrent housekeeping would be safe, because every statement checks its conditions
-again. Each kind of work runs in a separate task, so that a failure does not affect other kinds of work.
+leading process does this work, except that each process cares for its own data folder. Concurrent housekeeping would be
+safe, because every statement checks its conditions again. Each kind of work runs in a separate task, so that a failure
+does not affect other kinds of work.
 """
 
 from __future__ import annotations
@@ -65,6 +66,7 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
             (0.0, 0.0, partial(_commit_outputs, listener=listener, longest_wait_s=tick_s)),
             (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
             (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
+            (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _remove_index_copies),
             (MOVE_EVERY_S, MOVE_EVERY_S, partial(_move_uploads, damaged=set())),
         )
         tasks = [asyncio.create_task(_repeat(services, holder, *chore)) for chore in chores]
@@ -174,6 +176,13 @@ async def _collect_garbage(services: Services, holder: str) -> None:
         retired = await _in_thread(services, retire, services.database, services.settings.retention)
         collected = await _in_thread(services, collect_garbage, services.database)
         log.info("deleted old rows: %s; deleted unused rows: %s", retired, collected)
+
+
+async def _remove_index_copies(services: Services, _holder: str) -> None:
+    """Remove this server's copies of index files that were deleted from the store, for example after a purge."""
+    removed = await _in_thread(services, services.database.read, SYSTEM, services.index_files.remove_unstored)
+    if removed:
+        log.info("removed the copies of %d files of indexes that are no longer stored", removed)
 
 
 async def _move_uploads(services: Services, holder: str, damaged: set[str]) -> None:

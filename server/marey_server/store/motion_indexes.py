@@ -30,6 +30,7 @@ MOST_CHANGES = 20_000
 """Greatest number of clips that may have changed since an index was updated; a search checks each of them."""
 MOST_COPIED_BYTES = 8 * GIB
 """Greatest total size, in bytes, of the copies of index files on one server. A larger index cannot be searched."""
+_DIGEST_DIGITS = 64
 
 
 class FoundIndex(NamedTuple):
@@ -190,6 +191,25 @@ class IndexFiles:
             with suppress(FileNotFoundError):
                 os.unlink(name)
             raise
+
+    def remove_unstored(self, tx: Transaction) -> int:
+        """Remove the copies of files that the server no longer stores, such as those of a purged index.
+
+        Returns the number of removed copies.
+        """
+        removed = 0
+        for some in in_lists(f"sha256:{path.name}" for path in self._copies()):
+            stored = set(tx.execute(select(blob.c.digest).where(blob.c.digest.in_(some))).scalars())
+            for digest in set(some) - stored:
+                self.path(digest).unlink(missing_ok=True)
+                removed += 1
+        return removed
+
+    def _copies(self) -> list[Path]:
+        """List the complete copies; the names of copies that are being made are no digests."""
+        if not self._folder.exists():
+            return []
+        return [path for path in self._folder.iterdir() if len(path.name) == _DIGEST_DIGITS]
 
     def _make_room(self, most_bytes: int, kept: Collection[str]) -> None:
         """Remove copies that are not in `kept`, the longest unused first, until all have at most `most_bytes`."""

@@ -20,13 +20,13 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.perception import comparing
-from marey_motion.perception.comparing import ComparableClip, compare_clips, prepare_comparison
+from marey_motion.perception.comparing import ClipDistances, ComparableClip, compare_clips, prepare_comparison
 from marey_motion.perception.maps import paired_distances
 from marey_motion.perception.metric import metric_of
 from marey_motion.perception.registration import clip_distance
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
-from marey_reports.perception.compared import ComparedSet
+from marey_reports.perception.compared import ComparedClip, ComparedSet
 from marey_reports.perception.page import draw_distance_figures, render_distances
 from marey_schemas.documents.metrics import (
     MetricComponent,
@@ -55,6 +55,12 @@ def body_of(clip: Clip) -> MatchingBody:
 
 def comparable(clip: Clip, **options: Any) -> ComparableClip:
     return prepare_comparison(clip, body_of(clip), METRIC, 60.0, name="clip", **options)
+
+
+def compared_set(
+    metric: MetricDocument, clips: list[ComparableClip], found: ClipDistances, options: DistanceOptions
+) -> ComparedSet:
+    return ComparedSet(metric, list(map(ComparedClip.of, clips)), dict(enumerate(clips)), found, options)
 
 
 def test_every_built_in_metric_is_one_of_its_own_and_knows_its_origin() -> None:
@@ -128,7 +134,7 @@ def test_whole_clips_of_different_lengths_are_drawn_at_one_rate_or_refused() -> 
     short = comparable(generate_gait(1.2, 0.0, 15.0), cycles="whole")
     clips = [long, short]
     found = compare_clips([clip.compared for clip in clips], METRIC)
-    subject = ComparedSet(PAPER, clips, found, DistanceOptions(cycles="whole"))
+    subject = compared_set(PAPER, clips, found, DistanceOptions(cycles="whole"))
     arrays = subject.arrays((0, 1))
     assert (arrays["combined"].shape, float(arrays["map_rate_hz"])) == ((630, 450), 30.0)
     assert set(draw_distance_figures(subject)) == {"registration"}
@@ -143,7 +149,7 @@ def test_a_report_lists_all_pairs_and_parts_only_of_metrics_with_several(name: s
     metric = metric_of(document)
     clips = [prepare_comparison(gait, body_of(gait), metric, 60.0, name=f"<{at}>") for at, gait in enumerate(gaits())]
     found = compare_clips([clip.compared for clip in clips], metric)
-    subject = ComparedSet(document, clips, found, DistanceOptions())
+    subject = compared_set(document, clips, found, DistanceOptions())
     figures = draw_distance_figures(subject)
     assert ("nearest-components" in figures) == (columns > 0)
     page = render_distances(subject, figures, title="Gaits <of> mine")

@@ -21,6 +21,7 @@ from marey_motion.perception.fitting import (
     predict,
 )
 from marey_motion.perception.judging import (
+    DifferenceTable,
     Judgements,
     difference_table,
     draw_trials,
@@ -90,6 +91,32 @@ def test_one_pair_in_six_is_chosen_and_missing_pairs_are_missing() -> None:
             Judgements(5, np.zeros(len(chosen), np.int64), np.array(shown, np.int64), np.array(chosen, np.int64))
 
 
+@pytest.mark.parametrize("participants", [1, 2, 3, 29])
+def test_the_noise_is_the_error_of_the_differences_even_with_few_participants(participants: int) -> None:
+    rng = np.random.default_rng(participants)
+
+    def answered(trials: int) -> DifferenceTable:
+        shown = rng.permuted(np.tile(np.arange(MOTIONS), (trials, 1)), axis=1)[:, :4]
+        one, other = np.triu_indices(4, 1)
+        utility = rng.gumbel(scale=0.1, size=(trials, 6)) - grouped()[shown[:, one], shown[:, other]]
+        return difference_table(Judgements(MOTIONS, np.zeros(trials, np.int64), shown, np.argmax(utility, axis=1)))
+
+    truth = answered(100_000).differences
+    tables = [answered(63 * participants) for _ in range(20)]
+    errors = [float(np.nanmean((table.differences - truth)[PAIRS] ** 2)) for table in tables]
+    stated = [table.noise_ceiling or 0.0 for table in tables]
+    assert np.sqrt(np.mean(np.square(stated))) == pytest.approx(np.sqrt(np.mean(errors)), rel=0.06)
+    assert all(one == pytest.approx(np.sqrt(np.mean(errors)), rel=0.3) for one in stated)
+
+
+def test_the_noise_is_unknown_without_repeated_answers() -> None:
+    shown = np.array([[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]])
+    once = Judgements(MOTIONS, np.arange(3), shown, np.zeros(3, np.int64))
+    assert difference_table(once).noise_ceiling is None
+    again = Judgements(MOTIONS, np.arange(18) % 3, np.tile(shown, (6, 1)), np.arange(18) % 6)
+    assert difference_table(again).noise_ceiling is not None
+
+
 def test_triangle_inequalities_are_counted() -> None:
     assert triangle_violations(grouped()) == (0, 3990)
     table = np.array([[0.0, 0.1, 0.9], [0.1, 0.0, 0.2], [0.9, 0.2, 0.0]])
@@ -104,6 +131,7 @@ def test_simulated_participants_reveal_two_groups() -> None:
     assert spearmanr(table.differences[PAIRS], truth[PAIRS]).statistic >= 0.9
     violated, checked = triangle_violations(table.differences)
     assert violated / checked < 0.01
+    assert table.noise_ceiling is not None
     assert 0.02 < table.noise_ceiling < 0.06
     order = order_motions(table.differences)
     small = order.groups == order.groups[-1]
@@ -240,3 +268,10 @@ def test_qualities_are_those_of_their_formulas() -> None:
     assert (quality.rss, quality.rmse_percent, quality.l2) == pytest.approx((0.03, 10.0, 0.06**0.5))
     assert quality.r2 == pytest.approx(1.0 - 0.03 / 0.046666667)
     assert np.isnan(fit_quality(np.ones(3), np.arange(3.0)).spearman)
+
+
+@pytest.mark.parametrize("participants", [4, 5])
+def test_intervals_of_weights_need_participants_who_can_be_drawn_in_many_ways(participants: int) -> None:
+    judgements = simulate_judgements(grouped(), participants, seed=3, noise=0.05)
+    fits = analyse_study(judgements, [pair_differences()], name="t", draws=10, seed=0).fits
+    assert any(one.parts[0].intervals for one in fits) == (participants == 5)

@@ -36,7 +36,7 @@ from marey_motion.similarity.features import (
 )
 from marey_motion.similarity.searching import Hit, search_clips, search_windows
 from marey_motion.similarity.shard_search import SearchedShard
-from marey_motion.similarity.shards import Shard, presence, write_shard
+from marey_motion.similarity.shards import Runs, Shard, presence, write_shard
 from marey_motion.similarity.similarity_kernels import pose_distance as pose_distance_kernel
 from marey_motion.similarity.weighing import metric_tables
 from marey_schemas.documents.metrics import AngleMeasure, built_in_metric
@@ -54,8 +54,8 @@ def searched(
 ) -> SearchedShard:
     bits, lengths = np.array(present or [ALL] * len(runs)), np.array([len(run) for run in runs])
     write_shard(folder / name, runs)
-    path = folder / name
-    return SearchedShard(lambda: Shard.open(path, lengths, bits), np.arange(len(runs)), np.zeros(len(runs), np.bool_))
+    path, places = folder / name, Runs.of(lengths)
+    return SearchedShard(lambda: Shard.open(path, places, bits), np.arange(len(runs)), np.zeros(len(runs), np.bool_))
 
 
 def pose_distance(a: np.ndarray, b: np.ndarray, metric: PerceptualMetric) -> float:
@@ -316,7 +316,7 @@ def test_missing_joints_and_unusable_metrics_are_told(tmp_path: Path) -> None:
         search_windows([shard], example, turned, 1)
     (tmp_path / "cut").write_bytes((tmp_path / "s").read_bytes()[:-4])
     with pytest.raises(MotionError, match="is no shard"):
-        Shard.open(tmp_path / "cut", np.array([60, 60]), np.array([ALL, ALL]))
+        Shard.open(tmp_path / "cut", Runs.of(np.array([60, 60])), np.array([ALL, ALL]))
 
 
 def test_samples_of_a_window_are_whole_steps_apart() -> None:

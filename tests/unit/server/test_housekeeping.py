@@ -120,3 +120,19 @@ def test_outputs_that_wait_since_the_last_commit_began_are_committed_at_once(
             return await asyncio.to_thread(second.wait, 30)
 
     assert asyncio.run(two_commits())
+
+
+def test_copies_of_index_files_that_the_store_has_deleted_are_removed(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(housekeeping, "FIRST_GARBAGE_S", 0.02)
+    app = create_app(Settings(data=tmp_path, port=0), database)
+    (copy := app.services.index_files.path(f"sha256:{'0' * 64}")).parent.mkdir()
+    copy.write_bytes(b"poses")
+
+    async def until_removed() -> None:
+        async with housekeeping.keeping_house(app.services):
+            while copy.exists():
+                await asyncio.sleep(0.01)
+
+    asyncio.run(asyncio.wait_for(until_removed(), 30))

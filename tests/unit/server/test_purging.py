@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from tests.support.store_fixtures import ALL_RIGHTS, WRITE, motion_tree, requiri
 from marey_schemas.datasets.commits import PutEntry, RemoveEntry
 from marey_schemas.datasets.naming import RefCreate, RefKind
 from marey_schemas.datasets.proposals import ProposalCreate
+from marey_schemas.documents.motion_indexes import MotionIndexDocument
 from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import Event, ItemChange
 from marey_schemas.kinds import Kind
@@ -34,6 +36,7 @@ from marey_server.store.database.prepared import Prepared
 from marey_server.store.datasets import proposals
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import retrying
+from marey_server.store.motion_indexes import IndexFiles
 from marey_server.store.object_upkeep.checking import StoreDefect
 from marey_server.store.purging import candidates, versions
 from marey_server.store.quotas import holdings
@@ -751,3 +754,120 @@ def test_files_that_jobs_imported_or_made_of_a_purged_item_are_released(house: H
     assert (house.desk.job(export).result or {})["archive"] == {"blob": digest_of(archive)}
     assert house.read(blobs.readable, [digest_of(data) for data in (source, archive)]) == set()
     assert house.faults() == []
+
+
+# -- poses in indexes of motions --------------------------------------------------------------------------------------
+
+
+class IndexedHouse:
+    """Indexes of motions that contain clips of a house."""
+
+    def __init__(self, house: House) -> None:
+        self.house = house
+        self.files = 0
+
+    def shard(self, *clips: str) -> dict[str, Any]:
+        """Store the files of a shard with poses of clips."""
+        count = len(clips)
+        lists = {name: [1] * count for name in ("revisions", "rows", "joints", "frames", "rates_hz")}
+        return self.shard_of(json.dumps({"items": clips, **lists}).encode(), count)
+
+    def shard_of(self, listed: bytes, rows: int = 1) -> dict[str, Any]:
+        self.files += 1
+        files = {"clips": listed, "poses": b"poses %d" % self.files}
+        for content in files.values():
+            self.house.write(blobs.put_blob, content)
+        sizes = {name: {"blob": digest_of(one), "size_bytes": len(one)} for name, one in files.items()}
+        return {**sizes, "rows": rows}
+
+    def add(self, *shards: dict[str, Any], name: str = "motion-index") -> str:
+        (made,) = self.house.desk.publish(Draft("i", Kind.INDEX, name, {"index": self.document(*shards)}))
+        return made.item
+
+    def update(self, index: str, *shards: dict[str, Any]) -> None:
+        self.house.write(
+            items.put_part, "lab", Kind.INDEX, index, "index", self.document(*shards), expected_rev=None, message=""
+        )
+
+    def document(self, *shards: dict[str, Any]) -> dict[str, Any]:
+        return {"schema": "marey/motion-index@1", "clips": 1, "rows": 1, "shards": list(shards)}
+
+
+def test_a_purge_deletes_indexes_of_which_an_earlier_revision_contains_poses_of_the_clip(house: House) -> None:
+    _, (walk, run) = house.add_clips("walk", "run")
+    indexed = IndexedHouse(house)
+    kept = indexed.shard(run)
+    index, other = indexed.add(kept, indexed.shard(walk)), indexed.add(kept, name="other")
+    indexed.update(index, kept)
+    house.delete(walk)
+    expected = house.purge(item=walk, preview=True)
+    assert [(one.kind, one.path) for one in expected.purged] == [(Kind.CLIP, "raw/walk"), (Kind.INDEX, "motion-index")]
+    assert {one.item for one in house.purge(item=walk).purged} == {walk, index}
+    assert {one.kind for one in house.events(index)} >= {"item.deleted"}
+    assert house.collect().blobs == 3, "the list of clips, the poses, and the motion of the purged clip"
+    assert [one.id for one in house.read(items.list_items, "lab", Kind.INDEX, items.ItemFilters()).items] == [other]
+    assert house.faults() == []
+
+
+def test_clips_that_an_index_does_not_use_any_more_are_in_its_files(house: House) -> None:
+    _, (walk, run) = house.add_clips("walk", "run")
+    indexed = IndexedHouse(house)
+    index = indexed.add({**indexed.shard(walk, run), "dropped": [0]})
+    house.delete(walk, run)
+    assert {one.item for one in house.purge(item=walk).purged} == {walk, index}
+    assert [one.item for one in house.purge(item=run).purged] == [run]
+
+
+def test_an_unfinished_job_that_reads_an_index_holds_the_clips_in_it(house: House) -> None:
+    _, (walk, run) = house.add_clips("walk", "run")
+    indexed = IndexedHouse(house)
+    index = indexed.add(indexed.shard(walk))
+    job = house.desk.submit("index", inputs={"clips": ({"item": run},), "index": ({"item": index},)})
+    house.delete(walk)
+    assert house.holders(walk).holders == (ItemHolder(item=index, kind=Kind.INDEX, path="motion-index"),)
+    house.desk.cancel(job)
+    assert {one.item for one in house.purge(item=walk).purged} == {walk, index}
+    assert house.faults() == []
+
+
+def test_an_index_that_is_written_during_the_preparation_is_found_by_the_purge(house: House) -> None:
+    _, (walk,) = house.add_clips("walk")
+    house.delete(walk)
+    request = PurgeRequest(item=walk)
+    prepared = house.read(purging.prepare_purge, "lab", request)
+    indexed = IndexedHouse(house)
+    index = indexed.add(indexed.shard(walk))
+    assert {one.item for one in house.write(purging.record_purge, "lab", request, prepared).purged} == {walk, index}
+
+
+@pytest.mark.parametrize("listed", [b"{", b"\xff", json.dumps({"items": ["clip_a"]}).encode()])
+def test_an_index_with_an_unreadable_list_may_contain_any_clip(house: House, listed: bytes) -> None:
+    _, (walk,) = house.add_clips("walk")
+    indexed = IndexedHouse(house)
+    index = indexed.add(indexed.shard_of(listed))
+    thing = house.add("thing")
+    house.delete(walk, thing)
+    assert [one.item for one in house.purge(item=thing).purged] == [thing], "an index has poses of clips alone"
+    assert {one.item for one in house.purge(item=walk).purged} == {walk, index}
+
+
+def test_copies_of_index_files_are_removed_when_the_store_has_deleted_the_files(house: House, tmp_path: Path) -> None:
+    _, (walk, run) = house.add_clips("walk", "run")
+    indexed = IndexedHouse(house)
+    indexes = {clip: indexed.add(indexed.shard(clip), name=clip) for clip in (walk, run)}
+    copies = IndexFiles(tmp_path / "copies")
+    assert house.read(copies.remove_unstored) == 0, "no index has been searched"
+    for index in indexes.values():
+        document = MotionIndexDocument.model_validate(
+            house.read(items.read_part, "lab", Kind.INDEX, index, "index", revision=None).tree
+        )
+        for file in copies.missing(document):
+            house.read(copies.copy, file)
+    assert house.read(copies.remove_unstored) == 0
+    house.delete(walk)
+    house.purge(item=walk)
+    house.collect()
+    (tmp_path / "copies" / "unfinished").write_bytes(b"")
+    assert house.read(copies.remove_unstored) == 2
+    left = house.read(items.read_part, "lab", Kind.INDEX, indexes[run], "index", revision=None).tree
+    assert copies.missing(MotionIndexDocument.model_validate(left)) == []

@@ -89,7 +89,7 @@ export interface Analysis {
 
 interface AnalysisDocument extends Omit<Differences, "order" | "noise">, Pick<Analysis, "triangles" | "fits" | "refusals"> {
   order: { order: number[] } | null;
-  noise_ceiling: number;
+  noise_ceiling: number | null;
 }
 
 interface Job {

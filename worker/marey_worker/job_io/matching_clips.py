@@ -148,7 +148,7 @@ def build_set(
     clips cannot be used for motion matching.
     """
     motions = list(read_motions(context, wanted.clips))
-    rigged = read_rigged(context, common_rig(context, wanted, motions))
+    rigged = read_rigged(context, common_rig(context, wanted, [skeleton_of(motion) for _, motion in motions]))
     body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
     return build_clips(context, wanted, motions, body, options, normaliser)
 
@@ -202,9 +202,16 @@ def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tupl
         yield document_digest(tree), MotionDocument.model_validate(tree)
 
 
-def common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, MotionDocument]]) -> Rig:
-    """Return the skeleton of all clips, at the newest revision in use. Raises `JobRefused` if there are several."""
-    used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for _, motion in motions]
+def skeleton_of(motion: MotionDocument) -> RevisionRef:
+    """Return the skeleton revision of a motion."""
+    return RevisionRef.model_validate(motion.skeleton.model_dump())
+
+
+def common_rig(context: Context, wanted: ClipSet, used: Sequence[RevisionRef]) -> Rig:
+    """Return the skeleton of all clips, at the newest of the revisions `used`, which are those of the clips.
+
+    Raises `JobRefused` if there are several skeletons.
+    """
     (most, count), *others = Counter(ref.item for ref in used).most_common()
     if others:
         odd = [pin.path for pin, ref in zip(wanted.clips, used, strict=True) if ref.item != most]

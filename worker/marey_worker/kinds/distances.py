@@ -1,9 +1,15 @@
-"""Kind `distances`: measures how different clips look to people, by a perceptual metric."""
+"""Kind `distances`: measures how different clips look to people, by a perceptual metric.
+
+The clips are divided into blocks. Each task compares the clips of two blocks, so it holds few clips in memory, and
+measures each of them once for many pairs.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -11,50 +17,92 @@ import numpy as np
 from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
-from marey_motion.perception.comparing import ClipDistances, ComparableClip, compare_clips, prepare_comparison
+from marey_motion.perception.comparing import ClipDistances, ComparableClip, compare_pairs, prepare_comparison
 from marey_motion.perception.metric import metric_of
-from marey_reports.perception.compared import ComparedSet
+from marey_reports.perception.compared import ComparedClip, ComparedSet, drawn_pairs
 from marey_reports.perception.page import draw_distance_figures, render_distances
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.metrics import MetricDocument, MetricIdentity
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.options.perception import DistanceOptions
 from marey_schemas.queue.job_params import MOST_COMPARED_CLIPS, DistancesParams
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.chosen_metric import read_metric_or_default
 from marey_worker.job_io.evaluated_set import store_document, store_file
-from marey_worker.job_io.matching_clips import ClipSet, common_rig, is_loop, read_motions, refusing_motion_errors
+from marey_worker.job_io.matching_clips import (
+    ClipSet,
+    common_rig,
+    is_loop,
+    read_motions,
+    refusing_motion_errors,
+    skeleton_of,
+)
 from marey_worker.job_io.refusals import Refusals
-from marey_worker.job_io.skeleton_cache import read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 from marey_worker.job_io.stored_reports import inputs_of, stored_figure
 
-Prepared = tuple[PinnedInput, ComparableClip]
+Prepared = dict[int, ComparableClip]
+"""Clips that can be compared, by their position in the input `clips`."""
 
 
 def run(context: Context, params: DistancesParams) -> dict[str, Any]:
-    """Compare clips; the result names the nearest and the farthest pair, and refers to the document and the report.
+    """Compare the clips of two blocks with each other; the result refers to a file with their distances.
 
-    A clip that cannot be compared is listed as a refusal in the result. Raises `JobRefused` if fewer than two clips can
-    be compared.
+    All tasks together compare all pairs of clips, whatever their number. A clip that cannot be compared is refused.
     """
-    _require_count(len(context.inputs["clips"]))
+    pins = context.inputs["clips"]
+    _require_count(len(pins))
     document = read_metric_or_default(context, params.metric)
+    first, second = _blocks(context.task.position, context.task.size, len(pins))
+    wanted = sorted({*first, *second})
     refusals = Refusals(context)
     with refusing_motion_errors():
-        prepared = list(_prepared(context, params, document, refusals))
-        if len(prepared) < 2:
-            raise JobRefused(
-                "too-few-clips",
-                f"only {len(prepared)} of {len(context.inputs['clips'])} clips can be compared, and at least two are "
-                f"needed{refusals.first}",
-            )
-        clips = [clip for _, clip in prepared]
-        compared = [clip.compared for clip in clips]
-        distances = compare_clips(
-            compared, metric_of(document), threads=context.threads, progress=context.progress
-        )  # fmt: skip
-    subject = ComparedSet(document, clips, distances, DistanceOptions.of(params))
-    result = _result(context, params, subject, prepared, refusals)
+        rig, motions = _read(context, set(wanted))
+        prepared, refused = _prepare(context, params, document, rig, motions, refusals)
+        pairs = [(i, j) for i in first for j in second if i < j and i in prepared and j in prepared]
+        table = np.array(pairs, np.int64).reshape(-1, 2)
+        clips = {number: clip.compared for number, clip in prepared.items()}
+        found = compare_pairs(clips, table, metric_of(document), threads=context.threads, progress=context.progress)
+    tree = {
+        "pairs": table,
+        "distances": found,
+        "clips": {str(number): asdict(ComparedClip.of(clip)) for number, clip in prepared.items()},
+        "refused": {str(number): entry for number, entry in refused.items()},
+        "rig": [ref.model_dump(mode="json") for ref in rig],
+    }
+    return {"pairs": len(pairs), "compared": store_file(context, encode_tree(tree, MSGPACK, arrays="blocks"))}
+
+
+def gather(context: Context, params: DistancesParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Combine the distances; the result names the nearest and the farthest pair, and refers to document and report.
+
+    Refused clips are listed in the result. Raises `JobRefused` if fewer than two clips can be compared.
+    """
+    document, pins = read_metric_or_default(context, params.metric), context.inputs["clips"]
+    found = [decode_tree(context.blob(result["compared"]["blob"]), MSGPACK) for result in results]
+    refused = [entry for _, entry in sorted(_by_number(found, "refused").items())]
+    facts = dict(sorted(_by_number(found, "clips").items()))
+    if len(facts) < 2:
+        first = f"; {refused[0]['name']}: {refused[0]['detail']}" if refused else ""
+        raise JobRefused(
+            "too-few-clips",
+            f"only {len(facts)} of {len(pins)} clips can be compared, and at least two are needed{first}",
+        )
+    places = np.array(list(facts))
+    pairs = np.searchsorted(places, np.concatenate([one["pairs"] for one in found]))
+    distances = ClipDistances.of(len(facts), pairs, np.concatenate([one["distances"] for one in found]))
+    drawn = sorted({number for pair in drawn_pairs(distances) for number in pair})
+    with refusing_motion_errors():
+        rig = Rig(*map(RevisionRef.model_validate, found[0]["rig"]))
+        shown = [pins[places[number]] for number in drawn]
+        motions = zip(drawn, shown, read_motions(context, shown), strict=True)
+        moving = {number: (pin, motion) for number, pin, (_, motion) in motions}
+        prepared, _ = _prepare(context, params, document, rig, moving, Refusals(context))
+    clips = [ComparedClip(**one) for one in facts.values()]
+    subject = ComparedSet(document, clips, prepared, distances, DistanceOptions.of(params))
+    result = _result(context, params, subject, [pins[number] for number in places], refused)
     if params.report:
         context.progress(0, None, "writing the report")
         title = params.title or " and ".join(clip.name for clip in clips[:2]) + (" …" if len(clips) > 2 else "")
@@ -75,82 +123,117 @@ def _require_count(count: int) -> None:
         )
 
 
-def _prepared(
-    context: Context, params: DistancesParams, document: MetricDocument, refusals: Refusals
-) -> Iterator[Prepared]:
-    """Yield the clips that can be compared; refuse the others. Raises `JobRefused` for clips of several skeletons."""
+def _blocks(position: int, tasks: int, clips: int) -> tuple[range, range]:
+    """Return the numbers of the clips in the two blocks that a task compares; both are the same for some tasks."""
+    blocks = round(((8 * tasks + 1) ** 0.5 - 1) / 2)  # the number of tasks is that of all pairs of blocks
+    pair = list(combinations_with_replacement(range(blocks), 2))[position]
+    first, second = (range(clips * block // blocks, clips * (block + 1) // blocks) for block in pair)
+    return first, second
+
+
+def _by_number(found: Sequence[Mapping[str, Any]], name: str) -> dict[int, Any]:
+    """Combine the members `name` of the files of all tasks, by the number of the clip."""
+    return {int(number): entry for one in found for number, entry in one[name].items()}
+
+
+Moving = dict[int, tuple[PinnedInput, MotionDocument]]
+"""Clips with their motions, by number."""
+
+
+def _read(context: Context, wanted: Collection[int]) -> tuple[Rig, Moving]:
+    """Return the skeleton of all clips, and the motions of some. Raises `JobRefused` if there are several skeletons."""
     pins = context.inputs["clips"]
     (rig,) = context.inputs.get("rig", ()) or (None,)
-    motions: Sequence[tuple[str, MotionDocument]] = list(read_motions(context, pins))
-    rigged = read_rigged(context, common_rig(context, ClipSet(pins, rig), motions))
+    used, motions = [], Moving()
+    for number, (_, motion) in enumerate(read_motions(context, pins)):
+        used.append(skeleton_of(motion))
+        if number in wanted:
+            motions[number] = pins[number], motion
+    return common_rig(context, ClipSet(pins, rig), used), motions
+
+
+def _prepare(
+    context: Context,
+    params: DistancesParams,
+    document: MetricDocument,
+    rig: Rig,
+    motions: Moving,
+    refusals: Refusals,
+) -> tuple[Prepared, dict[int, dict[str, str]]]:
+    """Measure clips, and cut loops out of them; also return the refusals of clips that cannot be compared."""
+    rigged = read_rigged(context, rig)
     body, metric = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping), metric_of(document)
-    for done, ((pin, info), (_, motion)) in enumerate(
-        zip(context.documents(pins, "info", required=False), motions, strict=True)
-    ):
-        context.progress(done, len(pins), f"measuring {pin.name}")
+    prepared, refused = Prepared(), dict[int, dict[str, str]]()
+    infos = context.documents([pin for pin, _ in motions.values()], "info", required=False)
+    for done, ((number, (pin, motion)), (_, info)) in enumerate(zip(motions.items(), infos, strict=True)):
+        context.progress(done, len(motions), f"measuring {pin.name}")
         try:
             clip = documents.clip_from_document(motion, rigged.skeleton)
             loop = is_loop(pin, info, params.loops)
-            yield (
-                pin,
-                prepare_comparison(
-                    clip, body, metric, document.frame_rate_hz, name=pin.path, cycles=params.cycles, loop=loop
-                ),
+            prepared[number] = prepare_comparison(
+                clip, body, metric, document.frame_rate_hz, name=pin.path, cycles=params.cycles, loop=loop
             )
         except MotionError as error:
             refusals.add(pin, error)
+            refused[number] = refusals.entries[-1]
+    return prepared, refused
 
 
 def _result(
-    context: Context, params: DistancesParams, subject: ComparedSet, prepared: Sequence[Prepared], refusals: Refusals
+    context: Context,
+    params: DistancesParams,
+    subject: ComparedSet,
+    pins: Sequence[PinnedInput],
+    refused: Sequence[Mapping[str, str]],
 ) -> dict[str, Any]:
     ranked = subject.distances.pairs_by_distance()
+    rate_hz = subject.metric.frame_rate_hz
     tree = {
         "metric": subject.metric.stored(),
         "options": DistanceOptions.of(params).model_dump(mode="json"),
-        "clips": [_clip_tree(pin, clip, subject.metric.frame_rate_hz) for pin, clip in prepared],
+        "clips": [_clip_tree(pin, clip, rate_hz) for pin, clip in zip(pins, subject.clips, strict=True)],
         "distances": subject.distances.totals,
         "components": {
             one.measurement: table
             for one, table in zip(subject.metric.components, subject.distances.by_component, strict=True)
         },
-        "refused": refusals.entries,
+        "refused": refused,
         "says": list(subject.claims()),
     }
     return {
-        "clips": len(prepared),
+        "clips": len(pins),
         "pairs": len(ranked),
         "metric": MetricIdentity.of(subject.metric).model_dump(mode="json"),
-        "nearest": _pair_tree(subject.distances, prepared, ranked[0]),
-        "farthest": _pair_tree(subject.distances, prepared, ranked[-1]),
-        "refused": refusals.entries,
+        "nearest": _pair_tree(subject, ranked[0]),
+        "farthest": _pair_tree(subject, ranked[-1]),
+        "refused": refused,
         "document": store_document(context, tree),
         "maps": store_file(context, _maps(subject)),
     }
 
 
-def _clip_tree(pin: PinnedInput, clip: ComparableClip, rate_hz: float) -> dict[str, Any]:
-    period = clip.period
+def _clip_tree(pin: PinnedInput, clip: ComparedClip, rate_hz: float) -> dict[str, Any]:
     return {
         "item": pin.item,
         "revision": pin.revision,
         "name": pin.path,
-        "seconds": clip.compared.frame_count / rate_hz,
-        "cyclic": clip.compared.cyclic,
-        "period_s": None if period is None else period.frames / rate_hz,
-        "start_s": None if period is None else period.start / rate_hz,
+        "seconds": clip.compared_frames / rate_hz,
+        "cyclic": clip.cyclic,
+        "period_s": None if clip.period_frames is None else clip.period_frames / rate_hz,
+        "start_s": None if clip.start_frame is None else clip.start_frame / rate_hz,
     }
 
 
-def _pair_tree(distances: ClipDistances, prepared: Sequence[Prepared], pair: np.ndarray) -> dict[str, Any]:
+def _pair_tree(subject: ComparedSet, pair: np.ndarray) -> dict[str, Any]:
     i, j = map(int, pair)
-    return {"clips": [prepared[i][1].name, prepared[j][1].name], "distance": float(distances.totals[i, j])}
+    names = [subject.clips[number].name for number in (i, j)]
+    return {"clips": names, "distance": float(subject.distances.totals[i, j])}
 
 
 def _maps(subject: ComparedSet) -> bytes:
     """Return motion maps and registration curves of the drawn pairs as a NumPy archive (.npz)."""
     arrays: dict[str, np.ndarray] = {}
-    for number, pair in enumerate(subject.drawn_pairs()):
+    for number, pair in enumerate(drawn_pairs(subject.distances)):
         arrays |= {f"pair{number}_{name}": values for name, values in subject.arrays(pair).items()}
     buffer = io.BytesIO()
     save: Any = np.savez_compressed  # which has options besides the names of arrays

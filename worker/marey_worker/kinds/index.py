@@ -20,7 +20,7 @@ from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.similarity.features import Rows, clip_features
-from marey_motion.similarity.shards import FULL_SHARD_ROWS, Shard, presence, write_shard
+from marey_motion.similarity.shards import FULL_SHARD_ROWS, Runs, Shard, presence, write_shard
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.motion_indexes import (
     INDEX_VERSION,
@@ -142,7 +142,7 @@ def _copy(context: Context, writer: _Writer, shard: IndexShard, clips: ShardClip
     file = context.scratch / "earlier"
     file.write_bytes(context.blob(shard.poses.blob))
     try:
-        opened = Shard.open(file, np.array(clips.rows), np.array(clips.joints))
+        opened = Shard.open(file, Runs.of(np.array(clips.rows)), np.array(clips.joints))
     except MotionError as error:
         raise _damaged(context.inputs["index"][0]) from error
     for run in runs:

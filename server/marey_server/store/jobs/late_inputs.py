@@ -104,7 +104,7 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
         layout.request_of(row),
         row.params,
         pins,
-        1 if kind.task_count is None else kind.task_count(params),
+        kind.count_tasks(params, pins),
         row.labels_key,
         row.author_id,
         id=row.id,

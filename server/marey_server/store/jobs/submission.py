@@ -38,7 +38,14 @@ from marey_server.store.jobs.documents import document_of_new, job_documents
 from marey_server.store.jobs.endings import dependency_failure
 from marey_server.store.jobs.events import emit_job_events, wake_workers
 from marey_server.store.jobs.exports import record_permission
-from marey_server.store.jobs.inputs import FoundItem, find_items, late_inputs, pin_inputs, record_named_items
+from marey_server.store.jobs.inputs import (
+    FoundItem,
+    PinnedInputs,
+    find_items,
+    late_inputs,
+    pin_inputs,
+    record_named_items,
+)
 from marey_server.store.jobs.late_inputs import pin_late_inputs
 from marey_server.store.jobs.layout import NewJob, Submission, count_inputs, lay_out, naming, new_row
 from marey_server.store.jobs.propagation import propagate_ends
@@ -178,7 +185,7 @@ def _check(
     if (clash := find_clash(kind, params, pins, request.into)) is not None:
         unnamed = "Two results of the job, or a result and an input, would have the same place, or a path is too long."
         raise _invalid(f"{at}{clash.place}", clash.code, clash.detail, unnamed)
-    tasks, plain = _count_tasks(kind, params, at), params.model_dump(mode="json")
+    tasks, plain = _count_tasks(kind, params, pins, at), params.model_dump(mode="json")
     late = [maker for _, _, maker in late_inputs(request, at)]
     return Submission(
         kind,
@@ -209,8 +216,8 @@ def _target(
     return commits.check_target(tx, project, kind, request.commit, request.into, f"{at}/commit")
 
 
-def _count_tasks(kind: KindDeclaration, params: Any, at: str) -> int:
-    count = 1 if kind.task_count is None else kind.task_count(params)
+def _count_tasks(kind: KindDeclaration, params: Any, pins: PinnedInputs, at: str) -> int:
+    count = kind.count_tasks(params, pins)
     if not 1 <= count <= MOST_TASKS:
         detail = f"These parameters divide the job into {count} tasks; 1 to {MOST_TASKS} are allowed."
         raise _invalid(f"{at}/params", "too-many-tasks", detail)

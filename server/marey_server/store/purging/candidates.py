@@ -16,6 +16,7 @@ from marey_server.store.database.clock import DAY_US
 from marey_server.store.items.listing import ItemFilters, conditions_of
 from marey_server.store.items.reading import item_rows
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purging.index_copies import IndexSearch
 from marey_server.store.purging.versions import VersionSearch
 from marey_server.store.tables import item, revision, revision_part
 from marey_server.store.transaction import Transaction
@@ -37,16 +38,17 @@ assert set(_ORDER) == set(Kind), "every kind needs a place in the order of a pur
 
 @dataclass(frozen=True)
 class PreparedPurge:
-    """Items that a request may purge, and the results of the search that was made for them before the purge."""
+    """Items that a request may purge, and the results of the searches that were made for them before the purge."""
 
     ids: tuple[str, ...]
     search: VersionSearch
+    copies: IndexSearch
     next: str | None = None
     """Id of the last item in `ids`, after which the next request continues; None if no items remain."""
 
 
 def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> PreparedPurge:
-    """Choose the next items of a purge, and search all versions of the project for them.
+    """Choose the next items of a purge, and search all versions and indexes of motions of the project for them.
 
     Raises `BadRequestProblem` for a malformed query, and `ForbiddenProblem` if the caller lacks the scope `read`.
     """
@@ -61,10 +63,11 @@ def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> Prepa
             break
         chosen.append(row)
     ids = tuple(row.id for row in chosen)
-    _, parts = contents_of(tx, ids)
+    copies = IndexSearch(project_row.id, (row.id for row in chosen if row.kind == Kind.CLIP.value))
+    _, parts = contents_of(tx, (*ids, *copies.update(tx)))
     search = VersionSearch(project_row.id, parts)
     search.update(tx)
-    return PreparedPurge(ids, search, ids[-1] if len(rows) > len(chosen) else None)
+    return PreparedPurge(ids, search, copies, ids[-1] if len(rows) > len(chosen) else None)
 
 
 def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest) -> list[Row[Any]]:

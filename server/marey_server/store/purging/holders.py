@@ -33,13 +33,18 @@ class FoundHolders:
 
 
 def find_holders(
-    tx: Transaction, project_id: str, rows: Mapping[str, Row[Any]], versions: Mapping[str, Iterable[Holder]]
+    tx: Transaction,
+    project_id: str,
+    rows: Mapping[str, Row[Any]],
+    versions: Mapping[str, Iterable[Holder]],
+    copies: Mapping[str, Collection[str]],
 ) -> dict[str, FoundHolders]:
     """Return, by the id of an item, the holders that prevent its purge; items without holders are left out.
 
     `rows` are the items that are to be purged together. If an item in `rows` refers to another item in `rows`, the
     reference prevents the purge of the other item only if the first item has a holder. `versions` are the holders that
-    a `VersionSearch` has found.
+    a `VersionSearch` has found. `copies` maps the ids of indexes of motions to the ids of the clips whose poses they
+    contain; an index in `rows` refers to these clips.
     """
     held: dict[str, FoundHolders] = {}
     for item_id, found in versions.items():
@@ -49,7 +54,10 @@ def find_holders(
         for job in jobs.values():
             held.setdefault(item_id, FoundHolders()).add(job)
     _add_referring(tx, project_id, rows.keys(), held)
-    _spread(_references_among(tx, rows.keys()), rows, held)
+    refers = _references_among(tx, rows.keys())
+    for index, clips in copies.items():
+        refers.setdefault(index, []).extend(sorted(rows.keys() & set(clips)))
+    _spread(refers, rows, held)
     return held
 
 

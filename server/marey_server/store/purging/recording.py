@@ -1,11 +1,13 @@
 """Purges and their previews: prepared items are erased unless they have holders, which the answer names.
 
-A holder of an item is a version of a dataset, another item, or an unfinished job that needs the item.
+A holder of an item is a version of a dataset, another item, or an unfinished job that needs the item. An index of
+motions contains copies of the poses of its clips, and can be built again. So it is no holder of a clip, but is erased
+together with the clip.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +17,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.purges import HeldItem, PurgeAnswer, PurgedItem, PurgeRequest, words_of
 from marey_server import faults
 from marey_server.errors import ApiProblem, ConflictProblem, NotFoundProblem
-from marey_server.store import projects
+from marey_server.store import items, projects
 from marey_server.store.items.reading import item_rows, was_purged
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import begin_purge
@@ -57,6 +59,9 @@ def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared:
     if request.item is not None and found.refused:
         raise _still_held(found.refused[0])
     answer = _answer(tx, project_row, request, prepared, found)
+    for row in found.free:
+        if row.deleted_us is None:  # an index of motions
+            items.delete_item(tx, project, Kind(row.kind), row.id, expected_rev=None)
     if found.free:
         erase(tx, project_row, found.free, found.jobs, at_us)
         faults.point("purge.before_commit")
@@ -66,7 +71,10 @@ def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared:
 
 @dataclass(frozen=True)
 class _Examined:
-    """Prepared items that are still deleted: items that can be purged, and items that have holders."""
+    """Prepared items that are still deleted: items that can be purged, and items that have holders.
+
+    The items that can be purged include indexes with poses of the others, whether or not they are deleted.
+    """
 
     free: Sequence[Row[Any]]
     refused: tuple[HeldItem, ...]
@@ -78,8 +86,13 @@ def _examine(tx: Transaction, project_row: ProjectRow, request: PurgeRequest, pr
     rows = _lock(tx, project_row, prepared, preview=request.preview)
     if request.item is not None and not rows:
         raise _not_deleted(tx, project_row, request.item)
-    held = find_holders(tx, project_row.id, rows, _versions(tx, project_row, prepared, rows))
-    free = [row for item_id, row in rows.items() if item_id not in held]
+    copies = prepared.copies.update(tx)
+    indexes = _lock_rows(tx, project_row, sorted(copies.keys() - rows.keys()), preview=request.preview)
+    both = {**rows, **indexes}
+    held = find_holders(tx, project_row.id, both, _versions(tx, project_row, prepared, both), copies)
+    freed = rows.keys() - held.keys()
+    free = [row for item_id, row in rows.items() if item_id in freed]
+    free += [row for item_id, row in indexes.items() if not freed.isdisjoint(copies[item_id])]
     naming = jobs_naming(tx, project_row.id, [row.id for row in free])
     jobs = {one.id for one in naming} | {one.parent for one in naming if one.parent is not None}
     refused = tuple(_refused(rows[item_id], held[item_id]) for item_id in prepared.ids if item_id in held)
@@ -101,15 +114,17 @@ def _answer(
 
 def _lock(tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge, *, preview: bool) -> dict[str, Row[Any]]:
     """Return the rows of the prepared items that were not restored, in their order; except for a preview, lock them."""
-    statement = item_rows().where(
-        item.c.id.in_(prepared.ids),
-        item.c.project_id == project_row.id,
-        item.c.deleted_us.is_not(None),
-        item.c.purged_us.is_(None),
-    )
-    statement = statement.order_by(item.c.id)
-    found = {row.id: row for row in tx.execute(statement if preview else statement.with_for_update(of=item))}
-    return {item_id: found[item_id] for item_id in prepared.ids if item_id in found}
+    found = _lock_rows(tx, project_row, prepared.ids, preview=preview)
+    return {item_id: found[item_id] for item_id in prepared.ids if item_id in found and found[item_id].deleted_us}
+
+
+def _lock_rows(tx: Transaction, project_row: ProjectRow, ids: Collection[str], *, preview: bool) -> dict[str, Row[Any]]:
+    """Return the rows of the items that were not purged, by id; except for a preview, lock them."""
+    if not ids:
+        return {}
+    mine = (item.c.id.in_(ids), item.c.project_id == project_row.id, item.c.purged_us.is_(None))
+    statement = item_rows().where(*mine).order_by(item.c.id)
+    return {row.id: row for row in tx.execute(statement if preview else statement.with_for_update(of=item))}
 
 
 def _not_deleted(tx: Transaction, project_row: ProjectRow, item_id: str) -> ApiProblem:
