@@ -22,8 +22,6 @@ from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
 
 MOST_ROWS = 24
-LONGEST_NAME = 30
-"""Greatest length in characters of each of two names in the title of a picture."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +113,7 @@ def _side_by_side(first: ClipOfStrip, second: ClipOfStrip, moments: int, file_ty
             f"most {sheets.MAX_MOMENTS} moments"
         )
     paper = room("marey_reports.drawing.paper", FIGURES_EXTRA)
-    white, tinted = (paper.shortened(one.clip.path, LONGEST_NAME) for one in (second, first))
+    white, tinted = (paper.shortened(one.clip.path) for one in (second, first))
     title = f"white: {white}, tinted: {tinted}"
     pair = sheets.TakePair(title, second.whole(), first.whole())
     data: bytes = sheets.contact_sheet([pair], heading=first.clip.name, moments=moments)

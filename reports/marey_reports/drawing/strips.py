@@ -17,7 +17,19 @@ from marey_motion.arrays import Floats, Indices
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_directions, global_positions
-from marey_reports.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET, REFERENCE, TEXT, new_figure, shortened, to_svg, write
+from marey_reports.drawing.paper import (
+    COLOURS,
+    HAIRLINE,
+    INK,
+    PAPER,
+    QUIET,
+    REFERENCE,
+    TEXT,
+    new_figure,
+    shortened,
+    to_svg,
+    write,
+)
 from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, StickFigure, body_of, runs_of
 
 if TYPE_CHECKING:
