@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
+_NOUNS = {"processed": "aligned clip"}
 _PLURALS = {"processed": "processed", "study": "studies", "index": "indexes"}
 
 
@@ -27,6 +28,11 @@ class Kind(StrEnum):
     def plural(self) -> str:
         """The name of the kind in URLs, for example `clips`."""
         return _PLURALS.get(self.value, f"{self.value}s")
+
+    @property
+    def noun(self) -> str:
+        """The kind in texts for people, for example `clip` or `aligned clip`."""
+        return _NOUNS.get(self.value, self.value)
 
     @classmethod
     def from_plural(cls, plural: str) -> "Kind":

@@ -164,7 +164,7 @@ def title_of(graph: LineageGraph, group: LineageGroup) -> str:
     if len(members) == 1:
         return f"{members[0].path or members[0].item}@{members[0].revision}"
     shared = commonpath([one.path.rpartition("/")[0] for one in members])
-    return f"{counted(len(members), group.kind.value)}{f' in {shared}' if shared else ''}"
+    return f"{counted(len(members), group.kind.noun)}{f' in {shared}' if shared else ''}"
 
 
 def remarks_on(graph: LineageGraph, group: LineageGroup) -> list[str]:

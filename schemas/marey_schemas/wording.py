@@ -16,8 +16,9 @@ def counted(number: int, noun: str) -> str:
     """Return a number with its noun, in the plural unless the number is 1: "1 frame", "103,568 trajectories"."""
     if number == 1:
         return f"1 {noun}"
-    plural = f"{noun[:-1]}ies" if noun.endswith("y") and noun[-2] not in "aeou" else f"{noun}s"
-    return f"{number:,} {plural}"
+    if noun.endswith("y") and noun[-2] not in "aeou":
+        return f"{number:,} {noun[:-1]}ies"
+    return f"{number:,} {noun}{'es' if noun.endswith('x') else 's'}"
 
 
 def part_of(shown: int, total: int, noun: str) -> str:

@@ -137,6 +137,8 @@ def test_without_built_pages_a_page_names_the_command_that_builds_them(
     missing = httpx.get(f"{server.address}/view?clip=lab/x")
     assert (missing.status_code, missing.headers["Content-Type"]) == (404, "text/html; charset=utf-8")
     assert "make web" in missing.text
+    assert '<meta name="viewport" content="width=device-width' in missing.text  # phones do not shrink the page
+    assert "color-scheme: light dark" in missing.text
     assert httpx.get(f"{server.address}/assets/a.js").status_code == 404
     token = server.client(server.make_project()).headers["Authorization"].removeprefix("Bearer ")
     with Marey(server.address, token) as marey, pytest.raises(MareyError, match="offers no page that plays motion"):

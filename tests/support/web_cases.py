@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_client.poses.player_pages import ShownMotion
-from marey_motion import foot_contacts, generate_gait, global_positions
+from marey_motion import foot_contacts, forward_directions, generate_gait, global_positions
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_tree, skeleton_to_document
 from marey_motion.rigs.mapping import map_joints
@@ -21,6 +21,7 @@ from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 
+SIDES = ("left", "right")
 FEET = ("left_toe", "right_toe")
 
 
@@ -81,6 +82,8 @@ def _write_clip(stem: Path, clip: Clip) -> None:
     positions = global_positions(clip, end_sites=True)
     stem.with_suffix(".positions").write_bytes(positions.astype("<f4").tobytes())
     toes = positions[:, [clip.skeleton.index_of(mapping.joints[foot]) for foot in FEET]]
+    hips = [[clip.skeleton.index_of(mapping.joints[f"{side}_hip"])] for side in SIDES]
+    stem.with_suffix(".facing").write_bytes(forward_directions(positions, *hips).astype("<f4").tobytes())
     stem.with_suffix(".contacts").write_bytes(foot_contacts(toes, clip.frame_rate_hz).astype("|u1").T.tobytes())
 
 

@@ -62,6 +62,18 @@ export async function faults(where: Page): Promise<string[]> {
   return found.violations.map((one) => `${one.id}: ${one.nodes.map((node) => node.target.join(" ")).join(", ")}`);
 }
 
+/** Least height and width in pixels of what fingers can press. */
+const FINGER_PX = 44;
+
+/** Return the names of buttons, lists and sliders that are too small for fingers. */
+export function smallTargets(where: Page): Promise<string[]> {
+  return where.evaluate((least) => {
+    const targets = [...document.querySelectorAll<HTMLElement>("button, select, summary, input")].filter((one) => one.checkVisibility());
+    const isSmall = ({ width, height }: DOMRect) => width < least || height < least;
+    return targets.filter((one) => isSmall(one.getBoundingClientRect())).map((one) => one.innerText || one.ariaLabel || one.outerHTML);
+  }, FINGER_PX);
+}
+
 /** Return the state of the scene as soon as it meets a condition. */
 export async function scene(where: Page, meets: (state: SceneState) => boolean): Promise<SceneState> {
   let state: SceneState | undefined;

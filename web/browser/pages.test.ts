@@ -1,7 +1,8 @@
 /** The pages in a real Chromium, against a real server that pytest has started and filled (tests/integration/test_pages.py). */
 import { type Browser, type BrowserContext, type Page } from "playwright-core";
 import { afterAll, beforeAll, expect, it } from "vitest";
-import { colours, faults, launch, PATIENCE_MS, picture, scene, signOut, tellFirstPose } from "./looking";
+import type { SceneState } from "../src/player/testHandle";
+import { colours, faults, launch, PATIENCE_MS, picture, scene, signOut, smallTargets, tellFirstPose } from "./looking";
 
 interface Given {
   chromium: string;
@@ -21,7 +22,17 @@ const MOST_TRIANGLES = 30_000;
 let browser: Browser;
 let context: BrowserContext;
 let page: Page;
+/** Direction from which the camera sees the first clip from the front, in degrees about the vertical. */
+let front = 0;
 const complaints: string[] = [];
+
+/** Return the direction that a body faces, in degrees about the vertical from +z, by the positions of its hips. */
+function frontOf(actor: SceneState["actors"][number]): number {
+  const place = (name: RegExp) => 3 * actor.joints.findIndex((joint) => name.test(joint));
+  const [left, right] = [place(/^(Left|l)(UpLeg|Thigh)$/), place(/^(Right|r)(UpLeg|Thigh)$/)]; // real takes, and generated ones
+  const [x, z] = [0, 2].map((axis) => actor.positions[left + axis]! - actor.positions[right + axis]!) as [number, number];
+  return (Math.atan2(-z, x) * 180) / Math.PI;
+}
 
 beforeAll(async () => {
   browser = await launch(GIVEN.chromium);
@@ -62,26 +73,53 @@ it("works with keys alone, and keeps all that is seen in its address, but not th
   await page.keyboard.press("ArrowLeft");
   await page.keyboard.press("v");
   await page.keyboard.press("c");
-  await scene(page, (one) => one.actors[0]!.frame === 9 && one.camera.startsWith("0,8,"));
+  let state = await scene(page, (one) => one.actors[0]!.frame === 9 && one.camera.split(",")[1] === "8");
+  front = Number(state.camera.split(",")[0]);
+  expect(frontOf(state.actors[0]!)).toBeCloseTo(front, 0);
+  await page.keyboard.press("d");
+  state = await scene(page, (one) => one.camera !== state.camera);
+  await page.keyboard.press("a");
+  await page.keyboard.press("w");
+  await page.keyboard.press("s");
+  await scene(page, (one) => one.camera === `${front},8,3`);
   await page.keyboard.press("Space");
   await scene(page, (one) => one.seconds > 0.3);
   await page.keyboard.press("Space");
   await page.keyboard.press("Home");
   await page.keyboard.press("ArrowRight");
-  await expect.poll(() => page.url()).toMatch(/frame=1&camera=0,8,3&look=skeleton/);
+  await expect.poll(() => page.url()).toMatch(new RegExp(`frame=1&camera=${front},8,3&look=skeleton`));
   await picture(page, "view-skeletons");
 });
 
+it("copies a link to the frame that is shown, or says what to copy", async () => {
+  await context.grantPermissions(["clipboard-read", "clipboard-write"]);
+  await page.keyboard.press("End");
+  await page.getByRole("button", { name: "Copy link" }).click(); // before the address is written
+  await page.getByRole("button", { name: "Copied" }).waitFor();
+  const last = (await page.getByRole("slider", { name: "Frame" }).getAttribute("max"))!;
+  expect(await page.evaluate(() => navigator.clipboard.readText())).toBe(page.url());
+  expect(page.url()).toContain(`frame=${last}&`);
+  await page.evaluate(() => Object.defineProperty(navigator, "clipboard", { value: undefined })); // as without HTTPS
+  await page.getByRole("button", { name: "Copy link" }).click();
+  await page.getByRole("button", { name: "Copy the page’s address" }).waitFor();
+  await page.keyboard.press("Home");
+  await page.keyboard.press("ArrowRight");
+  await expect.poll(() => page.url()).toContain("frame=1&");
+});
+
 it("shows the same again from the copied address, in a narrow window, with the cookie alone", async () => {
-  const narrow = await context.newPage();
-  await narrow.setViewportSize({ width: 390, height: 844 });
+  const phone = await browser.newContext({
+    viewport: { width: 390, height: 844 }, isMobile: true, hasTouch: true, storageState: await context.storageState(),
+  });
+  const narrow = await phone.newPage();
   await narrow.goto(page.url());
   const state = await scene(narrow, (one) => one.actors.length === 2);
-  expect([state.actors[0]!.frame, state.camera]).toEqual([1, "0,8,3"]);
+  expect([state.actors[0]!.frame, state.camera]).toEqual([1, `${front},8,3`]);
   expect(await narrow.evaluate(() => document.cookie)).toBe(""); // pages cannot read the cookie
   expect(await narrow.evaluate(() => document.documentElement.scrollWidth)).toBeLessThanOrEqual(390);
+  expect(await smallTargets(narrow)).toEqual([]);
   await picture(narrow, "view-390");
-  await narrow.close();
+  await phone.close();
 });
 
 it("has no fault that axe finds, also with the help open", async () => {
@@ -106,9 +144,20 @@ it("draws side views where there is no WebGL", async () => {
   const state = await scene(plain, (one) => one.actors.length === 2);
   expect(state.stage).toBe("canvas");
   await expect.poll(() => colours(plain), { timeout: PATIENCE_MS }).toBeGreaterThan(5);
-  await plain.getByText("This browser offers no WebGL").waitFor();
+  const notice = await plain.getByText("This browser offers no WebGL").boundingBox();
+  const drawing = (await plain.locator("canvas").boundingBox())!;
+  expect(notice!.y).toBeGreaterThanOrEqual(drawing.y + drawing.height - 1); // it covers no figure
   await picture(plain, "view-without-webgl");
   await plain.close();
+});
+
+it("says to a browser with a session which clip there is not", async () => {
+  const gone = await context.newPage();
+  const { searchParams } = new URL(page.url());
+  await gone.goto(new URL(`view?clip=${searchParams.get("clip")!.split("/")[0]}/clip_none`, page.url()).href);
+  await gone.getByRole("heading", { name: "The clip cannot be shown" }).waitFor();
+  await gone.getByText("clip_none").waitFor();
+  await gone.close();
 });
 
 it("says what to do without a session, and for a link that was used", async () => {
@@ -117,6 +166,7 @@ it("says what to do without a session, and for a link that was used", async () =
   const other = await stranger.newPage();
   await other.goto(GIVEN.link); // its code was used above
   await other.getByText("This link is not valid").waitFor();
+  expect(await other.evaluate(() => document.documentElement.scrollHeight)).toBe(800); // nothing to scroll to
   await other.goto(page.url());
   await other.getByText("marey view PROJECT/CLIP --browser").waitFor();
   expect(await faults(other)).toEqual([]);

@@ -229,7 +229,8 @@ it("says that the time is up, and shows other motions when the participant goes 
   await begin(page, GIVEN.codes.hurried);
   // The figures of a trial of one second may be gone before a busy machine could look for them.
   const first = await openedBy(page, () => page.keyboard.press("Space"));
-  await page.getByText("The time was up").waitFor();
+  const told = (await page.getByText("The time was up").boundingBox())!;
+  expect(told.x).toBeGreaterThanOrEqual(16); // not at the edge of the window
   await pictures(page, "late");
   const second = await openedBy(page, () => page.keyboard.press("Space"));
   expect([first.number, second.number]).toEqual([1, 2]);

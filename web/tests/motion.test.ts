@@ -47,6 +47,20 @@ describe.each(INDEX.clips)("the clip %s", (name) => {
     expect(packed.skeleton.feet).toEqual(clip.skeleton.feet);
   });
 
+  it("faces where the server computes it, also without a mapping", () => {
+    const clip = loadCase(name);
+    const unmapped = clipOf(name, decodeMessagePack(bytesOf(`${name}.msgpack`)), new Skeleton(jsonOf<HierarchyDocument>(`${name}.hierarchy.json`)));
+    const expected = floatsOf(`${name}.facing`);
+    for (const actor of [new Actor(clip), new Actor(unmapped)]) {
+      for (let frame = 0; frame < clip.frames; frame += 7) {
+        actor.seek(frame / clip.frameRate);
+        const angle = (actor.heading * Math.PI) / 180;
+        expect(Math.sin(angle)).toBeCloseTo(expected[2 * frame]!, 4);
+        expect(Math.cos(angle)).toBeCloseTo(expected[2 * frame + 1]!, 4);
+      }
+    }
+  });
+
   it("touches the ground in the frames in which the server finds contacts", () => {
     const clip = loadCase(name);
     const expected = bytesOf(`${name}.contacts`);
@@ -100,6 +114,36 @@ describe("a skeleton whose root carries the body through space", () => {
     const skeleton = new Skeleton({ joints }, mapping);
     expect(skeleton.hips).toBe(1);
     expect(shapeBody(skeleton).bones.map((bone) => bone.to)).toEqual([2, 3, 4]);
+  });
+
+  it("has hips in the middle if there is a joint between them and each leg", () => {
+    const legs = ["Left", "Right"].flatMap((side, index) => [
+      { name: `${side}Buttock`, parent: 1, offset: [index === 0 ? 0.05 : -0.05, 0, 0] as [number, number, number] },
+      { name: `${side}Thigh`, parent: 3 + 2 * index, offset: [0, -0.1, 0] as [number, number, number] },
+    ]);
+    const skeleton = new Skeleton({ joints: [...joints.slice(0, 3), ...legs] }, { joints: { left_hip: "LeftThigh", right_hip: "RightThigh" } });
+    expect([skeleton.hips, skeleton.across]).toEqual([1, [4, 6]]);
+    expect(shapeBody(skeleton).bones.map((bone) => bone.to)).toEqual([2, 3, 4, 5, 6]);
+  });
+
+  it("is as high as its bones from foot to head, however the trunk is joined to the legs", () => {
+    const body: HierarchyDocument["joints"] = [
+      { name: "BoneRoot", parent: -1, offset: [0, 0, 0] },
+      { name: "Hip", parent: 0, offset: [0, 1, 0] },
+      { name: "Pelvis", parent: 1, offset: [0, 0, 0] },
+      ...[1, -1].flatMap((side, index) => [
+        { name: `${side === 1 ? "L" : "R"}_Thigh`, parent: 2, offset: [0.1 * side, 0, 0] as [number, number, number] },
+        { name: `${side === 1 ? "L" : "R"}_Foot`, parent: 3 + 2 * index, offset: [0, -0.9, 0] as [number, number, number] },
+      ]),
+      { name: "Waist", parent: 1, offset: [0, 0.2, 0] },
+      { name: "Head", parent: 7, offset: [0, 0.5, 0] },
+    ];
+    const mapping = { joints: { left_hip: "L_Thigh", right_hip: "R_Thigh", left_ankle: "L_Foot", right_ankle: "R_Foot", head: "Head" } };
+    const shape = shapeBody(new Skeleton({ joints: body }, mapping));
+    expect(shape.height).toBeCloseTo(1.7); // 0.1 + 0.9 + 0.2 + 0.5
+    expect(shape.middle).toEqual([2]);
+    const animal = body.map((joint) => (joint.name === "Head" ? { ...joint, offset: [0, 0, 0.5] as [number, number, number] } : joint));
+    expect(shapeBody(new Skeleton({ joints: animal }, mapping)).middle).toEqual([2, 8]);
   });
 
   it("is looked at where its hips are", () => {

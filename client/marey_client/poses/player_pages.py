@@ -110,7 +110,7 @@ def motions_of_samples(model: ModelHandle, revision: int | None, n: int, seed: i
     """Draw samples of a model."""
     drawn = model.sample(n, seed, revision=revision)
     return [
-        shown_motion(model, f"{model.path}, sample {number} of seed {seed}", motion)
+        shown_motion(model, f"sample {number} of {model.path}, seed {seed}", motion)
         for number, motion in enumerate(drawn.motions, 1)
     ]
 

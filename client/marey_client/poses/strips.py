@@ -112,7 +112,9 @@ def _side_by_side(first: ClipOfStrip, second: ClipOfStrip, moments: int, file_ty
             f"{first.clip.path!r} and {second.clip.path!r} have different joints; draw them to a .png file, at "
             f"most {sheets.MAX_MOMENTS} moments"
         )
-    title = f"{second.clip.path} (white), {first.clip.path} (tinted)"
+    paper = room("marey_reports.drawing.paper", FIGURES_EXTRA)
+    white, tinted = (paper.shortened(one.clip.path) for one in (second, first))
+    title = f"white: {white}, tinted: {tinted}"
     pair = sheets.TakePair(title, second.whole(), first.whole())
     data: bytes = sheets.contact_sheet([pair], heading=first.clip.name, moments=moments)
     return data

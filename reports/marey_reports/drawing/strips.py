@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,19 @@ from marey_motion.arrays import Floats, Indices
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_directions, global_positions
-from marey_reports.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET, REFERENCE, TEXT, new_figure, to_svg, write
+from marey_reports.drawing.paper import (
+    COLOURS,
+    HAIRLINE,
+    INK,
+    PAPER,
+    QUIET,
+    REFERENCE,
+    TEXT,
+    new_figure,
+    shortened,
+    to_svg,
+    write,
+)
 from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, StickFigure, body_of, runs_of
 
 if TYPE_CHECKING:
@@ -32,6 +45,8 @@ CAMERA_TILT_RAD = np.radians(10.0)
 
 # In inches.
 MARGIN, HEADER, ABOUT, MOMENT, GAP = 0.10, 0.42, 0.22, 0.40, 0.10
+LABEL_LINE = 0.16
+LABEL_LETTERS, MOST_LABEL_LINES = 26, 4
 RIM_STOPS = 0.05  # before a bone's ends
 FLOOR_SHARE = 0.09  # of a cell's height: the floor's distance from its lower edge
 FILLED = 0.84  # of a cell's height, by the highest point
@@ -256,8 +271,8 @@ def _scale(
 
 def _label_width(rows: Sequence[StripRow]) -> float:
     """Return the width in inches that the labels of the rows need."""
-    longest = max([0, *(max(1.15 * len(row.label), 0.9 * len(row.note)) for row in rows)])
-    return 0.2 + 0.078 * longest
+    lines = [(1.15 * len(line), 0.9 * len(row.note)) for row in rows for line in _lines(row.label)]
+    return 0.2 + 0.078 * max([0, *(max(pair) for pair in lines)])
 
 
 def _draw_legend(axes: Axes, left: float, top: float, legend: Sequence[tuple[str, str]]) -> None:
@@ -270,9 +285,17 @@ def _draw_legend(axes: Axes, left: float, top: float, legend: Sequence[tuple[str
 
 
 def _draw_label(axes: Axes, row: StripRow, middle: float) -> None:
-    write(axes, (0.05, middle + (0.09 if row.note else 0.0)), row.label, fontsize=TEXT, fontweight="bold")
+    lines = _lines(row.label)
+    top = middle + 0.5 * LABEL_LINE * (len(lines) - 1) + (0.09 if row.note else 0.0)
+    for number, line in enumerate(lines):
+        write(axes, (0.05, top - number * LABEL_LINE), line, fontsize=TEXT, fontweight="bold")
     if row.note:
-        write(axes, (0.05, middle - 0.10), row.note, color=QUIET)
+        write(axes, (0.05, top - (len(lines) - 1) * LABEL_LINE - 0.19), row.note, color=QUIET)
+
+
+def _lines(label: str) -> list[str]:
+    """Break a label into lines; a label that is too long even for them loses its middle."""
+    return wrap(shortened(label, MOST_LABEL_LINES * LABEL_LETTERS), LABEL_LETTERS) or [""]
 
 
 class _Look(NamedTuple):

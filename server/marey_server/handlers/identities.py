@@ -45,10 +45,12 @@ from marey_server.store.transaction import Transaction
 BROWSER = "text/html; charset=utf-8"
 _PAGE = Markup(
     """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>Marey: {title}</title>
-<style>body {{ font: 1rem/1.5 sans-serif; margin: 4rem auto; max-width: 40rem; padding: 0 1rem }}
-code {{ background: #eee; color: #000; padding: .5rem; word-break: break-all }}</style></head>
-<body><h1>{title}</h1><p>{text}</p>{code}</body></html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Marey: {title}</title>
+<style>:root {{ color-scheme: light dark }}
+body {{ font: 1rem/1.5 system-ui, sans-serif; margin: 4rem auto; max-width: 40rem; padding: 0 1rem }}
+code {{ display: block; background: #eee; color: #000; padding: .5rem; overflow-wrap: anywhere }}</style></head>
+<body><main><h1>{title}</h1><p>{text}</p>{code}</main></body></html>
 """
 )
 log = logging.getLogger(__name__)

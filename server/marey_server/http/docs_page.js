@@ -65,7 +65,7 @@ async function shown(answer) {
 function addForm(operation) {
   const parameters = fields(operation);
   const body = bodyField(operation);
-  const output = element("pre", { hidden: true });
+  const output = element("pre", { hidden: true, tabIndex: 0 });
   const form = element("form", {}, ...parameters.map((one) => one.label), ...(body ? [body.label] : []));
   form.append(element("button", { textContent: "Send" }), output);
   form.addEventListener("submit", async (event) => {

@@ -38,7 +38,8 @@ def _page(document: Schema) -> Iterator[str]:
     info = document["info"]
     yield "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
     yield f"<title>{escape(info['title'])} API</title><style>{_STYLE}</style>"
-    yield f"<h1>{escape(info['title'])} API</h1><p>Version {escape(info['version'])}. {escape(info['description'])}"
+    yield f"<main><h1>{escape(info['title'])} API</h1>"
+    yield f"<p>Version {escape(info['version'])}. {escape(info['description'])}"
     yield " Programs read <a href='openapi.json'>openapi.json</a>.</p>"
     yield "<div class=token><label>Token for requests sent from this page; reloading the page forgets it"
     yield "<input id=token type=password autocomplete=off placeholder='marey_…'></label></div><nav>"
@@ -52,10 +53,11 @@ def _page(document: Schema) -> Iterator[str]:
     for name, schema in sorted(document["components"]["schemas"].items()):
         yield f"<details id='model-{escape(name)}'><summary><code>{escape(name)}</code> "
         yield f"{escape(_first_line(schema.get('description', '')))}</summary><div>"
-        yield f"<pre>{escape(json.dumps(schema, indent=2, ensure_ascii=False))}</pre></div></details>"
+        shown = escape(json.dumps(schema, indent=2, ensure_ascii=False))
+        yield f"<pre tabindex=0>{shown}</pre></div></details>"  # long ones scroll, also by keys
     yield "<h2 id=problems>Problems</h2><table><tr class=head><th>Status<th>Code<th>Meaning"
     yield from _problems()
-    yield f"</table><script>{_SCRIPT}</script></html>"
+    yield f"</table></main><script>{_SCRIPT}</script></html>"
 
 
 def _operations(document: Schema, tag: str) -> Iterator[str]:

@@ -134,3 +134,16 @@ def test_ghosts_of_pose_rows_are_named_and_keep_their_distance() -> None:
     ghosts = np.concatenate([points_of(one) for one in coloured(figure, REFERENCE)])
     bodies = np.concatenate([points_of(one) for colour in COLOURS[:2] for one in coloured(figure, colour)])
     assert 0.01 < abs(ghosts[:, 0].mean() - bodies[:, 0].mean()) < 0.3
+
+
+@pytest.mark.parametrize("name", ["Müllers sehr langer Gang über die große Brücke, Übung 12 b", "Ü" * 60, "walk " * 60])
+def test_a_long_name_is_broken_into_lines_and_leaves_the_width_to_the_poses(name: str) -> None:
+    clip = generate_gait(1.2, 0.0, 1.0)
+    poses = [replace(clip, poses=clip.poses[frame : frame + 1]) for frame in (0, 30, 59)]
+    figure = draw_pose_rows([PoseRow(name, "revision 1", poses)], ["0", "1", "2"], ["", "", ""])
+    assert figure.get_size_inches()[0] < 3 * POSE_CELL_IN[0] + 3.0
+    assert not cut_off(figure)
+    told = [text.get_text() for text in figure.axes[0].texts]
+    assert "revision 1" in told
+    if len(name) <= 60:
+        assert name.replace(" ", "") in "".join(told).replace(" ", "")

@@ -151,3 +151,9 @@ def test_a_cycle_of_arrows_is_refused() -> None:
 def test_neighbours_stand_beside_each_other() -> None:
     layout = lay_out(6, [(0, 5), (1, 4), (2, 3)])
     assert layout.layers[0] == [{5: 0, 4: 1, 3: 2}[box] for box in layout.layers[1]]
+
+
+def test_aligned_clips_are_named_in_words() -> None:
+    aligned = [revision(f"aligned/{place}", -1, kind=Kind.PROCESSED, job="job_align") for place in range(14)]
+    graph = graph_of(revision("step", 0, kind=Kind.MODEL), *aligned, links=[(1 + place, 0) for place in range(14)])
+    assert "14 aligned clips in aligned" in draw_lineage(graph, "svg").decode()

@@ -14,8 +14,10 @@ def test_a_noun_takes_an_s_unless_there_is_exactly_one(number: int, told: str) -
     assert counted(number, "frame") == told
 
 
-@pytest.mark.parametrize(("noun", "told"), [("trajectory", "2 trajectories"), ("day", "2 days")])
-def test_a_noun_in_y_takes_the_plural_of_its_kind(noun: str, told: str) -> None:
+@pytest.mark.parametrize(
+    ("noun", "told"), [("trajectory", "2 trajectories"), ("day", "2 days"), ("index", "2 indexes")]
+)
+def test_a_noun_in_y_or_x_takes_the_plural_of_its_kind(noun: str, told: str) -> None:
     assert counted(2, noun) == told
 
 

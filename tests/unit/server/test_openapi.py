@@ -78,6 +78,8 @@ def test_lists_that_can_show_some_fields_are_described_so() -> None:
 
 def test_the_page_shows_every_operation_and_asks_nobody_else() -> None:
     page = render_page(DOCUMENT).decode()
+    assert page.count("<main>") == page.count("</main>") == 1
+    assert page.count("<pre tabindex=0>") == len(DOCUMENT["components"]["schemas"])  # they scroll, also by keys
     for path, _, operation in OPERATIONS:
         assert path in page
         assert f"id='{operation['operationId']}'" in page

@@ -32,6 +32,8 @@ export class Skeleton {
   readonly head: number;
   /** Joint at which the body begins; the bones that lead to it only carry the body through space, and are not drawn. */
   readonly hips: number;
+  /** Joints at the left and the right end of the hips, or of another pair of bones that branch off there; null without one. */
+  readonly across: readonly [number, number] | null;
 
   constructor(hierarchy: HierarchyDocument, mapping: MappingDocument | null = null) {
     const joints = hierarchy.joints;
@@ -46,8 +48,8 @@ export class Skeleton {
     this.sides = this.findSides(standard);
     this.feet = this.findFeet(standard);
     this.head = standard.get("head") ?? this.names.findIndex((name) => /head/i.test(name));
-    const leg = standard.get("left_hip") ?? -1;
-    this.hips = leg > 0 ? this.parents[leg]! : this.firstBranching();
+    this.hips = this.findHips(standard);
+    this.across = this.findAcross(standard);
   }
 
   /** The joints above the hips, which are no part of the body. */
@@ -67,6 +69,18 @@ export class Skeleton {
     const lengths = Float64Array.from({ length: this.pointCount }, (_, point) => (point === 0 ? 0 : this.boneLength(point)));
     for (let point = this.pointCount - 1; point > 0; point--) lengths[this.parents[point]!]! += lengths[point]!;
     return lengths;
+  }
+
+  /** Return the joint from which both legs branch off; between it and a leg, some skeletons have another joint. */
+  private findHips(standard: Map<string, number>): number {
+    const legs = ["left_hip", "right_hip"].map((name) => standard.get(name) ?? -1).filter((leg) => leg > 0);
+    const [left, right] = [legs[0], legs.at(-1)];
+    if (left === undefined || right === undefined) return this.firstBranching();
+    const above = new Set<number>();
+    for (let joint = this.parents[left]!; joint >= 0; joint = this.parents[joint]!) above.add(joint);
+    let hips = this.parents[right]!;
+    while (hips > 0 && !above.has(hips)) hips = this.parents[hips]!;
+    return hips;
   }
 
   private firstBranching(): number {
@@ -89,6 +103,15 @@ export class Skeleton {
       sides[point] = known.get(point) ?? named ?? (parent < 0 ? "centre" : sides[parent]!);
     }
     return sides;
+  }
+
+  private findAcross(standard: Map<string, number>): [number, number] | null {
+    const ofSide = (side: Side) => {
+      const mapped = standard.get(`${side}_hip`) ?? -1;
+      return mapped >= 0 ? mapped : this.parents.findIndex((parent, point) => parent === this.hips && this.sides[point] === side);
+    };
+    const [left, right] = [ofSide("left"), ofSide("right")];
+    return left >= 0 && right >= 0 ? [left, right] : null;
   }
 
   private findFeet(standard: Map<string, number>): number[] {

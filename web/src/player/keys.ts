@@ -2,11 +2,13 @@
 
 export type Action =
   | "play" | "back" | "forward" | "back10" | "forward10" | "start" | "end" | "slower" | "faster"
-  | "look" | "layout" | "follow" | "frame" | "camera" | "help";
+  | "look" | "layout" | "follow" | "frame" | "camera" | "turnLeft" | "turnRight" | "nearer" | "farther" | "help";
 
 interface Key {
   action: Action;
   key: string;
+  /** Another key with the same action. */
+  also?: string;
   shift?: boolean;
   shown: string;
   text: string;
@@ -21,10 +23,14 @@ export const KEYS: Key[] = [
   { action: "start", key: "Home", shown: "Home", text: "Go to the start" },
   { action: "end", key: "End", shown: "End", text: "Go to the end" },
   { action: "slower", key: "-", shown: "−", text: "Play slower" },
-  { action: "faster", key: "=", shown: "=", text: "Play faster" },
+  { action: "faster", key: "=", also: "+", shown: "+", text: "Play faster" },
   { action: "look", key: "v", shown: "V", text: "Switch between skeleton and mannequin" },
   { action: "layout", key: "b", shown: "B", text: "Show the clips side by side or overlaid, or show one of two clips" },
-  { action: "camera", key: "c", shown: "C", text: "Camera from the front, the side or the top" },
+  { action: "camera", key: "c", shown: "C", text: "Camera from the front, the left side or the top" },
+  { action: "turnLeft", key: "a", shown: "A", text: "Move the camera around the figure, to the left" },
+  { action: "turnRight", key: "d", shown: "D", text: "Move the camera around the figure, to the right" },
+  { action: "nearer", key: "w", shown: "W", text: "Move the camera nearer" },
+  { action: "farther", key: "s", shown: "S", text: "Move the camera farther away" },
   { action: "frame", key: "f", shown: "F", text: "Bring the figure back into view" },
   { action: "follow", key: "f", shift: true, shown: "Shift F", text: "Start or stop following the figure with the camera" },
   { action: "help", key: "?", shown: "?", text: "Show this help" },
@@ -36,6 +42,6 @@ export function actionOf(event: KeyboardEvent): Action | null {
   const target = event.target as HTMLElement | null;
   const typed = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   if (target?.closest("select, textarea, dialog") || (typed === " " && target?.closest("button, a, summary"))) return null;
-  const shift = event.shiftKey && typed !== "?";
-  return KEYS.find((one) => one.key === typed && (one.shift ?? false) === shift)?.action ?? null;
+  const shift = event.shiftKey && (typed.length > 1 || /[a-z]/.test(typed)); // signs such as ? and = need Shift on some keyboards
+  return KEYS.find((one) => [one.key, one.also].includes(typed) && (one.shift ?? false) === shift)?.action ?? null;
 }

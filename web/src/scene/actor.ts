@@ -11,7 +11,7 @@ export class Actor {
   readonly contacts: Uint8Array[];
   frame = 0;
   private readonly kinematics: Kinematics;
-  /** Place of the hips in the first frame. */
+  /** Place of the middle of the body in the first frame. */
   private readonly start: [number, number];
 
   constructor(readonly clip: Clip) {
@@ -38,6 +38,15 @@ export class Actor {
     return this.clip.skeleton.feet.filter((_, index) => this.contacts[index]![this.frame] === 1);
   }
 
+  /** Direction that the body faces in this frame: degrees about the vertical, 0 for +z, 90 for +x; 0 if it is unknown. */
+  get heading(): number {
+    const { across } = this.clip.skeleton;
+    if (across === null) return 0;
+    const [left, right] = across;
+    const [x, z] = [0, 2].map((axis) => this.positions[3 * left + axis]! - this.positions[3 * right + axis]!) as [number, number];
+    return x === 0 && z === 0 ? 0 : (Math.atan2(-z, x) * 180) / Math.PI;
+  }
+
   /** Return the points of the ground below the hips in all frames, at a height in metres. */
   groundPath(height: number): Float32Array {
     const kinematics = new Kinematics(this.clip);
@@ -50,15 +59,16 @@ export class Actor {
     return path;
   }
 
-  /** Point that a camera looks at: below or above the hips, at half the height of the body. */
+  /** Point that a camera looks at: below or above the middle of the body, at half its height. */
   centre(follows: boolean): [number, number, number] {
     const [x, z] = follows ? this.place() : this.start;
     return [x, 0.52 * this.body.height, z];
   }
 
   private place(): [number, number] {
-    const { hips } = this.clip.skeleton;
-    return [this.positions[3 * hips]!, this.positions[3 * hips + 2]!];
+    const { middle } = this.body;
+    const mean = (axis: number) => middle.reduce((sum, joint) => sum + this.positions[3 * joint + axis]!, 0) / middle.length;
+    return [mean(0), mean(2)];
   }
 }
 

@@ -25,6 +25,8 @@ export interface Body {
   balls: Ball[];
   /** Height of the body at rest, in metres. */
   height: number;
+  /** Joints between which the body is in the middle of a picture: the hips, and the head of a body that walks on four legs. */
+  middle: number[];
 }
 
 const SHORTEST_LIMB = 1e-3;
@@ -59,21 +61,29 @@ export function shapeBody(skeleton: Skeleton): Body {
     .map((limb) => ({ from: limb.to, to: limb.to, radius: 0.82 * limb.radius }));
   for (const hub of hubs(skeleton)) balls.push({ from: hub, to: hub, radius: 0.11 * scale });
   balls.push({ from: top, to: crown < 0 ? top : crown, radius: 0.105 * scale });
-  return { bones, limbs, balls, height };
+  const isLong = ahead(rest, skeleton.hips, top) > Math.abs(rest[3 * top + 1]! - rest[3 * skeleton.hips + 1]!);
+  return { bones, limbs, balls, height, middle: isLong ? [skeleton.hips, top] : [skeleton.hips] };
 }
 
-/** Length of a leg and of the bones from the hips to the head; undefined if feet or head are unknown.
+/** Length of the bones from a foot to the head; undefined if feet or head are unknown.
  *
  * The pose at rest need not stand: in some files, all its bones lie along one axis.
  */
 function uprightHeight(skeleton: Skeleton): number | undefined {
-  const lengthTo = (point: number) => {
+  const { feet, head, parents } = skeleton;
+  if (feet.length === 0 || head <= 0) return undefined;
+  const ofTrunk = new Map<number, number>(); // lengths from the head to each joint above it
+  for (let [joint, length] = [head, 0]; joint >= 0; joint = parents[joint]!) {
+    ofTrunk.set(joint, length);
+    length += skeleton.boneLength(joint);
+  }
+  const lengths = feet.map((foot) => {
     let length = 0;
-    for (; point >= 0 && point !== skeleton.hips; point = skeleton.parents[point]!) length += skeleton.boneLength(point);
-    return length;
-  };
-  const legs = skeleton.feet.map(lengthTo);
-  return legs.length > 0 && skeleton.head > 0 ? Math.max(...legs) + lengthTo(skeleton.head) : undefined;
+    let joint = foot;
+    for (; !ofTrunk.has(joint); joint = parents[joint]!) length += skeleton.boneLength(joint);
+    return length + ofTrunk.get(joint)!;
+  });
+  return Math.max(...lengths);
 }
 
 /** Joints from which at least three bones branch off: pelvis and chest. */
@@ -85,6 +95,11 @@ function hubs(skeleton: Skeleton): number[] {
     if (carried[point]! > 0.06 * total) branches.set(parent, (branches.get(parent) ?? 0) + 1);
   });
   return [...branches].filter(([joint, count]) => joint >= 0 && count >= 3).map(([joint]) => joint);
+}
+
+/** Horizontal distance of two points. */
+function ahead(positions: Float64Array, one: number, other: number): number {
+  return Math.hypot(positions[3 * one]! - positions[3 * other]!, positions[3 * one + 2]! - positions[3 * other + 2]!);
 }
 
 function restPositions(skeleton: Skeleton): Float64Array {

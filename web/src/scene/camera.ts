@@ -1,13 +1,18 @@
-/** Camera that orbits a figure, and its text in addresses: yaw and pitch in degrees, distance in metres. */
+/** Camera that orbits a figure, and its text in addresses: yaw and pitch in degrees, distance in body heights. */
 
-export const NAMED_CAMERAS = { front: [0, 8], side: [90, 8], top: [0, 89] } as const;
-export type CameraName = keyof typeof NAMED_CAMERAS;
+/** Angles in degrees from the direction that the body faces to the camera, and above the ground. */
+const NAMED_CAMERAS = { front: [0, 8], side: [90, 8], top: [0, 89] } as const;
+type CameraName = keyof typeof NAMED_CAMERAS;
+const CAMERA_NAMES = Object.keys(NAMED_CAMERAS) as CameraName[];
 
 const MOST_PITCH = 89;
 const DEGREES_PER_PIXEL = 0.35;
+/** Angle from the direction that a body faces to a camera that sees it from the front left. */
+const FRONT_LEFT = 35;
 
 export class OrbitCamera {
-  yaw = 35;
+  /** Direction from the figure to the camera: degrees about the vertical, 0 for +z. */
+  yaw = FRONT_LEFT;
   pitch = 12;
   /** Distance from the figure in units of its height. */
   distance = 3;
@@ -15,6 +20,8 @@ export class OrbitCamera {
   shift: [number, number, number] = [0, 0, 0];
   /** Whether the camera moves along with the root of the figure. */
   follows = true;
+  /** Name of the view that was chosen; null after a turn. */
+  private named: CameraName | null = null;
 
   /** Read a text such as `35,12,2.6`; other texts change nothing. */
   read(text: string | null): void {
@@ -32,13 +39,23 @@ export class OrbitCamera {
     return `${round(this.yaw, 1)},${round(this.pitch, 1)},${round(this.distance, 2)}${follows}`;
   }
 
-  look(name: CameraName): void {
-    [this.yaw, this.pitch] = NAMED_CAMERAS[name];
+  /** See a body that faces `heading` from its front left. */
+  face(heading: number): void {
+    this.yaw = wrapped(heading + FRONT_LEFT);
+  }
+
+  /** Look from the next of the named views at a body that faces `heading`, in degrees. */
+  lookNext(heading: number): void {
+    this.named = CAMERA_NAMES[(CAMERA_NAMES.indexOf(this.named!) + 1) % CAMERA_NAMES.length]!;
+    const [aside, above] = NAMED_CAMERAS[this.named];
+    [this.yaw, this.pitch] = [wrapped(heading + aside), above];
     this.shift = [0, 0, 0];
   }
 
+  /** Turn by a drag of a pointer, in pixels. */
   turn(dx: number, dy: number): void {
-    this.yaw = (this.yaw - dx * DEGREES_PER_PIXEL) % 360;
+    this.named = null;
+    this.yaw = wrapped(this.yaw - dx * DEGREES_PER_PIXEL);
     this.pitch = clamp(this.pitch + dy * DEGREES_PER_PIXEL, -MOST_PITCH, MOST_PITCH);
   }
 
@@ -72,8 +89,10 @@ export class OrbitCamera {
       const [dx, dy] = [event.clientX - before[0], event.clientY - before[1]];
       const apart = held.size === 2 ? span() : 0;
       held.set(event.pointerId, [event.clientX, event.clientY]);
-      if (held.size === 2) this.zoom(apart / Math.max(span(), 1));
-      else if (event.shiftKey || event.buttons & 6) this.pan(dx, dy, element.clientHeight, metres());
+      if (held.size === 2) {
+        this.zoom(apart / Math.max(span(), 1));
+        this.pan(dx / 2, dy / 2, element.clientHeight, metres()); // the point between two fingers moves half as far
+      } else if (event.shiftKey || event.buttons & 6) this.pan(dx, dy, element.clientHeight, metres());
       else this.turn(dx, dy);
       changed();
     };
@@ -102,4 +121,6 @@ export class OrbitCamera {
 }
 
 const clamp = (value: number, least: number, most: number): number => Math.min(Math.max(value, least), most);
+/** Return an angle in degrees as −180 to 180. */
+const wrapped = (degrees: number): number => degrees - 360 * Math.round(degrees / 360);
 const round = (value: number, digits: number): number => Number(value.toFixed(digits));

@@ -10,6 +10,8 @@ export class SideViewStage implements Stage {
   private actors: Actor[] = [];
   private palette: Palette | null = null;
   private strokes = 0;
+  /** Pixels of the canvas per pixel of the style sheet. */
+  private ratio = 1;
 
   constructor(private readonly canvas: HTMLCanvasElement) {
     const context = canvas.getContext("2d");
@@ -26,8 +28,9 @@ export class SideViewStage implements Stage {
   }
 
   resize(width: number, height: number): void {
-    this.canvas.width = Math.max(width, 1);
-    this.canvas.height = Math.max(height, 1);
+    this.ratio = Math.min(devicePixelRatio, 2);
+    this.canvas.width = Math.max(Math.round(width * this.ratio), 1);
+    this.canvas.height = Math.max(Math.round(height * this.ratio), 1);
   }
 
   draw(cells: Cell[], camera: OrbitCamera): void {
@@ -62,16 +65,17 @@ export class SideViewStage implements Stage {
       return [scale * across, -scale * (y - cy - camera.shift[1])];
     };
     const ground = scale * (cy + camera.shift[1]);
-    this.line(palette.grid, 1, [-wide, ground], [wide, ground]);
+    this.line(palette.grid, this.ratio, [-wide, ground], [wide, ground]);
     context.lineCap = "round";
     for (const limb of actor.body.bones) {
       const side = skeleton.sides[limb.to];
       const colour = side === "left" ? palette.left : side === "right" ? palette.right : palette.bone;
-      this.line(colour, Math.max(2, 0.5 * scale * limb.radius), place(limb.from), place(limb.to));
+      this.line(colour, Math.max(2 * this.ratio, 0.5 * scale * limb.radius), place(limb.from), place(limb.to));
     }
     for (const foot of actor.standing()) {
       const [x] = place(foot);
-      this.line(skeleton.sides[foot] === "left" ? palette.left : palette.right, 4, [x - 9, ground + 3], [x + 9, ground + 3]);
+      const [half, below] = [9 * this.ratio, ground + 3 * this.ratio];
+      this.line(skeleton.sides[foot] === "left" ? palette.left : palette.right, 4 * this.ratio, [x - half, below], [x + half, below]);
     }
   }
 

@@ -2,7 +2,7 @@
  *
  * Pages cannot read the cookie, so they note in the storage of the browser until when they are signed in; it is no secret.
  */
-import { Api } from "./api";
+import { Api, ApiError } from "./api";
 
 const CODE = /^#(mareyview_[a-z0-9]+_[a-z0-9]+)$/;
 const NOTE = "marey-session-";
@@ -19,6 +19,12 @@ export async function signIn(): Promise<void> {
 /** Whether this browser has a session in a project, which may have been ended elsewhere. */
 export function isSignedIn(project: string): boolean {
   return Date.parse(localStorage.getItem(NOTE + project) ?? "") > Date.now();
+}
+
+/** Whether a page failed because this browser may not read the project; for strangers, the server has no projects. */
+export function needsLink(failure: Error, project: string | null): boolean {
+  if (!(failure instanceof ApiError)) return false;
+  return failure.status === 401 || (failure.status === 404 && !(project !== null && isSignedIn(project)));
 }
 
 /** End the session in a project on the server, which also deletes the cookie. */

@@ -14,6 +14,7 @@ from marey_client.cli.terminal.output import print_json, print_message
 from marey_client.progress import progress
 from marey_schemas.datasets.layouts import LAYOUTS
 from marey_schemas.formats import DEFAULT_FORMAT, WHOLE_FORMATS
+from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
@@ -100,5 +101,5 @@ def _print_notes(made: ExportedVersion) -> None:
     if len(made.renamed) > RENAMED_SHOWN:
         print_message(f"and {len(made.renamed) - RENAMED_SHOWN} more; the sidecar names the file of each clip")
     if made.left_out:
-        kinds = ", ".join(counted(count, kind) for kind, count in sorted(made.left_out.items()))
+        kinds = ", ".join(counted(count, Kind(kind).noun) for kind, count in sorted(made.left_out.items()))
         print_message(f"left out, because only clips are exported: {kinds}; an archive contains everything")

@@ -165,7 +165,7 @@ def _explain(
         print_json(answers[0] if len(answers) == 1 else answers)
     else:
         for kind, explained in zip(wanted, answers, strict=True):
-            print_message(f"{explained.selected:,} of {counted(explained.items, str(kind))}")
+            print_message(f"{explained.selected:,} of {counted(explained.items, kind.noun)}")
             rows = [(one.condition, one.hides, one.alone) for one in explained.conditions]
             print_table(("condition", "hides", "alone"), rows, right=["hides", "alone"])
 
