@@ -28,6 +28,11 @@ class Kind(StrEnum):
         """The name of the kind in URLs, for example `clips`."""
         return _PLURALS.get(self.value, f"{self.value}s")
 
+    @property
+    def title(self) -> str:
+        """The name of the kind in sentences for people, for example "aligned clip"."""
+        return "aligned clip" if self is Kind.PROCESSED else self.value
+
     @classmethod
     def from_plural(cls, plural: str) -> "Kind":
         """Return the kind with the given name in URLs. Raises `KeyError`."""
