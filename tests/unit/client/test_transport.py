@@ -174,7 +174,7 @@ def test_errors_survive_the_way_from_one_process_to_another(script: ScriptedServ
 
 def test_an_answer_of_something_else_is_no_traceback(script: ScriptedServer) -> None:
     script.answers = [httpx.Response(200, text="<html>hello</html>")]
-    with pytest.raises(errors.UnexpectedAnswer, match="answered 200 OK .* not an answer of a Marey server"):
+    with pytest.raises(errors.UnexpectedAnswer, match=r"answered 200 OK .* not an answer of a Marey server"):
         script.marey().project("lab").read()
 
 
