@@ -21,9 +21,9 @@ def train(lab: ProjectHandle, seed: int) -> ModelHandle:
     return lab.model(lab.train_model("aligned", name="walk", into="shared", seed=seed, **QUICK))
 
 
-def documents(model: ModelHandle) -> dict[str, str]:
+def documents(lab: ProjectHandle, model: ModelHandle) -> dict[str, str]:
     """Return the digest of each part of the newest revision of a model."""
-    return {name: part.document for name, part in model.read().parts.items()}
+    return {name: part.document for name, part in lab.models.get(model.id).item.parts.items()}
 
 
 def test_of_two_models_one_is_chosen_with_everything_made_from_it(lab: ProjectHandle, run: CommandLine) -> None:
@@ -35,15 +35,16 @@ def test_of_two_models_one_is_chosen_with_everything_made_from_it(lab: ProjectHa
     gaits.commit("trained again")
     run("dataset", "checkout", "lab/shared@trial")
     train(lab, seed=3)
-    theirs = documents(model)
+    theirs = documents(lab, model)
     drawn = model.sample(2, seed=4).latents
     gaits.commit("trained in another way", branch="trial")
     run("dataset", "checkout", "lab/shared")
-    assert documents(model)["model"] != theirs["model"]
+    assert documents(lab, model)["model"] != theirs["model"]
+    assert documents(lab, model)["report"] != theirs["report"]
 
     refused = run("dataset", "merge", "lab/shared@trial", status=1)
     assert "walk:model" in refused.stdout + refused.stderr
     run("dataset", "merge", "lab/shared@trial", "--theirs", "walk:model")
     run("dataset", "checkout", "lab/shared")
-    assert documents(model) == theirs
+    assert documents(lab, model) == theirs
     assert np.array_equal(model.sample(2, seed=4).latents, drawn)
