@@ -98,7 +98,8 @@ def _missing(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -
     if address.is_folder:
         what, kinds = "no folder", ()
     elif (other := find_item(marey, address, [one for one in Kind if one not in kinds])) is not None:
-        return WrongUsage(f"there is {what} at {address}, but a {other.item.kind.title}; `marey show {address}` shows it")
+        kind = other.item.kind.title
+        return WrongUsage(f"there is {what} at {address}, but a {kind}; `marey show {address}` shows it")
     return WrongUsage(f"there is {what} at {address}; {advice(marey.project(address.project), address.path, kinds)}")
 
 
