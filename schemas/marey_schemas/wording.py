@@ -43,7 +43,7 @@ def suggestion(name: str, known: Collection[str], what: str) -> str:
     `what` are the known names, such as "kinds".
     """
     near = nearest(name, known)
-    return f"did you mean {near!r}?" if near else f"the {what} are {', '.join(known)}"
+    return f"did you mean '{near}'?" if near else f"the {what} are {', '.join(known)}"
 
 
 def plain_reason(fault: Mapping[str, Any], model: type[BaseModel] | None = None) -> str:

@@ -68,7 +68,7 @@ MISTAKES: tuple[tuple[str, int, str], ...] = (
     ("ls lab --kind clps", 2, "did you mean 'clip'?"),
     ("job submit lab retraget", 2, "did you mean 'retarget'?"),
     ("edit commands smoth", 2, "did you mean 'smooth'?"),
-    ("script register lab s --file s.json", 2, "comit: there is no field of this name; did you mean 'commit'?"),
+    ("script register lab s --file s.json", 2, "comit: there is no field of this name"),
 )
 """Commands after `marey`, each with its exit status and a part of the answer."""
 
