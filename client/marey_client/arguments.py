@@ -1,24 +1,28 @@
-"""Validation of arguments: an invalid value raises `BadArgument`, which names the argument."""
+"""Arguments of functions: validation by models, and arguments that accept one value or several."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from marey_client.errors import BadArgument
-from marey_schemas.wording import plain_reason
+from marey_schemas.wording import first_reason
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
 def checked(model: type[Model], values: Mapping[str, Any] | None = None, /, **more: Any) -> Model:
     """Return a model with the given field values. Raises `BadArgument`, which names the first invalid field."""
+    given = {**(values or {}), **more}
     try:
-        return model.model_validate({**(values or {}), **more})
+        return model.model_validate(given)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(step) for step in first["loc"])
-        text = plain_reason(first["msg"])
-        raise BadArgument(f"{where}: {text}" if where else text) from error
+        raise BadArgument(first_reason(error, model, given)) from error
+
+
+def several(given: str | Path | Mapping[str, Any] | BaseModel | Iterable[Any]) -> tuple[Any, ...]:
+    """Return one value or several as a tuple; a text, a path, a document or a model is one value."""
+    return (given,) if isinstance(given, (str, Path, Mapping, BaseModel)) else tuple(given)

@@ -11,9 +11,9 @@ from typing import BinaryIO
 
 import httpx
 
+from marey_client.arguments import several
 from marey_client.downloads import saved_atomically
 from marey_client.errors import BlobTooLarge, Conflict, DigestMismatch, FileChanged, Unreachable
-from marey_client.one_or_several import several
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.encoding.digests import digest_of, digest_of_file, digest_of_hash
 from marey_schemas.formats import OCTETS

@@ -173,8 +173,11 @@ def require_address(url: str) -> None:
 def as_token(text: str) -> str:
     """Return `text` without leading and trailing white space. Raises `BadToken`, whose message omits the text."""
     token = text.strip()
-    if not token or not token.isascii() or not token.isprintable() or " " in token:
-        raise BadToken("the text given is not a token: a token is one word of letters, digits and _")
+    if not token or not token.isascii() or not token.isprintable() or set(token) & set(" \"'<>"):
+        raise BadToken(
+            "the text given is not a token: a token is one word of letters, digits and _, without quotes, and without "
+            "the word Bearer before it"
+        )
     return token
 
 

@@ -89,6 +89,10 @@ class CannotExport(MareyError):
     """The version of a dataset, or a clip in it, cannot be exported in the chosen layout."""
 
 
+class NotReplaced(MareyError):
+    """A file that would be replaced exists, and is of another kind than the new file."""
+
+
 class FolderNotEmpty(MareyError):
     """The folder to write exists and is not empty, or is a file."""
 

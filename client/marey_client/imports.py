@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 from pydantic import TypeAdapter, ValidationError
 
+from marey_client.arguments import several
 from marey_client.asynchronous.interruption import CallPool
 from marey_client.blobs import Blobs
 from marey_client.errors import BadFileName, NothingToUpload, SameName
 from marey_client.jobs import Jobs
-from marey_client.one_or_several import several
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.encoding.digests import digest_of_file
 from marey_schemas.formats import IMPORTED_ENDINGS, LengthUnit

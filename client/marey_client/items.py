@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, Unpack
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, several
 from marey_client.downloads import TakenPaths, download
 from marey_client.errors import NoSuchPath, NotFound
 from marey_client.keywords.asking import DifferenceKeywords, LineageKeywords
 from marey_client.listing.paths import missing_path, require_folder
 from marey_client.listing.tables import summary_table
-from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model, sends_nothing
 from marey_schemas.documents.differences import Difference, DifferenceRequest

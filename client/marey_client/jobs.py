@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from marey_client.asynchronous.interruption import pause, waiting
-from marey_client.errors import JobUnsuccessful, WaitedTooLong
+from marey_client.errors import BadArgument, JobUnsuccessful, WaitedTooLong
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport
 from marey_schemas.base import Request
@@ -54,10 +54,10 @@ class Jobs:
     def get(self, job_id: str, *, wait_s: float = 0.0) -> Job:
         """Wait up to `wait_s` seconds for the end of a job, and return its current state."""
         if wait_s <= 0:
-            return self.transport.get(Job, f"/jobs/{job_id}")
+            return self.transport.get(Job, _address(job_id))
         preferred = {"Prefer": f"wait={max(1, round(min(wait_s, LONGEST_WAIT_S)))}"}
         with waiting():
-            return self.transport.get(Job, f"/jobs/{job_id}", headers=preferred)
+            return self.transport.get(Job, _address(job_id), headers=preferred)
 
     def wait(
         self,
@@ -92,26 +92,26 @@ class Jobs:
 
     def cancel(self, job_id: str) -> Job:
         """Ask a job to stop; a queued job is cancelled at once."""
-        return self.transport.post(Job, f"/jobs/{job_id}/cancel")
+        return self.transport.post(Job, f"{_address(job_id)}/cancel")
 
     def retry(self, job_id: str) -> Job:
         """Submit a failed or cancelled job again; return the new job."""
-        return self.transport.post(Job, f"/jobs/{job_id}/retry")
+        return self.transport.post(Job, f"{_address(job_id)}/retry")
 
     def attempts(self, job_id: str) -> Iterator[Attempt]:
         """List the attempts of a job."""
-        return pages(self.transport, Attempt, f"/jobs/{job_id}/attempts")
+        return pages(self.transport, Attempt, f"{_address(job_id)}/attempts")
 
     def outputs(self, job_id: str) -> Iterator[JobOutput]:
         """List the revisions that a job created."""
-        return pages(self.transport, JobOutput, f"/jobs/{job_id}/outputs")
+        return pages(self.transport, JobOutput, f"{_address(job_id)}/outputs")
 
     def log(self, job_id: str, *, follow: bool = False) -> Iterator[bytes]:
         """Yield the log of the job's attempts, piece by piece; with `follow`, continue until the job has ended."""
         offset = 0
         while True:
             response = self.transport.send(
-                "GET", f"/jobs/{job_id}/log", params={"offset": offset}, headers={"Accept": "text/plain"}
+                "GET", f"{_address(job_id)}/log", params={"offset": offset}, headers={"Accept": "text/plain"}
             )
             offset = int(response.headers["Log-Offset"])
             if response.content:
@@ -127,3 +127,10 @@ class Jobs:
         if job.failure is None:
             raise JobUnsuccessful(f"job {job.id} was cancelled", job)
         raise JobUnsuccessful(f"job {job.id} failed ({job.failure.code}): {job.failure.detail}", job)
+
+
+def _address(job_id: str) -> str:
+    """Return the path of a job. Raises `BadArgument` for a text that cannot be the id of a job, such as a path."""
+    if not job_id or "/" in job_id:
+        raise BadArgument(f"job: {job_id!r} is not the id of a job; `marey job ls PROJECT` lists the ids")
+    return f"/jobs/{job_id}"

@@ -14,6 +14,7 @@ from marey_client.access import Tokens, Users
 from marey_client.audit import AuditConditions, read_audit
 from marey_client.blobs import Blobs
 from marey_client.credentials import TokenFile, resolve
+from marey_client.errors import BadArgument
 from marey_client.jobs import Jobs
 from marey_client.paging import pages
 from marey_client.project import ProjectHandle
@@ -105,7 +106,12 @@ class Marey:
 
     @sends_nothing
     def project(self, name: str) -> ProjectHandle:
-        """Return a project by its name, without a request."""
+        """Return a project by its name, without a request. Raises `BadArgument` for the path of a folder."""
+        known, slash, path = name.partition("/")
+        if slash:
+            raise BadArgument(f"project: {name!r} is a path; the project is {known!r}, and {path!r} a path in it")
+        if name in ("", ".", ".."):
+            raise BadArgument(f"project: {name!r} is not the name of a project")
         return ProjectHandle(self.transport, name)
 
     def projects(self) -> Iterator[Project]:

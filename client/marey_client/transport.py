@@ -22,10 +22,12 @@ from marey_client.credentials import BearerToken, TokenFile, require_address, re
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
 from marey_client.tracing import TracedRequest, calling
+from marey_client.unanswered import explain_silence, media_type_of, not_of_marey, require_marey, server_of
 from marey_schemas.address import API
 from marey_schemas.encoding.codecs import JSON, CodecError, decode_tree, encode_tree
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM
 from marey_schemas.problems import Problem
+from marey_schemas.wording import first_reason
 
 Model = TypeVar("Model", bound=BaseModel)
 T = TypeVar("T")
@@ -203,6 +205,7 @@ class Transport:
             )
             call.note_answer(response.status_code)
             raise_for_problem(response)
+            require_marey(response)
             return response
 
         return self.repeat(once, repeatable=repeatable, what=f"{method} {path}")
@@ -226,7 +229,7 @@ class Transport:
                 failure: Exception = error
                 again, wait_s = error.problem.status in BUSY_STATUSES, error.retry_after_s
             except httpx.TransportError as error:
-                failure = Unreachable(f"{self.url} does not answer: {_sentence(error)}")
+                failure = Unreachable(f"{self.url} does not answer: {explain_silence(self.url, error)}")
                 failure.__cause__ = error
                 again, wait_s = repeatable or isinstance(error, NEVER_ARRIVED), None
             delay_s = self.retries.delay_s(tried, wait_s)
@@ -345,18 +348,19 @@ def read_model(answer: type[Model], response: httpx.Response) -> Model:
     try:
         return answer.model_validate_json(response.content)
     except ValidationError as error:
+        if media_type_of(response) not in ("", JSON):
+            raise UnexpectedAnswer(not_of_marey(response)) from error
         raise UnexpectedAnswer(
-            f"{response.request.method} {response.request.url.path}: the server's answer is not a valid "
-            f"{answer.__name__} ({error.error_count()} fields are wrong); the client may be older than the "
-            "server: update the client"
+            f"{response.request.method} {response.request.url.path}: this client cannot read the server's answer "
+            f"({first_reason(error, answer)}); update the older of the two: `marey --version` shows the version of the "
+            "client"
         ) from error
 
 
 def read_tree(response: httpx.Response) -> Any:
     """Return the body of `response` as a tree with numpy arrays."""
-    media_type = response.headers.get("Content-Type", "").partition(";")[0].strip()
     try:
-        return decode_tree(response.content, media_type, max_bytes=MAX_ANSWER_BYTES)
+        return decode_tree(response.content, media_type_of(response), max_bytes=MAX_ANSWER_BYTES)
     except CodecError as error:
         raise UnexpectedAnswer(f"{response.request.url.path}: {error}") from error
 
@@ -365,11 +369,10 @@ def raise_for_problem(response: httpx.Response) -> None:
     """Raise an error if the status of an answer is 400 or higher."""
     if response.status_code < 400:
         return
-    server = str(response.request.url.copy_with(raw_path=b"/"))
     circumstances: dict[str, Any] = {
         "retry_after_s": retry_after_s(response),
         "anonymous": "Authorization" not in response.request.headers,
-        "server": server.rstrip("/"),
+        "server": server_of(response),
     }
     if response.headers.get("Content-Type", "").startswith(PROBLEM) and response.content:
         with suppress(ValidationError):  # others than Marey answer with problems, too
@@ -378,9 +381,8 @@ def raise_for_problem(response: httpx.Response) -> None:
         type="about:blank",
         title=response.reason_phrase,
         status=response.status_code,
-        detail=f"{server} answered {response.status_code} "
-        f"{response.reason_phrase}, which is not an answer of a Marey server; check the address of the server",
-        instance=response.headers.get("X-Request-Id", "unknown"),
+        detail=not_of_marey(response),
+        instance=response.headers.get("X-Request-Id", ""),
         code=f"http-{response.status_code}",
     )
     raise error_of(problem, **circumstances)
@@ -395,7 +397,3 @@ def _present(params: Params | None) -> dict[str, str] | None:
         for name, value in params.items()
         if value is not None
     }
-
-
-def _sentence(error: httpx.TransportError) -> str:
-    return str(error) or ("no answer in time" if isinstance(error, httpx.TimeoutException) else type(error).__name__)

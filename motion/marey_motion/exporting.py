@@ -21,6 +21,7 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.formats import DEFAULT_UNIT, format_named
 from marey_schemas.item_files import ItemToExport
 from marey_schemas.options.exporting import MotionFileOptions
+from marey_schemas.wording import first_reason
 
 _CHANNELS: TypeAdapter[tuple[tuple[str, ...], ...]] = TypeAdapter(tuple[tuple[str, ...], ...])
 
@@ -108,7 +109,7 @@ def write_motion_file(
         if time == "source":
             clip = restored_clip(clip, AlignmentInfo.model_validate(source.parts["info"]).model_dump())
     except ValidationError as error:
-        raise MotionError(str(error), code="bad-document") from error
+        raise MotionError(first_reason(error), code="bad-document") from error
     return write_clip_file(
         clip, options.format, unit=options.unit, info=source.parts.get("info"), fold_positions=options.fold_positions
     )

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from pydantic import Field, SecretStr, StringConstraints
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.names import ProjectName, UserName
-from marey_schemas.sizes import DAY_S, LOGIN_DAYS, LONGEST_LOGIN_DAYS
+from marey_schemas.names import ProjectName, UserName, form
+from marey_schemas.sizes import DAY_S, LOGIN_DAYS, LONGEST_LOGIN_DAYS, LONGEST_TOKEN_DAYS
 
 MOST_RUNNING = 1_000_000
 """Greatest value of the limit of a project's running jobs."""
@@ -51,7 +51,11 @@ class EndTokens(StrEnum):
 DisplayName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 Password = Annotated[SecretStr, Field(min_length=10, max_length=1024)]
 LoginSeconds = Annotated[int, Field(ge=60, le=LONGEST_LOGIN_DAYS * DAY_S)]
-ScopeText = Annotated[str, StringConstraints(pattern=rf"^(?:{'|'.join(Scope)})(?:!project=[a-z0-9_-]{{1,64}})?$")]
+_SCOPE = form(
+    rf"^(?:{'|'.join(Scope)})(?:!project=[a-z0-9_-]{{1,64}})?$",
+    f"be one of the scopes {', '.join(Scope)}, alone or with a project, as in write!project=walk",
+)
+ScopeText = Annotated[str, StringConstraints(pattern=_SCOPE)]
 """Scope of a token, optionally limited to one project, as in `write!project=walk`."""
 
 
@@ -122,7 +126,7 @@ class TokenCreate(Request):
     expires_in_s: int | None = Field(
         90 * DAY_S,
         ge=60,
-        le=10 * 365 * DAY_S,
+        le=LONGEST_TOKEN_DAYS * DAY_S,
         description="Seconds until the token ends; null: it never ends. A token cannot end later than the token that "
         "creates it. If absent, the token ends after 90 days, or when the token that creates it ends, whichever is "
         "sooner.",
@@ -139,7 +143,7 @@ class TokenRotation(Request):
     """Request to replace the token that authenticates this request; the new token has the same rights and expiry."""
 
     rotation_id: str = Field(
-        pattern=r"^[A-Za-z0-9_-]{32,64}$",
+        pattern=form(r"^[A-Za-z0-9_-]{32,64}$", "have 32 to 64 letters, digits, - and _"),
         description="Random text, for example 32 hexadecimal digits. A repeated request with the same `rotation_id` "
         "gets the same new token. Keep this text secret until you have the answer.",
     )

@@ -7,6 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Request
+from marey_schemas.names import form
 
 CONSENT_EXPIRED = "consent-expired"
 """Code of errors, and of refusals in jobs, for clips that are not exported because their consent has ended."""
@@ -17,7 +18,10 @@ CONSENT_REMEDY = (
 )
 
 ConsentReason = Annotated[
-    str, StringConstraints(min_length=1, max_length=500, pattern=r"^[^\x00-\x1f\x7f]*\S[^\x00-\x1f\x7f]*$")
+    str,
+    StringConstraints(
+        min_length=1, max_length=500, pattern=form(r"^[^\x00-\x1f\x7f]*\S[^\x00-\x1f\x7f]*$", "be a line with words")
+    ),
 ]
 """Reason for an export after the end of the consent: one line of text."""
 

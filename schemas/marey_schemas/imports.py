@@ -9,10 +9,10 @@ from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents.clips import Check
-from marey_schemas.names import Digest
+from marey_schemas.names import LINE, Digest
 from marey_schemas.options.imports import ImportOptions
 
-FileName = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f\x7f]+$")]
+FileName = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=LINE)]
 """Name of a file; folders in the name become collections below the target collection."""
 
 

@@ -5,39 +5,50 @@ from typing import Annotated
 
 from pydantic import StringConstraints
 
-SLUG = r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$"
-"""Pattern of names that are parts of URLs."""
-_USER = r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$"
-_NAME = r"^[^/\x00-\x1f\x7f]+$"
-_PATH = r"^(?:[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*)?$"
-_TAG = r"^[^,\x00-\x1f\x7f]+$"
-DIGEST_PATTERN = r"^sha256:[0-9a-f]{64}$"
-REF = r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,126}[A-Za-z0-9])?$"
-"""Pattern of names of branches and tags."""
+FORMS: dict[str, str] = {}
+"""Requirements by pattern, in words, for messages to people; each continues a sentence after "must"."""
+
+
+def form(pattern: str, words: str) -> str:
+    """Return `pattern`, after `words` have been noted in `FORMS` as its explanation for people."""
+    FORMS[pattern] = words
+    return pattern
+
 
 _SLUG_WORDS = "have at most 64 lower-case letters, digits, {signs}, and begin and end with a letter or a digit"
-FORMS = {
-    SLUG: _SLUG_WORDS.format(signs="- and _"),
-    _USER: _SLUG_WORDS.format(signs="dots, - and _"),
-    _NAME: "contain no slash and no control characters, such as line breaks, and not be empty",
-    _PATH: "be names joined by single slashes, without a slash at its beginning or end",
-    _TAG: "contain no comma and no control characters, such as line breaks, and not be empty",
-    DIGEST_PATTERN: "be sha256: followed by 64 hexadecimal digits in lower case",
-    REF: "have at most 128 letters, digits, dots, - and _, and begin and end with a letter or a digit",
-}
-"""Requirements by pattern, in words, for messages to people; each continues a sentence after "must"."""
+_NO_CONTROLS = "no control characters, such as line breaks, and not be empty"
+_ONE_LINE = f"contain {_NO_CONTROLS}"
+SLUG = form(r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$", _SLUG_WORDS.format(signs="- and _"))
+"""Pattern of names that are parts of URLs."""
+USER = form(r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$", _SLUG_WORDS.format(signs="dots, - and _"))
+_NAME = form(r"^[^/\x00-\x1f\x7f]+$", f"contain no slash and {_NO_CONTROLS}")
+_PATH = form(
+    r"^(?:[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*)?$",
+    "be names joined by single slashes, without a slash at its beginning or end",
+)
+_TAG = form(r"^[^,\x00-\x1f\x7f]+$", f"contain no comma and {_NO_CONTROLS}")
+_SUFFIX = form(r"^[^/\x00-\x1f\x7f]*$", "contain no slash and no control characters, such as line breaks")
+_SHOWN = form(r"^[^\x00-\x1f\x7f-\x9f]+$", _ONE_LINE)
+LINE = form(r"^[^\x00-\x1f\x7f]+$", _ONE_LINE)
+"""Pattern of one line of text."""
+DIGEST_PATTERN = form(r"^sha256:[0-9a-f]{64}$", "be sha256: followed by 64 hexadecimal digits in lower case")
+REF = form(
+    r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,126}[A-Za-z0-9])?$",
+    "have at most 128 letters, digits, dots, - and _, and begin and end with a letter or a digit",
+)
+"""Pattern of names of branches and tags."""
 
 ProjectName = Annotated[str, StringConstraints(pattern=SLUG)]
 """Name of a project: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
 
-UserName = Annotated[str, StringConstraints(pattern=_USER)]
+UserName = Annotated[str, StringConstraints(pattern=USER)]
 
 MAX_NAME_LENGTH = 255
 
 ItemName = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME_LENGTH, pattern=_NAME)]
 """Name of an item: any printable text without a slash."""
 
-NameSuffix = Annotated[str, StringConstraints(max_length=64, pattern=r"^[^/\x00-\x1f\x7f]*$")]
+NameSuffix = Annotated[str, StringConstraints(max_length=64, pattern=_SUFFIX)]
 """Text that can be appended to a name."""
 
 CollectionPath = Annotated[str, StringConstraints(max_length=1024, pattern=_PATH)]
@@ -51,7 +62,7 @@ MOST_TAGS = 64
 Digest = Annotated[str, StringConstraints(pattern=DIGEST_PATTERN)]
 """Digest of bytes: `sha256:` and 64 hexadecimal digits."""
 
-ShownText = Annotated[str, StringConstraints(min_length=1, pattern=r"^[^\x00-\x1f\x7f-\x9f]+$")]
+ShownText = Annotated[str, StringConstraints(min_length=1, pattern=_SHOWN)]
 """Text of a program that is shown to people. It contains no control characters, which could change a terminal."""
 
 PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]

@@ -7,7 +7,7 @@ from pydantic import Field, SecretStr, StringConstraints
 
 from marey_schemas.access import LoginSeconds
 from marey_schemas.base import Answer, Request
-from marey_schemas.names import ProjectName
+from marey_schemas.names import ProjectName, form
 from marey_schemas.sizes import DAY_S, LOGIN_DAYS
 
 VERIFIER_PATTERN = r"^[A-Za-z0-9_-]{43,128}$"
@@ -26,7 +26,9 @@ PLAYER_PATH = "/pages/player"
 STUDY_PATH = "/studies"
 """Path, below the address of the server, of the page for the people who carry out a study."""
 
-Subject = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[\x20-\x7e]+$")]
+Subject = Annotated[
+    str, StringConstraints(min_length=1, max_length=255, pattern=form(r"^[\x20-\x7e]+$", "have only ASCII characters"))
+]
 """Id of a person at an identity provider: at most 255 ASCII characters (OpenID Connect Core, section 2)."""
 
 
@@ -34,7 +36,7 @@ class BrowserSignInCreate(Request):
     """Request of a program to sign in its user with the identity provider, in a browser."""
 
     challenge: str = Field(
-        pattern=r"^[0-9a-f]{64}$",
+        pattern=form(r"^[0-9a-f]{64}$", "be 64 hexadecimal digits in lower case"),
         description="SHA-256, in hexadecimal digits, of a random secret that the program keeps, the *verifier*.",
     )
     port: int | None = Field(
@@ -72,7 +74,7 @@ class IdentityLink(Request):
     issuer: str | None = Field(
         None,
         max_length=512,
-        pattern=r"^https?://[\x21-\x7e]+$",
+        pattern=form(r"^https?://[\x21-\x7e]+$", "be an address, beginning with https:// or http://"),
         description="Address of the identity provider; null: the provider in the server's settings.",
     )
 

@@ -49,7 +49,8 @@ from marey_server.process.housekeeping import keeping_house
 from marey_server.process.notices import note_ready, note_stopping
 from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Services
-from marey_server.process.settings import Settings, misspelt_variables
+from marey_server.process.setting_faults import misspelt_variables
+from marey_server.process.settings import Settings
 from marey_server.store import users
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs, DirectoryBlobs
 from marey_server.store.database.connections import Database

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import asyncio
 import os
-import re
 import sqlite3
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -21,12 +20,14 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
+from pydantic_settings.exceptions import SettingsError
 
 from marey_schemas.address import SETTINGS_FILE
 from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.log_lines import usual_form
-from marey_schemas.wording import counted, plain_reason
-from marey_server.process.settings import PREFIX, Settings
+from marey_schemas.wording import counted
+from marey_server.process.setting_faults import explain_faults, explain_variable
+from marey_server.process.settings import Settings
 
 PROGRESS_EVERY_S = 5.0
 
@@ -106,26 +107,13 @@ def read_settings(**given: Any) -> Settings:
     try:
         return Settings(**given)
     except ValidationError as error:
-        wrong = "; ".join(f"{_setting_at(each['loc'], given)}: {plain_reason(each['msg'])}" for each in error.errors())
-        raise CommandFailed(f"invalid setting: {wrong}") from None
+        raise CommandFailed(f"invalid setting: {explain_faults(error, given)}") from None
+    except SettingsError as error:  # of a variable for a list or an object
+        raise CommandFailed(f"invalid setting: {explain_variable(error)}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CommandFailed(f"{SETTINGS_FILE} cannot be read as TOML: {error}") from None
     except OSError as error:
         raise CommandFailed(f"{error.filename or SETTINGS_FILE} cannot be read: {error.strerror}") from None
-
-
-def _setting_at(steps: Sequence[int | str], given: Mapping[str, Any]) -> str:
-    """Return the name of a setting; if the settings file sets it, the text begins with the file and the line."""
-    name, whole = str(steps[0]) if steps else "", ".".join(map(str, steps))
-    if given.get(name) is not None or f"{PREFIX}{name}".upper() in map(str.upper, os.environ):
-        return whole
-    try:
-        lines = Path(SETTINGS_FILE).read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return whole
-    sets = re.compile(rf"\s*\[*\s*[\"']?{re.escape(name)}[\"']?\s*[=.\]]")
-    number = next((number for number, line in enumerate(lines, 1) if sets.match(line)), None)
-    return whole if number is None else f"{SETTINGS_FILE}, line {number}: {whole}"
 
 
 def upgrade(*, while_serving: bool = False, finish: bool = False, **settings: Any) -> None:

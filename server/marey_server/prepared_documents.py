@@ -132,7 +132,7 @@ def _check(tree: Any, schema: str | None) -> str:
     try:
         checked = model.model_validate(tree)
     except ValidationError as error:
-        errors = field_errors(error, tree)
+        errors = field_errors(error, model, tree)
         raise InvalidProblem(
             f"The document is not a valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
         ) from error

@@ -73,5 +73,7 @@ class TestLocalLauncher(LauncherContract):
 
 
 def test_options_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(LauncherUnusable, match="options of the launcher local: partition: Extra inputs"):
+    with pytest.raises(
+        LauncherUnusable, match="options of the launcher local: partition: there is no field of this name"
+    ):
         LocalLauncher(LaunchContext("crew", "http://x", "t", tmp_path, "text", "info", {"partition": "gpu"}))

@@ -153,7 +153,10 @@ class TestSlurmLauncher(LauncherContract):
 
 
 def test_an_option_that_slurm_does_not_have_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(LauncherUnusable, match="options of the launcher slurm: partitoin: Extra inputs"):
+    with pytest.raises(
+        LauncherUnusable,
+        match="options of the launcher slurm: partitoin: there is no field of this name; did you mean 'partition'",
+    ):
         SlurmLauncher(context_of(tmp_path, partitoin="gpu"))
 
 

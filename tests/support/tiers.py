@@ -35,6 +35,8 @@ CHROMIUM_VARIABLE = "MAREY_TEST_CHROMIUM"
 """Environment variable with the path of Chromium; without it, the program `chromium` is looked for."""
 NODE_PACKAGES = PAGE_SOURCES / "node_modules"
 SLURM_PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
+PROGRAMS = ("kubectl", "zsh", "fish")
+"""Programs that some tests need, which are marked with the name of the program."""
 SYSTEM_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
 """Folders in which daemons are looked for, also by users whose `PATH` does not contain them."""
 EXAMPLES, STEPS = 100, 50
@@ -133,8 +135,8 @@ def chromium() -> str | None:
     return os.environ.get(CHROMIUM_VARIABLE) or shutil.which("chromium")
 
 
-def _needs_kubectl(item: pytest.Item) -> bool:
-    return item.get_closest_marker("kubectl") is not None
+def _needs_program(item: pytest.Item, name: str) -> bool:
+    return item.get_closest_marker(name) is not None
 
 
 def _needs_cluster(item: pytest.Item) -> bool:
@@ -262,8 +264,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         reasons = {f"need Chromium and the pages (make web): {lacks}": _needs_chromium, **reasons}
     if lacks := _missing_for_pages():
         reasons = {f"need Node and its packages (make web): {lacks}": _needs_node, **reasons}
-    if shutil.which("kubectl") is None:
-        reasons = {"need kubectl": _needs_kubectl, **reasons}
+    for name in PROGRAMS:
+        if shutil.which(name) is None:
+            reasons = {f"need {name}": functools.partial(_needs_program, name=name), **reasons}
     if unset := [name for name in (CLUSTER_VARIABLE, CLUSTER_IMAGE_VARIABLE) if name not in os.environ]:
         reasons = {f"need a Kubernetes cluster ({' and '.join(unset)} not set)": _needs_cluster, **reasons}
     config.stash[ON_DATABASES] = Counter(_without_backend(item) for item in items if backend_of(item))

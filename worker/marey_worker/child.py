@@ -23,6 +23,7 @@ from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.job_kinds import find_kind
 from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.queue.worker_protocol import LONGEST_CODE, LONGEST_DETAIL
+from marey_schemas.wording import first_reason
 from marey_worker import signatures
 from marey_worker.context import Context, JobRefused, Unreadable
 from marey_worker.messages import BAD_RESULT, UNPACKABLE, Done, End, Failed, Run, pack, unpack
@@ -103,7 +104,7 @@ def run_job(run: Run, pipe: Connection) -> End:
     except Unreadable as error:  # inputs are pinned: what is not there now will not be there at the next try
         return _failed(error.code, str(error))
     except ValidationError as error:
-        return _failed("invalid-params", str(error))
+        return _failed("invalid-params", first_reason(error))
     except MemoryError:
         detail = f"the job needs more memory than its limit of {run.memory_limit_bytes >> 20} MiB"
         return _failed("memory-limit", detail, "memory-limit", retryable=True)

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tarfile import is_tarfile
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
 from marey_client.archives.documents import CheckContents, DocumentWriter, EarlierDocument
 from marey_client.archives.receiving import require_receivable
-from marey_client.errors import ArchiveInUse, BadRequest, NothingToArchive, UnexpectedAnswer
+from marey_client.errors import ArchiveInUse, BadRequest, NothingToArchive, NotReplaced, UnexpectedAnswer
 from marey_client.progress import OnProgress
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import (
@@ -79,9 +80,11 @@ def write_archive(
 
     Before the documents of revisions are read, `check` is called with the content digests of these revisions, and may
     raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call with the same arguments
-    continues it. Raises `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is
-    left.
+    continues it. Raises `ArchiveInUse` if another process is writing the file, `NotReplaced` if another file than an
+    archive has the name, and `NothingToArchive` if no version is left.
     """
+    if path.is_file() and path.stat().st_size and not is_tarfile(path):
+        raise NotReplaced(f"{path} exists and is not an archive, so it is not replaced; choose another name")
     head = dataset.at(version)
     bases = [dataset.at(one) for one in since]
     part = path.with_name(f"{path.name}.{short_name(head.digest, [one.digest for one in bases])}.part")

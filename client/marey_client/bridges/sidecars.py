@@ -15,6 +15,7 @@ from marey_client.errors import BadSidecar
 from marey_schemas.datasets.exports import EXPORT_SCHEMA, SIDECAR, ExportedClip, ExportedFolder
 from marey_schemas.documents.clips import TakeRecord
 from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.wording import first_reason
 
 MOST_SIDECAR_BYTES = 1 << 30
 RECORDS = "records.csv"
@@ -94,10 +95,7 @@ def read_sidecar(folder: Path) -> ExportedFolder | None:
     try:
         return ExportedFolder.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        text = f"{where}: {first['msg']}" if where else first["msg"]
         raise BadSidecar(
-            f"{path} is not the sidecar of an export ({text}); restore the file, or rename it to import the folder "
-            "without it"
+            f"{path} is not the sidecar of an export ({first_reason(error)}); restore the file, or rename it to "
+            "import the folder without it"
         ) from None

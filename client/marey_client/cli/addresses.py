@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from marey_client.cli.terminal.failures import WrongUsage
+from marey_schemas.wording import suggestion
 
 if TYPE_CHECKING:
     from marey_client.items import ItemHandle
@@ -37,6 +39,9 @@ class Address:
         project, _, path = text.strip("/").partition("/")
         if not project:
             raise WrongUsage(f"{text!r} contains no project; write project/folder/name")
+        if project in (".", "..") or "\\" in project:
+            place = "/".join(one for one in text.replace("\\", "/").split("/") if one not in ("", ".", ".."))
+            raise WrongUsage(f"{text!r} is not the address of a folder or an item; did you mean {place!r}?")
         return cls(project, path, path != "" and text.endswith("/"))
 
     @classmethod
@@ -80,20 +85,33 @@ def require_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> Any:
     found = find_item(marey, address, kinds)
     if found is None:
         wanted = " or ".join(kind.value for kind in kinds) if len(kinds) <= 2 else "item"
-        raise _missing(marey, address, f"no {wanted}")
+        raise _missing(marey, address, f"no {wanted}", kinds)
     return found
 
 
-def _missing(marey: Marey, address: Address, what: str) -> WrongUsage:
-    """Return the error for an address without an item of the wanted kind.
+def _missing(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -> WrongUsage:
+    """Return the error for an address without an item of these kinds, with the nearest address or other advice."""
+    from marey_schemas.kinds import Kind
 
-    The error names the command that lists the folder or the project.
-    """
     if address.path and marey.project(address.project).collections.at(address.path) is not None:
         return WrongUsage(f"{address} is a folder; `marey ls {address}` lists it")
     if address.is_folder:
-        what = "no folder"
-    return WrongUsage(f"there is {what} at {address}; `marey ls {address.project}` lists the project")
+        what, kinds = "no folder", ()
+    elif (other := find_item(marey, address, [one for one in Kind if one not in kinds])) is not None:
+        kind = other.item.kind.noun
+        return WrongUsage(f"there is {what} at {address}, but a {kind}; `marey show {address}` shows it")
+    return WrongUsage(f"there is {what} at {address}; {advice(marey.project(address.project), address.path, kinds)}")
+
+
+def advice(project: ProjectHandle, path: str, kinds: Iterable[Kind]) -> str:
+    """Return advice to somebody who gave a path at which there is no folder, nor an item of these kinds."""
+    from marey_client.listing.paths import nearest_path
+
+    near = nearest_path(project.transport, project.name, path, kinds) if path and not Address("", path).has_id else None
+    if near is None:
+        return f"`marey ls {project.name}` lists the project"
+    place = shlex.quote(f"{project.name}/{near}")
+    return f"`marey ls {place}` lists the folder" if f"{path}/".startswith(f"{near}/") else f"did you mean {place}?"
 
 
 def addresses_in_one_project(places: Sequence[str]) -> list[Address]:
@@ -113,7 +131,7 @@ def kind_named(name: str) -> Kind:
     try:
         return Kind(name)
     except ValueError:
-        raise WrongUsage(f"{name!r} is not a kind of item; the kinds are {', '.join(Kind)}") from None
+        raise WrongUsage(f"{name!r} is not a kind of item; {suggestion(name, [*Kind], 'kinds')}") from None
 
 
 def _existing(items: Any, item_id: str) -> ItemHandle | None:
@@ -246,7 +264,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
         raise WrongUsage(f"several items are called {address}: a {' and a '.join(kinds)}; choose one with --kind")
     if not found:
         if not deleted:
-            raise _missing(marey, address, "no item or folder")
+            raise _missing(marey, address, "no item or folder", _kinds_of(kind))
         raise WrongUsage(
             f"there is no deleted item or folder at {address}; `marey ls --deleted {address.project}` lists all that "
             "are deleted"
@@ -307,13 +325,18 @@ def require_apart(things: Sequence[Thing]) -> None:
                 )
 
 
+def _kinds_of(kind: str | None) -> Sequence[Kind]:
+    """Return the kinds of items that somebody may mean who gave `kind`, which may also be that of folders."""
+    from marey_schemas.kinds import Kind
+
+    return () if kind == FOLDER else tuple(Kind) if kind is None else (kind_named(kind),)
+
+
 def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:
     """Yield the folders at an address, then the items at this address.
 
     With `deleted`, yield deleted folders and items; for each kind, the most recently deleted one comes first.
     """
-    from marey_schemas.kinds import Kind
-
     if kind in (None, FOLDER) and (folder := _folder(project, address, deleted=deleted)) is not None:
         yield Folder(project, folder)
     if kind == FOLDER:
@@ -323,7 +346,7 @@ def _things(project: ProjectHandle, address: Address, kind: str | None, *, delet
         return _items(project, address, one, deleted=deleted)
 
     with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
-        for items in pool.map(of_kind, [kind_named(kind)] if kind else list(Kind)):
+        for items in pool.map(of_kind, _kinds_of(kind)):
             yield from map(SingleItem, items)
 
 

@@ -40,6 +40,7 @@ from marey_client.cli.operation import bench, capacity, costs
 from marey_client.cli.perception import metrics, quality
 from marey_client.cli.queue import jobs, pipelines, schedules, scripts
 from marey_client.cli.studies import conducting, results
+from marey_client.cli.terminal.failures import usage_in_plain_words
 from marey_client.cli.terminal.invocation import Invocation
 from marey_schemas.address import SERVER_VARIABLES
 
@@ -80,7 +81,20 @@ class CommandGroup(TyperGroup):
         """Return the name of the command, the command, and its arguments; fail if there is no such command."""
         if args[0] not in self.commands and args[0] in OTHER_NAMES:
             ctx.fail(f"No such command {args[0]!r}. Type: marey {OTHER_NAMES[args[0]]}")
+        groups = [name for name, one in self.commands.items() if args[0] in getattr(one, "commands", ())]
+        if args[0] not in self.commands and groups:
+            ctx.fail(f"No such command {args[0]!r}. Type: {' or '.join(f'marey {one} {args[0]}' for one in groups)}")
         return super().resolve_command(ctx, args)
+
+    def make_context(self, *given: Any, **more: Any) -> Any:
+        """Parse the arguments of `marey` itself."""
+        with usage_in_plain_words():
+            return super().make_context(*given, **more)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Parse the arguments of the command, and run it."""
+        with usage_in_plain_words():
+            return super().invoke(ctx)
 
 
 app = typer.Typer(

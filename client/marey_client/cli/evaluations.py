@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import Address, addresses_in_one_project, find_item, require_item
+from marey_client.cli.addresses import Address, addresses_in_one_project, advice, find_item, require_item
 from marey_client.cli.perception.metrics import MetricName, metric_at
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import JOB, Sources, Wait, clips_at, follow, print_commit
@@ -176,10 +176,11 @@ def clips_in(marey: Marey, address: Address) -> list[Any]:
     """Return the clip at an address, or all clips in a folder and below it."""
     from marey_schemas.kinds import Kind
 
+    project = marey.project(address.project)
     clip = find_item(marey, address, [Kind.CLIP])
-    found = [clip] if clip is not None else list(marey.project(address.project).clips.list(collection=address.path))
+    found = [clip] if clip is not None else list(project.clips.list(collection=address.path))
     if not found:
-        raise WrongUsage(f"there is no clip at {address}, nor below it; `marey ls {address.project}` lists the project")
+        raise WrongUsage(f"there is no clip at {address}, nor below it; {advice(project, address.path, (Kind.CLIP,))}")
     return found
 
 

@@ -270,7 +270,7 @@ def _with_tags(thing: Thing, added: Sequence[str], removed: Set[str]) -> ItemCha
     try:
         return ItemChange(tags=tuple(tags))
     except ValidationError as error:
-        reason = plain_reason(error.errors(include_url=False)[0]["msg"])
+        reason = plain_reason(error.errors(include_url=False)[0])
         raise WrongUsage(
             f"{thing.place} cannot have {counted(len(tags), 'tag')}: {reason}; nothing was changed"
         ) from None

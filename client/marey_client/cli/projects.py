@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from marey_client.cli.addresses import advice
 from marey_client.cli.terminal.failures import ANONYMOUS_HINT, WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
@@ -246,7 +247,7 @@ def _folder(project_handle: ProjectHandle, path: str) -> Collection:
     found = project_handle.collections.at(path.strip("/")) if path.strip("/") else None
     if found is None:
         raise WrongUsage(
-            f"there is no folder {path!r} in {project_handle.name}; `marey ls {project_handle.name}` lists the folders"
+            f"there is no folder {path!r} in {project_handle.name}; {advice(project_handle, path.strip('/'), ())}"
         )
     return found
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, several
 from marey_client.items import ItemHandle
-from marey_client.one_or_several import several
 from marey_client.transport import as_json, read_model
 from marey_schemas.documents.annotations import Annotation
 from marey_schemas.editing.annotation_commands import AnnotationChange

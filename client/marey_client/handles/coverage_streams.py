@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_client.arguments import checked
-from marey_client.one_or_several import several
+from marey_client.arguments import checked, several
 from marey_client.paging import pages
 from marey_client.transport import Transport, read_model
 from marey_schemas.coverage_streams import (

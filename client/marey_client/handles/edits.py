@@ -7,10 +7,9 @@ from typing import Any, Unpack
 
 from pydantic import BaseModel
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, several
 from marey_client.items import ItemHandle, Items
 from marey_client.keywords.asking import EditPreviewKeywords
-from marey_client.one_or_several import several
 from marey_client.transport import BLOCKS, Transport, as_json, read_tree
 from marey_schemas.editing.edits import EditDocument
 from marey_schemas.editing.previews import EditPreview, EditPreviewRequest

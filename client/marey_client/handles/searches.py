@@ -8,13 +8,12 @@ from typing import Any, Unpack
 
 from pydantic import BaseModel
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, several
 from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.handles.reports import ReportedHandle
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.keywords.asking import SearchKeywords
 from marey_client.keywords.processing import TreeKeywords
-from marey_client.one_or_several import several
 from marey_client.transport import BLOCKS, as_json, read_tree, sends_nothing
 from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT
 from marey_schemas.queue.job_params import TreeParams

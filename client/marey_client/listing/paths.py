@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import islice
 
 from marey_client.errors import NoSuchPath
@@ -41,6 +42,25 @@ def missing_path(transport: Transport, project: str, kind: Kind, path: str) -> s
     place = folder or project
     hint = f"; did you mean {f'{folder}/{near}'.lstrip('/')!r}?" if near else ""
     return f"there is no {kind} {name!r} in {place}{hint}"
+
+
+def nearest_path(transport: Transport, project: str, path: str, kinds: Iterable[Kind]) -> str | None:
+    """Return the path of the folder, or of the item of these kinds, that is spelled most like `path`.
+
+    If the folder in `path` does not exist, the folder that is spelled most like it is searched instead. If nothing in
+    the folder is spelled like the last name in `path`, the path of the folder is returned; None at the top.
+    """
+    folders = _folders(transport, project)
+    folder, _, name = path.strip("/").rpartition("/")
+    found = folder if folder in ("", *folders) else nearest(folder, folders)
+    if found is None:
+        return None
+    names = [one.rpartition("/")[2] for one in folders if one.rpartition("/")[0] == found]
+    for kind in kinds:
+        listed = pages(transport, Item, f"/projects/{project}/{kind.plural}", {"directly_in": found, "limit": 500})
+        names += (one.name for one in islice(listed, MOST_COMPARED))
+    near = nearest(name, names)
+    return "/".join(filter(None, (found, near))) or None
 
 
 def _missing_folder(transport: Transport, project: str, folder: str) -> str:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
+from marey_client.arguments import several
 from marey_client.errors import BadArgument
 from marey_client.items import ItemHandle
-from marey_client.one_or_several import several
 from marey_schemas.documents.clips import MotionDocument
 
 

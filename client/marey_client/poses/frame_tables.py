@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.arguments import several
 from marey_client.extras import room
 from marey_client.listing.tables import TABLES_EXTRA
-from marey_client.one_or_several import several
 from marey_client.poses.arrays import Joints, PosedItem
 from marey_client.poses.kinematics import read_positions
 

@@ -14,11 +14,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.arguments import several
 from marey_client.errors import NoSuchJoint
 from marey_client.extras import room
 from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.items import ItemHandle
-from marey_client.one_or_several import several
 from marey_client.poses.arrays import Joints, PosedItem, frames_text
 from marey_client.transport import Transport
 from marey_schemas.documents.references import RevisionRef

@@ -233,7 +233,10 @@ def _spread(frames: range, moments: int, name: str) -> list[int]:
     if not 1 <= moments <= MOST_MOMENTS:
         raise BadArgument(f"moments: a picture shows 1 to {MOST_MOMENTS} moments, not {moments}")
     if not frames:
-        raise BadArgument(f"frames: the range contains no frame of {name!r}")
+        raise BadArgument(
+            f"frames: the range contains no frame of {name!r}; write first:end, with the first frame before the end, "
+            "and within the clip"
+        )
     return [frames[round(place)] for place in np.linspace(0, len(frames) - 1, min(moments, len(frames)))]
 
 

@@ -39,6 +39,7 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry, skeleton_output
 from marey_schemas.kinds import Kind
 from marey_schemas.names import base_name
+from marey_schemas.wording import first_reason
 
 _LONGEST_COLLECTION = 1024
 _LONGEST_MESSAGE = 4000
@@ -83,7 +84,7 @@ def import_file(file: FileToImport) -> ImportedFile:
     except MotionError as error:
         return ImportedFile(file.planned.name, refusal=refusal_of(error))
     except (OverflowError, UnicodeError, ValidationError) as error:  # of a value that no document may contain
-        first = str(error.errors(include_url=False)[0]["msg"]) if isinstance(error, ValidationError) else str(error)
+        first = first_reason(error) if isinstance(error, ValidationError) else str(error)
         refused = FormatError(f"the file contains a value that cannot be stored: {first}", code="value-range")
         return ImportedFile(file.planned.name, refusal=refusal_of(refused))
 

@@ -17,6 +17,7 @@ from marey_motion.importing.items import ImportedGraph, ImportedItem
 from marey_schemas.documents.graphs import ModelGraph
 from marey_schemas.documents.originals import original_of
 from marey_schemas.kinds import Kind
+from marey_schemas.wording import first_reason
 
 SCHEMA = "marey/model-graph@1"
 FEW = 3
@@ -74,10 +75,7 @@ def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
     try:
         ModelGraph.model_validate(document)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        pointer = "".join(f"/{step}" for step in first["loc"])
-        detail = f"This is not a valid {SCHEMA}: {pointer}: {first['msg'].removeprefix('Value error, ')}"
-        raise FormatError(detail, code="invalid") from error
+        raise FormatError(f"This is not a valid {SCHEMA}: {first_reason(error)}", code="invalid") from error
     return ImportedItem(graph.file, Kind.GRAPH, graph.name, graph.collection, {"graph": document}, graph.tags)
 
 

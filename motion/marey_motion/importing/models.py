@@ -38,6 +38,7 @@ from marey_schemas.formats.companions import is_skeleton_name, model_name
 from marey_schemas.imports import skeleton_output
 from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import TreeOptions
+from marey_schemas.wording import first_reason
 
 MOST_NAMED = 5
 """Greatest number of places in a file that a warning names."""
@@ -210,5 +211,5 @@ def _imported_tree(data: bytes, name: str, model_file: str, primitive: MotionPri
             features="latent",
         )
     except ValidationError as error:
-        raise FormatError(f"the tree is too large: {error}", code="tree-options", file=name) from error
+        raise FormatError(f"the tree is too large: {first_reason(error)}", code="tree-options", file=name) from error
     return sample_tree_to_tree(tree, model_digest=PartDigestRef(digest_of="model"), seed=0, options=options)

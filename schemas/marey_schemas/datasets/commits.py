@@ -10,7 +10,7 @@ from pydantic import Field, StringConstraints, model_validator
 from marey_schemas.base import Answer, Request, Tagged
 from marey_schemas.datasets.naming import MAIN, RefName
 from marey_schemas.kinds import Kind
-from marey_schemas.names import Digest, ItemId, Message
+from marey_schemas.names import Digest, ItemId, Message, form
 
 MOST_CHANGES = 10_000
 """Greatest number of explicit changes in one commit."""
@@ -18,11 +18,13 @@ MOST_CHANGES = 10_000
 TIME_OF_COMMIT = "%Y-%m-%dT%H:%M:%S.%fZ"
 """Format of the time of a commit; the time is in UTC."""
 
+_ENTRY = form(
+    r"^[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*$",
+    "be names joined by single slashes, without a slash at its beginning or end, and not be empty",
+)
 EntryPath = Annotated[
     str,
-    StringConstraints(
-        min_length=1, max_length=1280, pattern=r"^[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*$"
-    ),
+    StringConstraints(min_length=1, max_length=1280, pattern=_ENTRY),
 ]
 
 

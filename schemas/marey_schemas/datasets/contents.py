@@ -12,7 +12,7 @@ from marey_schemas.consents import ConsentOverride
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, EntryPath
 from marey_schemas.datasets.naming import RefName
 from marey_schemas.kinds import Kind
-from marey_schemas.names import MOST_TAGS, Digest, Message, PartName, Tag
+from marey_schemas.names import LINE, MOST_TAGS, Digest, Message, PartName, Tag
 from marey_schemas.queue.facets import FacetName, FacetValue
 
 MOST_CONTENTS = 256
@@ -130,7 +130,7 @@ class ReceivedCommit(Request):
 
     tree: Digest
     parents: tuple[Digest, ...] = Field(max_length=2)
-    author: Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
+    author: Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=LINE)]
     message: Message
     at: Annotated[str, AfterValidator(_require_time)] = Field(
         description="Time in UTC, such as 2026-11-23T10:00:00.000000Z."

@@ -10,7 +10,7 @@ from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.datasets.protection import Protection
-from marey_schemas.names import REF, SLUG, CollectionPath
+from marey_schemas.names import REF, SLUG, CollectionPath, form
 
 MAIN = "main"
 """Name of the branch that every dataset has from the beginning."""
@@ -19,7 +19,11 @@ DatasetName = Annotated[str, StringConstraints(pattern=SLUG)]
 RefName = Annotated[str, StringConstraints(pattern=REF)]
 """Name of a branch or a tag; it is part of URLs."""
 
-Version = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}(?:~[0-9]{1,4})?$")]
+_VERSION = form(
+    r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}(?:~[0-9]{1,4})?$",
+    "be a branch, a tag or the digest of a commit, to which ~1 may be appended for the commit before it, and so on",
+)
+Version = Annotated[str, StringConstraints(pattern=_VERSION)]
 """Name of a version: a branch, a tag, or the digest of a commit (the first 8 digits are enough).
 
 With `~n` at the end, the name refers to the version n commits earlier.

@@ -14,14 +14,15 @@ from marey_schemas.datasets.naming import MAIN, RefName, Version
 from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Verdict
 from marey_schemas.datasets.protection import CheckName
 from marey_schemas.kinds import Kind
-from marey_schemas.names import ItemId, Message
+from marey_schemas.names import LINE, ItemId, Message, form
 
 MOST_TEXT = 10_000
 """Greatest length of a description, a comment or the text of a review."""
 WITH_FRAMES = (Kind.CLIP, Kind.ANNOTATION)
 """Kinds of entries that have frames on which somebody can comment."""
 
-Title = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[^\x00-\x1f\x7f]+$")]
+_LINK = form(r"^https?://[^\s\x00-\x1f\x7f]+$", "be a web address, beginning with https:// or http://")
+Title = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=LINE)]
 Text = Annotated[str, StringConstraints(min_length=1, max_length=MOST_TEXT)]
 Frame = Annotated[int, Field(ge=0, le=(1 << 31) - 1)]
 
@@ -90,7 +91,7 @@ class CheckReport(Request):
         description="Job of the project that carries out the check. The state `succeeded` is refused unless this job "
         "has succeeded. A job whose inputs are versions of datasets must also have read the newest commit.",
     )
-    link: Annotated[str, StringConstraints(max_length=2000, pattern=r"^https?://[^\s\x00-\x1f\x7f]+$")] | None = Field(
+    link: Annotated[str, StringConstraints(max_length=2000, pattern=_LINK)] | None = Field(
         None, description="Address of a page about the check."
     )
     text: str = Field("", max_length=MOST_TEXT, description="Result of the check, as text.")

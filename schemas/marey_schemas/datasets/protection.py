@@ -8,11 +8,12 @@ from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from marey_schemas.access import Role
 from marey_schemas.base import Request
+from marey_schemas.names import USER
 
 MOST_REQUIRED = 20
 """Greatest number of approvals that a rule can require, and greatest number of checks."""
 
-CheckName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$")]
+CheckName = Annotated[str, StringConstraints(pattern=USER)]
 """Name of a check of a proposal, such as `evaluation`."""
 
 

@@ -20,7 +20,7 @@ from marey_schemas.documents.references import OutputRef as OutputRef
 from marey_schemas.documents.references import RevisionRef as RevisionRef
 from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.encoding.arrays import ArrayOf
-from marey_schemas.names import Digest, JointName, Tag
+from marey_schemas.names import Digest, JointName, Tag, form
 
 MAX_FRAME_RATE_HZ = 100_000.0
 MIN_FRAME_RATE_HZ = 1e-6
@@ -81,7 +81,9 @@ class MotionDocument(Request):
 class Check(Request):
     """Finding of the importer about a motion: a stable code, a message, and the joints and frames concerned."""
 
-    code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9-]{1,64}$")]
+    code: Annotated[
+        str, StringConstraints(pattern=form(r"^[a-z0-9-]{1,64}$", "have 1 to 64 lower-case letters, digits and -"))
+    ]
     message: str
     joints: tuple[str, ...] = ()
     frames: tuple[int, int] | None = Field(

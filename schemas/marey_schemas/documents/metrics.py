@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from marey_schemas.base import Request
 from marey_schemas.documents.references import OutputRef, RevisionRef
 from marey_schemas.encoding.canonical import document_digest
-from marey_schemas.names import Digest
+from marey_schemas.names import Digest, form
 
 Measurement = Literal["angles", "positions", "velocities"]
 Shaping = Literal["euclid", "manhattan", "sigmoid", "power"]
@@ -66,7 +66,10 @@ _MOST_ROUNDING = 0.0025
 PUBLISHED_ERROR = 0.05
 """Standard error of a published perceived difference: in 1,827 trials, each of the 210 pairs was shown 52 times."""
 
-_BUILT_IN_PATTERN = r"^(published|uniform)/(?:(angles|positions|velocities)-)?(euclid|manhattan|sigmoid)$"
+_BUILT_IN_PATTERN = form(
+    r"^(published|uniform)/(?:(angles|positions|velocities)-)?(euclid|manhattan|sigmoid)$",
+    "name a built-in metric, such as published/sigmoid, or published/angles-sigmoid",
+)
 
 
 def _require_built_in(name: str) -> str:

@@ -8,6 +8,7 @@ from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Request
 from marey_schemas.documents.originals import StoredOriginal
+from marey_schemas.names import form
 
 RecordForm = Literal["job", "transform run", "edit history", "synthesis input"]
 RECORD_FORMS: tuple[RecordForm, ...] = get_args(RecordForm)
@@ -18,7 +19,12 @@ LONGEST_TEXT = 1000
 HIDDEN = "(not shown: a credential)"
 """Text that is shown in place of a credential."""
 
-FieldPointer = Annotated[str, StringConstraints(pattern=r"^(?:/|$)", max_length=LONGEST_TEXT)]
+FieldPointer = Annotated[
+    str,
+    StringConstraints(
+        pattern=form(r"^(?:/|$)", "be a JSON Pointer, which begins with a slash"), max_length=LONGEST_TEXT
+    ),
+]
 FieldValue = Annotated[str, StringConstraints(max_length=LONGEST_TEXT)] | bool | int | float | None
 
 

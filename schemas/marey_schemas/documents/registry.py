@@ -23,6 +23,11 @@ from marey_schemas.documents.sample_trees import SampleTreeDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.documents.studies import StudyDocument
 from marey_schemas.editing.edits import EditDocument
+from marey_schemas.names import form
+
+_SCHEMA = form(
+    r"^[a-z0-9][a-z0-9_-]*/[a-z0-9][a-z0-9_-]*@[1-9][0-9]*$", "name a schema and its version, as in lab/calibration@1"
+)
 
 
 class OpenDocument(Request):
@@ -30,9 +35,7 @@ class OpenDocument(Request):
 
     model_config = ConfigDict(extra="allow")
 
-    schema_: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]*/[a-z0-9][a-z0-9_-]*@[1-9][0-9]*$")] = (
-        Field("marey/document@1", alias="schema")
-    )
+    schema_: Annotated[str, StringConstraints(pattern=_SCHEMA)] = Field("marey/document@1", alias="schema")
 
 
 SCHEMAS: dict[str, type[Request]] = {

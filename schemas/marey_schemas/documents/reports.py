@@ -7,12 +7,18 @@ from typing import Annotated, Literal
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Request
-from marey_schemas.names import Digest, TrialName
+from marey_schemas.names import Digest, TrialName, form
 
-ScriptDigest = Annotated[str, StringConstraints(pattern=r"^sha256-[A-Za-z0-9+/]{43}=$")]
+ScriptDigest = Annotated[
+    str, StringConstraints(pattern=form(r"^sha256-[A-Za-z0-9+/]{43}=$", "be sha256- and a digest in Base64"))
+]
 """Digest of a script, in the syntax of Content-Security-Policy."""
 
-FigureName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
+_FIGURE = form(
+    r"^[a-z0-9][a-z0-9_-]{0,63}$",
+    "have at most 64 lower-case letters, digits, - and _, and begin with a letter or digit",
+)
+FigureName = Annotated[str, StringConstraints(pattern=_FIGURE)]
 
 
 class StoredFile(Request):

@@ -13,13 +13,16 @@ from typing import Annotated
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Request
+from marey_schemas.names import form
 
 MOST_FACETS = 16
 """Greatest number of facets that a job kind declares."""
 MOST_MEASURED = 100_000
 """Greatest number of items about which one job publishes facets."""
 
-_NAME_PATTERN = r"^[a-z][a-z0-9_]{0,63}$"
+_NAME_PATTERN = form(
+    r"^[a-z][a-z0-9_]{0,63}$", "have at most 64 lower-case letters, digits and _, and begin with a letter"
+)
 FacetName = Annotated[str, StringConstraints(pattern=_NAME_PATTERN)]
 FacetValue = Annotated[float, Field(allow_inf_nan=False)]
 

@@ -30,6 +30,7 @@ from marey_schemas.queue.measuring_kinds import (
     SWEEP,
 )
 from marey_schemas.queue.scripts import SCRIPT, ScriptDeclaration, ScriptParams
+from marey_schemas.wording import suggestion
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000
@@ -316,4 +317,4 @@ def find_kind(name: str) -> KindDeclaration:
     try:
         return job_kinds()[name]
     except KeyError:
-        raise UnknownKindError(f"there is no job kind {name!r}; the job kinds are {', '.join(job_kinds())}") from None
+        raise UnknownKindError(f"there is no job kind {name!r}; {suggestion(name, job_kinds(), 'job kinds')}") from None

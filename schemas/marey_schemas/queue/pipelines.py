@@ -7,13 +7,17 @@ from typing import Annotated, Any, Self
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.names import CollectionPath, Message
+from marey_schemas.names import CollectionPath, Message, form
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import CacheMode, Job, JobCreate, JobInput, JobOutputsInput, Resources
 
 MOST_STEPS = 32
 
-StepName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+_STEP = form(
+    r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$",
+    "have at most 64 letters, digits, dots, - and _, and begin with a letter or digit",
+)
+StepName = Annotated[str, StringConstraints(pattern=_STEP)]
 
 
 class StepOutputsInput(Request):

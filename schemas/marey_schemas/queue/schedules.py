@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.names import SLUG, Message
+from marey_schemas.names import SLUG, Message, form
 from marey_schemas.queue.jobs import JobCreate
 
 MAX_CRON_LENGTH = 100
@@ -22,7 +22,7 @@ Cron = Annotated[
     Field(
         min_length=9,
         max_length=MAX_CRON_LENGTH,
-        pattern=r"^[0-9A-Za-z*,/# -]+$",
+        pattern=form(r"^[0-9A-Za-z*,/# -]+$", "be five fields of a cron expression, such as 0 3 * * 1-5"),
         description="Times as five fields: minute, hour, day of the month, month, day of the week. `0 3 * * 1-5` means "
         "3:00 from Monday to Friday.",
     ),

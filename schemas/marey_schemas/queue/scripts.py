@@ -14,7 +14,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.consents import ConsentOverride
 from marey_schemas.formats import FORMATS, WHOLE_FORMATS, ExportFormat
 from marey_schemas.kinds import Kind
-from marey_schemas.names import SLUG, CollectionPath, Message
+from marey_schemas.names import SLUG, CollectionPath, Message, form
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import InputSpec, JobInput, JobState, Resources
 from marey_schemas.queue.own_pods import Image
@@ -46,12 +46,17 @@ WORKER_S, WORKER_MB = 1800, 2048
 ScriptName = Annotated[str, StringConstraints(pattern=SLUG)]
 """Name of a script: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
 
-FieldName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,62}$")]
+_FIELD = form(r"^[A-Za-z][A-Za-z0-9_]{0,62}$", "have at most 63 letters, digits and _, and begin with a letter")
+FieldName = Annotated[str, StringConstraints(pattern=_FIELD)]
 """Name of a parameter, an input, an output or a logged field."""
 
+_REPOSITORY = form(
+    r"^(?:https://[A-Za-z0-9.-]+(?::[0-9]{1,5})?|file://)(?:/[\w.~+-]+)+/?$",
+    "be the address of a Git repository without a user name, beginning with https:// or file://",
+)
 Repository = Annotated[
     str,
-    StringConstraints(max_length=500, pattern=r"^(?:https://[A-Za-z0-9.-]+(?::[0-9]{1,5})?|file://)(?:/[\w.~+-]+)+/?$"),
+    StringConstraints(max_length=500, pattern=_REPOSITORY),
 ]
 """Address of a Git repository, without user name, password or query."""
 
@@ -59,7 +64,7 @@ Value = bool | int | float | str
 """Value of a parameter or a logged field."""
 
 _PLACEHOLDER = re.compile(r"\{(input|output|parameter):([A-Za-z][A-Za-z0-9_]{0,62})\}")
-_COMMIT = re.compile(r"^[0-9a-f]{40}$")
+_COMMIT = re.compile(form(r"^[0-9a-f]{40}$", "be the full name of a commit, 40 hexadecimal digits in lower case"))
 _MOTION_ENDINGS = {row.name: row.endings[0] for row in FORMATS if row.name in WHOLE_FORMATS}
 """Formats of clips that a script can write, with the endings of their files."""
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from marey_schemas.wording import plain_reason
+from marey_schemas.wording import first_reason
 from marey_server.capacity.costs import MEASURED, JobCosts, MeasuredCosts, UnusableCosts
 from marey_server.capacity.needs import PlannedWork, compute_needs
 from marey_server.capacity.simulation import SimulatedJob, simulate
@@ -62,8 +62,7 @@ def predict(job: dict[str, float], workers: tuple[int, ...], work_s: float, seed
     try:
         costs = JobCosts.model_validate(job).in_queue()
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise NotComputable(f"{'.'.join(map(str, first['loc']))}: {plain_reason(first['msg'])}") from error
+        raise NotComputable(first_reason(error, JobCosts)) from error
     return {
         count: simulate(
             [SimulatedJob(0.0, work_s)] * (JOBS_PER_WORKER * count), [frozenset()] * count, costs, seed=seed

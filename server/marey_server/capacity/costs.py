@@ -11,7 +11,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from marey_schemas.wording import plain_reason
+from marey_schemas.wording import first_reason
 from marey_server.capacity.simulation import QueueCosts, RequestCosts
 
 MEASURED = Path(__file__).with_name("measured_costs.toml")
@@ -91,9 +91,7 @@ class MeasuredCosts(_Table):
         try:
             return cls.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(map(str, first["loc"]))
-            raise UnusableCosts(f"{path}: {where}: {plain_reason(first['msg'])}") from error
+            raise UnusableCosts(f"{path}: {first_reason(error, cls)}") from error
         except OSError as error:
             raise UnusableCosts(f"{path}: {error.strerror}") from error
         except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -300,7 +300,7 @@ def _form_options(form: dict[str, bytearray]) -> ImportOptions:
     try:
         return ImportOptions.model_validate(values)
     except ValidationError as error:
-        faults = field_errors(error, values)
+        faults = field_errors(error, ImportOptions, values)
         first = f"{faults[0].pointer or 'the form'}: {faults[0].detail}"
         raise InvalidProblem(f"The form is not valid: {first}", code="invalid-form", errors=faults) from None
 

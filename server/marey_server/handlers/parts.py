@@ -11,7 +11,7 @@ from pydantic import Field, StringConstraints
 from marey_schemas.base import Request
 from marey_schemas.items import Item, PartsRequest
 from marey_schemas.kinds import Kind
-from marey_schemas.names import Message
+from marey_schemas.names import Message, form
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.http.caching import IMMUTABLE
 from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
@@ -21,7 +21,9 @@ from marey_server.http.resource import Resource
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
-FrameRange = Annotated[str, StringConstraints(pattern=r"^\d{0,9}:\d{0,9}$")]
+FrameRange = Annotated[
+    str, StringConstraints(pattern=form(r"^\d{0,9}:\d{0,9}$", "be a range of frames first:end, such as 100:200"))
+]
 
 
 class PartQuery(Request):

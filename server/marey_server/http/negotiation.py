@@ -127,7 +127,8 @@ def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TY
     name, params = _split_parameters(content_type)
     if name not in known:
         raise UnsupportedMediaTypeProblem(
-            f"The media type of the body is {name}; this request accepts only: {', '.join(known)}.",
+            f"The media type of the body is {name}; this request accepts only: {', '.join(known)}. Name the media "
+            "type of the body in the header Content-Type.",
             context={"understood": list(known)},
         )
     if params.get("charset", "utf-8") not in ("utf-8", "utf8", "us-ascii"):

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BeforeValidator, Field, StringConstraints
 
 from marey_schemas.base import Request
+from marey_schemas.names import form
 from marey_server.store.listing import DEFAULT_LIMIT, MAX_LIMIT
 
 T = TypeVar("T")
@@ -31,7 +32,10 @@ class PageQuery(Request):
 
     limit: int = Field(DEFAULT_LIMIT, ge=1, le=MAX_LIMIT, description="Greatest number of entries in a page.")
     cursor: str | None = Field(
-        None, max_length=4096, pattern="^[A-Za-z0-9_-]+$", description="Value of `next_cursor` in the previous page."
+        None,
+        max_length=4096,
+        pattern=form("^[A-Za-z0-9_-]+$", "be the value of next_cursor"),
+        description="Value of `next_cursor` in the previous page.",
     )
 
 

@@ -55,7 +55,7 @@ def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[byte
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise _bad_query(field_errors(error, values, ".".join)) from None
+        raise _bad_query(field_errors(error, model, values, ".".join)) from None
 
 
 def _known_parameters(known: Mapping[str, Any]) -> str:
@@ -104,7 +104,7 @@ def validate_body(model: type[Model], tree: Any) -> Model:
             return model.model_validate(tree)
         return model.model_validate_json(canonical_json(tree), strict=True)  # in which 1.0 is the integer 1
     except ValidationError as error:
-        faults = field_errors(error, tree)
+        faults = field_errors(error, model, tree)
         first = f"{faults[0].pointer or 'the body'}: {faults[0].detail}"
         raise InvalidProblem(f"The request body is not valid: {first}", code="invalid-body", errors=faults) from None
 

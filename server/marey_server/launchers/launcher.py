@@ -92,7 +92,7 @@ def read_options(model: type[Options], given: Mapping[str, Any], launcher: str) 
     try:
         return model.model_validate(dict(given))
     except ValidationError as error:
-        reasons = {".".join(map(str, one["loc"])): plain_reason(one["msg"]) for one in error.errors()}
+        reasons = {".".join(map(str, one["loc"])): plain_reason(one, model) for one in error.errors()}
         faults = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
         raise LauncherUnusable(f"options of the launcher {launcher}: {faults}") from None
 

@@ -15,6 +15,7 @@ from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH, base_name
 from marey_schemas.problems import FieldError
+from marey_schemas.wording import first_reason
 from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem
 from marey_server.motions.child import Message, pack_tree, unpack_tree
 from marey_server.motions.loading import LOADING
@@ -178,8 +179,7 @@ def _imported(
     except MotionError as error:
         raise _not_an_annotation(error, pointer) from error
     except ValidationError as error:  # of a label that no document may contain
-        reason = error.errors(include_url=False, include_context=False, include_input=False)[0]["msg"]
-        raise _not_an_annotation(MotionError(f"{name}: {reason}", code="value-range"), pointer) from error
+        raise _not_an_annotation(MotionError(f"{name}: {first_reason(error)}", code="value-range"), pointer) from error
     return annotation.model_dump(mode="json", by_alias=True, exclude_none=True)
 
 

@@ -32,7 +32,7 @@ from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.kinds import Kind
 from marey_schemas.options.evaluation import MOST_FRAME_RATE_HZ
 from marey_schemas.problems import FieldError
-from marey_schemas.wording import plain_reason
+from marey_schemas.wording import first_reason
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import Message, pack_tree, unpack_tree
 from marey_server.store import items, projects
@@ -353,8 +353,7 @@ def refusing(field: str) -> Iterator[None]:
             str(error), code=error.code, errors=[_fault(f"/{field}", error.code, str(error))]
         ) from error
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        detail = ": ".join(filter(None, (".".join(map(str, first["loc"])), plain_reason(first["msg"]))))
+        detail = first_reason(error)
         fault = _fault(f"/{field}", "invalid", detail)
         raise InvalidProblem(f"The request is not valid: {fault.pointer}: {detail}", errors=[fault]) from error
 

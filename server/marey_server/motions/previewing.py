@@ -112,7 +112,7 @@ def _read_edit(tx: Transaction, project: str, request: EditPreviewRequest) -> Ed
     try:
         return EditDocument.model_validate(tree)
     except ValidationError as error:
-        first = field_errors(error, tree)[0]
+        first = field_errors(error, EditDocument, tree)[0]
         detail = f"The edit cannot be applied: {first.pointer}: {first.detail}"
         raise _invalid("/edit", "bad-document", detail) from error
 

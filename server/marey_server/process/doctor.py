@@ -19,7 +19,8 @@ from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.process.administrators import TOKEN_FILE
 from marey_server.process.disk_space import DiskSpace
 from marey_server.process.identity_provider import IdentityProvider
-from marey_server.process.settings import PREFIX, Settings, misspelt_variables
+from marey_server.process.setting_faults import misspelt_variables
+from marey_server.process.settings import PREFIX, Settings
 from marey_server.store.clock_setting import read_clock
 from marey_server.store.database.connections import Database
 from marey_server.store.database.opening import DatabaseUnusable, opening, sqlite_file

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Mapping
 from dataclasses import fields
 from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
@@ -14,6 +12,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SETTINGS_FILE
+from marey_schemas.names import form
 from marey_schemas.sizes import KIB, MIB
 from marey_server.process.secret_files import read_secret
 from marey_server.process.setting_groups.blob_settings import BlobSettings
@@ -291,7 +290,7 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     )
     worker_url: str | None = Field(
         None,
-        pattern=r"^https?://",
+        pattern=form(r"^https?://", "begin with https:// or http://"),
         description="Address at which workers in pools reach the server. Absent: the address that the server listens "
         "on.",
     )
@@ -385,12 +384,3 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
         user, _, place = urlsplit(url).netloc.partition("@")
         password = quote(read_secret(self.database_password_file), safe="")
         return url.replace(f"{user}@{place}", f"{user}:{password}@{place}", 1)
-
-
-def misspelt_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables that look like misspelt settings, each with the most similar setting."""
-    known = [f"{PREFIX}{name.upper()}" for name in Settings.model_fields]
-    unknown = [name for name in environment if name.startswith(PREFIX) and name.upper() not in known]
-    own = [name for name in unknown if not name.startswith(f"{PREFIX}TEST_")]
-    alike = {name: difflib.get_close_matches(name.upper(), known, 1, 0.82) for name in own}
-    return {name: found[0] for name, found in alike.items() if found}

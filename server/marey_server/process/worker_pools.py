@@ -6,6 +6,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from marey_schemas.names import form
 from marey_schemas.queue.own_pods import GPUS_LABEL, MOST_GPUS
 from marey_schemas.sizes import MIB
 from marey_server.access.labels import MOST_LABELS
@@ -13,8 +14,12 @@ from marey_server.access.own_pods import PodRules
 
 SHORTEST_DEADLINE_S = 600
 
-LabelName = Annotated[str, Field(pattern=r"^[^=\x00-\x20]{1,100}$")]
-LabelValue = Annotated[str, Field(pattern=r"^[^\x00-\x1f]{0,100}$")]
+LabelName = Annotated[
+    str, Field(pattern=form(r"^[^=\x00-\x20]{1,100}$", "have 1 to 100 characters without = and spaces"))
+]
+LabelValue = Annotated[
+    str, Field(pattern=form(r"^[^\x00-\x1f]{0,100}$", "have at most 100 characters without line breaks"))
+]
 """Parts of labels, which are given to workers as arguments of the form name=value."""
 
 
@@ -24,7 +29,10 @@ class WorkerPool(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(
-        pattern=r"^[a-z]([a-z0-9-]{0,18}[a-z0-9])?$",
+        pattern=form(
+            r"^[a-z]([a-z0-9-]{0,18}[a-z0-9])?$",
+            "have at most 20 lower-case letters, digits and -, begin with a letter, and not end with -",
+        ),
         description="Name of the pool; the names of its workers begin with it.",
     )
     labels: dict[LabelName, LabelValue] = Field(

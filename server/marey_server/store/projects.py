@@ -124,7 +124,9 @@ def require(
     row = tx.execute(_DELETED_BY_NAME, who).one_or_none() if deleted else tx.first(_ALIVE_BY_NAME, who)
     seen = None if row is None else _as_seen(tx.principal, row)
     if seen is None or (seen.guest and deleted):
-        raise NotFoundProblem(f"There is no project {name!r} that you may see.", code="no-project")
+        raise NotFoundProblem(
+            f"There is no project {name!r} that you may see.", code="no-project", context={"project": name}
+        )
     enough = roles.includes(seen.role, need) or (required.in_folders and _has_role_in_a_folder(tx, seen, need))
     if not enough or (seen.guest and not required.guests):
         if tx.principal.kind == "anonymous":

@@ -153,7 +153,7 @@ def test_wrong_examples_are_refused_with_the_reason(lab: ProjectHandle, run: Com
     assert "there is no index at lab/walks" in run("similar", moment, "--index", "lab/walks/none", status=2).stderr
     assert "is in the project other" in run("similar", moment, "--index", f"other/{index.path}", status=2).stderr
     (walk,) = lab.clips.list(path="walks/walk 1.5 0")
-    with pytest.raises(RequestFailed, match="less than or equal to 100"):
+    with pytest.raises(RequestFailed, match="at most 100"):
         lab.transport.send(
             "POST", "/projects/lab/similar",
             content=json.dumps({"clip": walk.id, "frames": [0, 9], "results": 101}).encode(),

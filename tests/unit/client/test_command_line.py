@@ -182,7 +182,7 @@ BUILD = ("build-model", "lab/walks", "--name", "w")
             ["edit", "apply", "lab/a", "--into", "x", "--file", "source.json"],
             "source clip other/x must be in the project",
         ),
-        (["search", "lab/m", "--request", "search.json"], "constraints: Input should be a valid tuple"),
+        (["search", "lab/m", "--request", "search.json"], "constraints: the value must be a list"),
         ([*BUILD, "--set", "align.window=5", "--set", "align.window.x=2"], "conflicts with --set align.window=5"),
         ([*BUILD, "--set", "annotate.proposal=steps", "--propose", "steps"], "--propose steps conflicts with --set"),
         (["evaluate", "lab/walks", "--speeds", "1:inf:1"], "'1:inf:1': all values must be finite"),
@@ -263,7 +263,7 @@ def test_a_final_slash_of_an_address_means_the_folder_even_if_a_clip_has_its_nam
         assert request.url.path.endswith("/collections")
         return httpx.Response(200, content=b'{"items": [], "next_cursor": null}')
 
-    script.answers = [no_folder]
+    script.answers = [no_folder, no_folder]
     with pytest.raises(WrongUsage, match="there is no folder at lab/raw/walks"):
         require_item(marey, folder, [Kind.CLIP])
 
@@ -332,7 +332,7 @@ def test_who_asks_for_an_item_at_a_folder_is_told_that_it_is_one(
     script.answers = [page(), page(folder)]
     with pytest.raises(WrongUsage, match=r"^lab/raw is a folder; `marey ls lab/raw` lists it$"):
         find(script.marey())
-    script.answers = [page(), page()]
+    script.answers = [page()] * 20
     with pytest.raises(WrongUsage, match=r"^there is .* at lab/raw; `marey ls lab` lists the project$"):
         find(script.marey())
 
@@ -354,7 +354,9 @@ def test_a_job_that_succeeded_is_listed_with_all_its_work_done(fields: dict[str,
 def test_what_is_wrong_with_a_file_is_told_without_the_number_of_the_error(tmp_path: Path) -> None:
     with pytest.raises(OSError) as failed:
         (tmp_path / "nowhere" / "walk.bvh").write_bytes(b"")
-    assert sentence(failed.value) == f"{tmp_path}/nowhere/walk.bvh: No such file or directory"
+    assert sentence(failed.value) == (
+        f"{tmp_path}/nowhere/walk.bvh: there is no folder {tmp_path}/nowhere; create it, or name another file"
+    )
 
 
 def test_what_is_wrong_with_a_field_is_told_once(script: ScriptedServer) -> None:

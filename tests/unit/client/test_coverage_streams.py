@@ -55,7 +55,7 @@ def test_what_is_asked_for_is_sent_and_checked_before(
     assert decode_tree(request.content, "application/json") == {
         "frame_rate_hz": 60.0, "skeleton": "skeleton_1", "evaluation": None, "turn_rates_deg_s": [-90, 0, 90],
     }  # fmt: skip
-    with pytest.raises(ValueError, match="less than or equal to 240"):
+    with pytest.raises(ValueError, match="at most 240"):
         streams.begin(1000.0)
     assert len(script.requests) == 1
 

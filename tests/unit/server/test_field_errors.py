@@ -18,7 +18,7 @@ BACKWARDS = {"command": "trim", "start": 5, "stop": 2}
 def told(model: type[BaseModel], tree: dict[str, Any]) -> list[FieldError]:
     with pytest.raises(ValidationError) as refused:
         model.model_validate(tree)
-    return field_errors(refused.value, tree)
+    return field_errors(refused.value, model, tree)
 
 
 def test_pointers_escape_as_rfc_6901_says() -> None:

@@ -75,10 +75,10 @@ def test_the_pods_of_a_deployment_are_those_of_a_job() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "image: Field required"),
+        ({}, "image: this field is missing"),
         ({"image": "marey-worker:latest"}, "image: the image must be named by its digest"),
-        ({"image": IMAGE, "colour": "red"}, "colour: Extra inputs are not permitted"),
-        ({"image": IMAGE, "namespace": "Lab"}, "namespace: the text must have another form"),
+        ({"image": IMAGE, "colour": "red"}, "colour: there is no field of this name"),
+        ({"image": IMAGE, "namespace": "Lab"}, "namespace: the text must have only lower-case letters"),
         ({"image": IMAGE, "relist_s": 0, "cpus": 0}, "cpus: .*; relist_s: "),
     ],
 )

@@ -28,7 +28,7 @@ from marey_schemas.lru import LruCache
 from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.queue.job_params import EvaluateParams
 from marey_schemas.queue.worker_protocol import PinnedInput
-from marey_schemas.wording import NAMES_SHOWN, counted
+from marey_schemas.wording import NAMES_SHOWN, counted, first_reason
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 
@@ -136,7 +136,7 @@ def refusing_motion_errors() -> Iterator[None]:
     except MotionError as error:
         raise JobRefused(error.code, str(error)) from error
     except ValidationError as error:
-        raise JobRefused("option-invalid", str(error)) from error
+        raise JobRefused("option-invalid", first_reason(error)) from error
 
 
 def build_set(

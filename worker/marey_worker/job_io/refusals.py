@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from marey_motion.errors import MotionError
 from marey_schemas.queue.jobs import NOTHING_DONE
 from marey_schemas.queue.worker_protocol import PinnedInput
-from marey_schemas.wording import counted
+from marey_schemas.wording import counted, first_reason
 from marey_worker.context import Context, JobRefused, NoSuchThing, Unreadable
 
 UNUSABLE = (MotionError, ValidationError, Unreadable)
@@ -38,9 +38,10 @@ class Refusals:
     ) -> None:
         """Add a refused input. `name` identifies the refusal to users; by default, the path of the input does."""
         shown = name or pin.path
-        code = "bad-document" if isinstance(error, ValidationError) else error.code
-        self._context.log(f"{shown}: {error}")
-        self.entries.append({"name": shown, "item": pin.item, "code": code, "detail": str(error)})
+        invalid = isinstance(error, ValidationError)
+        code, detail = ("bad-document", first_reason(error)) if invalid else (error.code, str(error))
+        self._context.log(f"{shown}: {detail}")
+        self.entries.append({"name": shown, "item": pin.item, "code": code, "detail": detail})
 
     def require_some(self, made: int, count: int, done: str, *, what: str = "clip") -> None:
         """Raise `JobRefused` if the job refused all of its `count` inputs and made nothing of them (`made` is 0).

@@ -21,6 +21,7 @@ from marey_schemas.editing.edits import EditDocument
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import EditParams
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.wording import first_reason
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces
@@ -218,7 +219,7 @@ def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | No
     try:
         return pin, EditDocument.model_validate(context.document(Kind.EDIT, pin.item, pin.revision, "edit"))
     except ValidationError as error:
-        raise JobRefused("bad-document", f"the edit {pin.path} cannot be applied: {error}") from error
+        raise JobRefused("bad-document", f"the edit {pin.path} cannot be applied: {first_reason(error)}") from error
 
 
 def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInput]:

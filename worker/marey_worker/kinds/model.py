@@ -26,6 +26,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import ModelOptions
 from marey_schemas.queue.job_params import ModelParams
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.wording import first_reason
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.stored_reports import inputs_of, store_report
@@ -77,7 +78,7 @@ def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[MotionDoc
         try:
             AlignmentInfo.model_validate(tree)
         except ValidationError as error:
-            raise JobRefused("bad-document", f"{pin.path}: {error}") from error
+            raise JobRefused("bad-document", f"{pin.path}: {first_reason(error)}") from error
         infos.append(tree)
     return motions, infos
 

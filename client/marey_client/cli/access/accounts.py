@@ -84,6 +84,8 @@ def login(
         url = marey.transport.url
         if with_token:
             secret = typer.get_text_stream("stdin").read().strip()
+            if not secret:
+                raise WrongUsage("standard input contains no token; write marey login --with-token < FILE")
         elif browser:
             from marey_client.cli.access.browser_login import sign_in_in_browser
 
@@ -147,10 +149,10 @@ def create_user(
     """Create a user; the command asks for the password twice."""
     from marey_schemas.access import UserCreate
 
-    password = None
-    if not without_password:
-        password = ask_secret(f"Password for {name}", twice=True)
-    wanted = UserCreate(name=name, display_name=display_name, password=password, administrator=administrator)
+    wanted = UserCreate(name=name, display_name=display_name, administrator=administrator)
+    if not without_password:  # a name that is not valid has been refused before
+        password = ask_secret(f"the password for {name}", twice=True)
+        wanted = UserCreate(name=name, display_name=display_name, password=password, administrator=administrator)
     with connect(context) as marey:
         made = marey.users.create(wanted)
     if as_json:

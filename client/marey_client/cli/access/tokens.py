@@ -13,7 +13,7 @@ import typer
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, connect, credential_of, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table
-from marey_schemas.sizes import DAY_S
+from marey_schemas.sizes import DAY_S, LONGEST_TOKEN_DAYS
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def create_token(
         int | None,
         typer.Option(
             min=0,
+            max=LONGEST_TOKEN_DAYS,
             help="Number of days for which the token is valid; 0: the token does not expire. Default: 90, but not "
             "longer than your own token.",
         ),

@@ -72,7 +72,7 @@ fi
 """
 _FISH = r"""
 function __marey_completion
-    set -l typed (commandline -cp | string collect --no-trim-newlines)
+    set -l typed (commandline -cp | string collect)
     set -l lines (env _MAREY_COMPLETE=complete_fish _TYPER_COMPLETE_ARGS="$typed" marey 2>/dev/null)
     if test $status -eq 3
         __fish_complete_path (commandline -ct)

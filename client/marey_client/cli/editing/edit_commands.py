@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.typed_values import Schema, parameters_of, read_value, type_text
+from marey_schemas.wording import suggestion
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -24,7 +25,7 @@ def parse_command(text: str) -> dict[str, Any]:
 
     name, *assigned = _words(text) or [""]
     if name not in COMMAND_MODELS:
-        raise WrongUsage(f"there is no command {name!r}; the commands are {', '.join(COMMAND_MODELS)}")
+        raise WrongUsage(f"there is no command {name!r}; {suggestion(name, COMMAND_MODELS, 'commands')}")
     parameters = _parameters(COMMAND_MODELS[name])
     command: dict[str, Any] = {"command": name}
     for assignment in assigned:

@@ -15,7 +15,7 @@ from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_pairs, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.terminal.typed_values import is_frame, read_json
-from marey_schemas.wording import counted
+from marey_schemas.wording import counted, suggestion
 
 if TYPE_CHECKING:
     from marey_client.handles.edits import EditHandle
@@ -156,7 +156,7 @@ def list_commands(
     from marey_schemas.editing.edits import COMMAND_MODELS
 
     if name is not None and name not in COMMAND_MODELS:
-        raise WrongUsage(f"there is no command {name!r}; the commands are {', '.join(COMMAND_MODELS)}")
+        raise WrongUsage(f"there is no command {name!r}; {suggestion(name, COMMAND_MODELS, 'commands')}")
     wanted = {one: model for one, model in COMMAND_MODELS.items() if name in (None, one)}
     if as_json:
         return print_json({one: model.model_json_schema() for one, model in wanted.items()})

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from marey_client.cli.addresses import Address
+from marey_client.cli.addresses import Address, advice
 from marey_client.cli.revisions import RevisionNumber, at_revision, find_revision, find_version
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
@@ -137,7 +137,7 @@ def _exported_at(marey: Marey, address: Address) -> list[_Exported]:
         return [_Exported(*single, "", single[0].name)]
     if not below:
         raise WrongUsage(
-            f"there is no item and no folder with clips at {address}; `marey ls {address.project}` lists the project"
+            f"there is no item and no folder with clips at {address}; {advice(project, address.path, Kind)}"
         )
     return [_Exported(one, None, one.item.collection.removeprefix(address.path).strip("/"), one.name) for one in below]
 

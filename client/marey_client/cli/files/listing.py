@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address, find_item, kind_named
+from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address, advice, find_item, kind_named
 from marey_client.cli.holdings import outdated
 from marey_client.cli.revisions import RevisionNumber, at_revision, require_revision
 from marey_client.cli.terminal.failures import WrongUsage
@@ -234,7 +234,9 @@ def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:
 
     item = find_item(marey, address, list(Kind))
     if item is None and address.path:
-        raise WrongUsage(f"there is no item or folder at {address}; `marey ls {address.project}` lists the project")
+        raise WrongUsage(
+            f"there is no item or folder at {address}; {advice(marey.project(address.project), address.path, Kind)}"
+        )
     return [] if item is None else [item]
 
 

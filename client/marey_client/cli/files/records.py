@@ -116,7 +116,7 @@ def _checked(given: Mapping[str, str], place: str) -> dict[str, Any]:
     except ValidationError as error:
         first = error.errors()[0]
         raise WrongUsage(
-            f"{place}, {'.'.join(map(str, first['loc']))}: {plain_reason(first['msg'])}, not {first['input']!r}"
+            f"{place}, {'.'.join(map(str, first['loc']))}: {plain_reason(first)}, not {first['input']!r}"
         ) from None
     return {name: getattr(checked, name) for name in given}
 

@@ -15,7 +15,7 @@ from marey_client.cli.terminal.invocation import AsJson, JobId, ProjectName, con
 from marey_client.cli.terminal.output import ago, print_json, print_message, print_pairs, print_table
 from marey_client.cli.terminal.schema_options import Chosen, add_command
 from marey_client.cli.terminal.typed_values import Schema, assignment, range_text, read_parameter, resolved, type_text
-from marey_schemas.wording import counted
+from marey_schemas.wording import counted, suggestion
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
@@ -122,7 +122,7 @@ def submit_job(
 def _kind_of_job(marey: Marey, name: str) -> JobKind:
     kinds = {kind.name: kind for kind in marey.jobs.kinds()}
     if name not in kinds:
-        raise WrongUsage(f"this server has no job kind {name!r}; its job kinds are {', '.join(kinds)}")
+        raise WrongUsage(f"this server has no job kind {name!r}; {suggestion(name, kinds, 'job kinds')}")
     return kinds[name]
 
 

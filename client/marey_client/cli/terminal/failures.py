@@ -6,8 +6,9 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
-from marey_schemas.wording import plain_reason, printable
+from marey_schemas.wording import first_reason, plain_reason, printable
 
 FAILED, WRONG_USAGE = 1, 2
 INTERRUPTED = 130
@@ -45,16 +46,33 @@ def reported(*, verbose: bool) -> Iterator[None]:
         from marey_schemas.encoding.codecs import CodecError
 
         if isinstance(error, ValidationError):
-            first = error.errors(include_url=False)[0]
-            where = ".".join(str(step) for step in first["loc"])
-            text = plain_reason(first["msg"])
-            _exit(WRONG_USAGE, f"{where}: {text}" if where else text, verbose)
+            _exit(WRONG_USAGE, first_reason(error), verbose)
         if isinstance(error, BadAddress | BadArgument | CodecError):
             _exit(WRONG_USAGE, str(error), verbose)
         if isinstance(error, UnicodeEncodeError):
             _exit(WRONG_USAGE, f"{error.object[:MOST_SHOWN]!r} is not text in UTF-8", verbose)
         if isinstance(error, MareyError | OSError):
             _exit(FAILED, sentence(error), verbose)
+        raise
+
+
+@contextmanager
+def usage_in_plain_words() -> Iterator[None]:
+    """Explain wrong options and arguments in words for people, where typer passes on the words of its libraries."""
+    from typer import BadParameter
+    from typer.core import _click
+
+    try:
+        yield
+    except BadParameter as error:
+        faults = getattr(error.__cause__, "errors", None)
+        if faults is not None:
+            error.message = plain_reason(faults()[0])
+        raise
+    except _click.exceptions.NoSuchOption as error:
+        files = [one for one in sys.argv[1:] if one.startswith(error.option_name) and os.path.exists(one)]
+        if files:
+            error.message = f"{files[0]} is read as an option; for the file of this name, write ./{files[0]}"
         raise
 
 
@@ -81,7 +99,7 @@ def sentence(error: BaseException) -> str:
     if not isinstance(error, RequestFailed):
         return text
     where = f" at {error.server}" if error.server else ""
-    whole = f"{text} ({error.code}, request {error.request_id}{where})"
+    whole = f"{text} ({error.code}, request {error.request_id}{where})" if error.request_id else text
     if error.anonymous and (isinstance(error, NotFound) or error.code == "unauthenticated"):
         return f"{whole}; {ANONYMOUS_HINT}"
     return "; ".join([whole, *getattr(error, "__notes__", ())])
@@ -89,9 +107,14 @@ def sentence(error: BaseException) -> str:
 
 def _text_of(error: BaseException) -> str:
     """Return the text of an error; for errors about files, the name of the file and the reason."""
-    if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
-        return f"{os.fsdecode(error.filename)}: {error.strerror}"
-    return str(error)
+    if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
+        return str(error)
+    file = Path(os.fsdecode(error.filename))
+    if isinstance(error, FileNotFoundError) and not file.parent.exists():
+        return f"{file}: there is no folder {file.parent}; create it, or name another file"
+    if isinstance(error, FileExistsError | NotADirectoryError) and file.is_file():
+        return f"{file} exists already, as a file; choose another name"
+    return f"{file}: {error.strerror}"
 
 
 def _exit(status: int, text: str, verbose: bool) -> None:

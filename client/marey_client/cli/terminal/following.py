@@ -43,7 +43,7 @@ class _CommittingJob(OptionsOf):
         try:
             commit = CommitOptions.model_validate(_COMMIT.read(typed)).commit()
         except ValidationError as error:
-            raise WrongUsage(f"--commit-to: {plain_reason(error.errors()[0]['msg'])}") from None
+            raise WrongUsage(f"--commit-to: {plain_reason(error.errors()[0])}") from None
         except ValueError as error:
             raise WrongUsage(str(error)) from None
         return {**self._job.read(typed), **({} if commit is None else {"commit": commit})}

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+from urllib.parse import urlsplit
 
 import typer
 
@@ -47,6 +48,8 @@ class Invocation:
     verbose: bool
 
 
+MOST_COMPARED = 1000
+"""Greatest number of projects with whose names a misspelt name is compared."""
 NO_OPTIONS = Invocation(None, None, False)
 
 
@@ -89,14 +92,14 @@ def connect_other(url: str | None, token_file: Path | None, first: Marey) -> Ite
         try:
             yield marey
         except Unauthenticated as error:
-            error.add_note(f"if {found.url} refused the token: marey login {found.url} stores one for it")
+            error.add_note(f"if {found.url} refused the token: `marey login --server {found.url}` stores one for it")
             raise
 
 
 @contextmanager
 def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Marey]:
     """Return a connection to the server named by the options, the environment or `marey login`."""
-    from marey_client.errors import Unauthenticated
+    from marey_client.errors import Forbidden, NotFound, Unauthenticated
     from marey_client.marey import Marey
 
     if (context.find_object(Invocation) or NO_OPTIONS).verbose:
@@ -114,3 +117,23 @@ def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Mare
             if found.origin and not anonymous:
                 error.add_note(f"the token comes from {found.origin}; marey login creates a new one")
             raise
+        except NotFound as error:
+            if error.code == "no-project" and not error.anonymous:
+                error.add_note(_nearest_project(marey, str(error.context.get("project", ""))))
+            if error.code == "not-found" and (path := urlsplit(found.url).path):
+                error.add_note(f"the address of the server, {found.url}, may be right without {path}")
+            raise
+        except Forbidden as error:
+            if error.code == "insufficient-scope" and found.origin:
+                error.add_note(f"the token comes from {found.origin}; marey login creates one with all your rights")
+            raise
+
+
+def _nearest_project(marey: Marey, name: str) -> str:
+    """Return advice to somebody who named a project that does not exist."""
+    from itertools import islice
+
+    from marey_schemas.wording import nearest
+
+    near = nearest(name, (one.name for one in islice(marey.projects(), MOST_COMPARED)))
+    return f"did you mean {near}?" if near else "`marey project ls` lists the projects that you may see"

@@ -80,7 +80,7 @@ class OptionsOf:
         except ValidationError as error:
             for one in error.errors(include_url=False):
                 if one["type"] != "missing":  # that the command adds
-                    raise WrongUsage(f"{self._spelled(one['loc'])}{plain_reason(one['msg'])}") from None
+                    raise WrongUsage(f"{self._spelled(one['loc'])}{plain_reason(one)}") from None
         return chosen
 
     @cached_property

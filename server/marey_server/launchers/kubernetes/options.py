@@ -7,9 +7,14 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
+from marey_schemas.names import form
 from marey_schemas.queue.own_pods import Image
 
-Name = Annotated[str, StringConstraints(pattern=r"^[a-z0-9]([a-z0-9-]*[a-z0-9])?$", max_length=63)]
+_NAME = form(
+    r"^[a-z0-9]([a-z0-9-]*[a-z0-9])?$",
+    "have only lower-case letters, digits and -, and begin and end with a letter or a digit",
+)
+Name = Annotated[str, StringConstraints(pattern=_NAME, max_length=63)]
 """Name of an object in Kubernetes."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Select, and_, exists, select, tuple_
+from sqlalchemy import ColumnElement, Row, Select, and_, exists, func, select, tuple_
 
 from marey_schemas.documents.skeleton_merges import SKELETON_MERGE
 from marey_schemas.items import Lineage, LineageEdge, Page, Revision, Staleness
@@ -52,13 +52,15 @@ def _revision_rows() -> Select[*tuple[Any, ...]]:
 def find_revision(tx: Transaction, item_id: str, number: int) -> Row[Any]:
     row = tx.execute(_revision_rows().where(revision.c.item_id == item_id, revision.c.number == number)).first()
     if row is None:
-        raise no_revision(item_id, number)
+        newest = tx.execute(select(func.max(revision.c.number)).where(revision.c.item_id == item_id)).scalar()
+        raise no_revision(item_id, number, newest)
     return row
 
 
-def no_revision(item_id: str, number: int) -> NotFoundProblem:
-    """Return the error for a revision that does not exist."""
-    return NotFoundProblem(f"The item {item_id!r} has no revision {number}.", code="no-revision")
+def no_revision(item_id: str, number: int, newest: int | None = None) -> NotFoundProblem:
+    """Return the error for a revision that does not exist; `newest` is the number of the newest one, if known."""
+    hint = "" if newest is None else f"; the newest is revision {newest}"
+    return NotFoundProblem(f"The item {item_id!r} has no revision {number}{hint}.", code="no-revision")
 
 
 def _shown(tx: Transaction, rows: Collection[Row[Any]]) -> list[Revision]:

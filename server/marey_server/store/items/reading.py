@@ -10,7 +10,7 @@ from sqlalchemy import Row, Select, and_, bindparam, not_, or_, select, type_coe
 from sqlalchemy.types import NullType
 
 from marey_schemas.items import Item, PartPlace, PartSummary
-from marey_schemas.kinds import Kind
+from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.sizes import MIB
 from marey_server.errors import GoneProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import documents, projects
@@ -230,7 +230,11 @@ def find_part(
     else:
         row = tx.first(_PART_OF_REVISION, {**which, "number": revision})
     if row is None:
-        raise NotFoundProblem(f"The {kind} {item_id!r} has no part {part!r} at the requested revision.", code="no-part")
+        raise NotFoundProblem(
+            f"The {kind} {item_id!r} has no part {part!r} at the requested revision; a {kind} can have the parts "
+            f"{', '.join(PARTS[kind])}.",
+            code="no-part",
+        )
     return FoundPart(row.document_digest, row.number, row.rev, row.size_bytes)
 
 

@@ -147,7 +147,7 @@ def _pin_input(
 ) -> list[Pin]:
     single = not isinstance(choices, tuple)
     if spec.required and not _as_many(choices):
-        errors.append(_error(pointer, "empty-input", f"This input needs at least one {spec.kind.value}."))
+        errors.append(_error(pointer, "empty-input", f"This input needs at least one {spec.kind.noun}."))
     pins: dict[tuple[str, int], Pin] = {}
     made: dict[str, Pin] = {}
     for index, choice in enumerate(_as_many(choices)):
@@ -162,7 +162,8 @@ def _pin_input(
         if isinstance(choice, CollectionInput):
             found = _items_below(tx, project, spec, choice.collection)
             if not found:
-                detail = f"The collection {choice.collection!r} contains no {spec.kind.value}."
+                hint = "; align its clips first" if spec.kind is Kind.PROCESSED else ""
+                detail = f"The collection {choice.collection!r} contains no {spec.kind.noun}{hint}."
                 errors.append(_error(f"{place}/collection", "empty-collection", detail))
             chosen = [(one, one.head) for one in found]
         else:

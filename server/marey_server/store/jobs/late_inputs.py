@@ -16,7 +16,7 @@ from sqlalchemy import Row, and_, insert, select, update
 from marey_schemas.queue.job_kinds import UnknownKindError, kind_of_job
 from marey_schemas.queue.jobs import FailureReason, InputSpec
 from marey_schemas.queue.kind_declaration import KindDeclaration
-from marey_schemas.wording import plain_reason
+from marey_schemas.wording import first_reason
 from marey_server import faults
 from marey_server.errors import QuotaExceededProblem
 from marey_server.store.jobs import commits, layout, result_cache
@@ -91,10 +91,7 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
             f"version accepted: {error}.",
         ) from error
     except ValidationError as error:
-        detail = (
-            f"In this version of the server, these parameters of {row.kind} are not valid: "
-            f"{plain_reason(error.errors()[0]['msg'])}"
-        )
+        detail = f"In this version of the server, these parameters of {row.kind} are not valid: {first_reason(error)}"
         raise LateInputError("invalid-params", detail) from error
     pins = _pin_outputs(tx, row, kind)
     if (clash := find_clash(kind, params, pins, row.into_path)) is not None:

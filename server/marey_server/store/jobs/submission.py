@@ -173,7 +173,7 @@ def _check(
     try:
         params = kind.params.model_validate(request.params)
     except ValidationError as error:
-        found = field_errors(error, request.params, lambda steps: f"{at}/params{json_pointer(steps)}")
+        found = field_errors(error, kind.params, request.params, lambda steps: f"{at}/params{json_pointer(steps)}")
         detail = f"These parameters are not valid for {kind.name}: {found[0].pointer}: {found[0].detail}"
         raise InvalidProblem(detail, errors=found) from error
     image = None

@@ -14,6 +14,7 @@ from sqlalchemy import Row, select, update
 
 from marey_schemas.access import Role
 from marey_schemas.queue.jobs import JobCreate
+from marey_schemas.wording import first_reason
 from marey_server.access import scopes
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.roles import RequiredRole
@@ -138,7 +139,7 @@ def _reason(error: ApiProblem | ValidationError, *, may_read: bool) -> str:
     """Return the reason of a refusal, without names if the token that made the schedule may not read the project."""
     if isinstance(error, ApiProblem):
         return error.detail if may_read else error.unnamed or error.detail
-    return f"The job is no longer valid: {error}"
+    return f"The job is no longer valid: {first_reason(error)}"
 
 
 def _is_unfinished(tx: Transaction, job_id: str | None) -> bool:
