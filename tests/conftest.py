@@ -18,6 +18,7 @@ pytest_plugins = (
     "tests.support.database_fixtures",
     "tests.support.shared_statements",
     "tests.support.slow_tests",
+    "tests.support.names_of_tests",
     "tests.support.tiers",
     "tests.support.store_fixtures",
     "tests.support.queue_desk",

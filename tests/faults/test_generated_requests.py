@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.furnished_house import start_attempt
-from tests.support.generated_requests import AnyCase, FuzzedServer, fuzzed_server, generate, probes
+from tests.support.generated_requests import AnyCase, FuzzedServer, fuzzed_server, generate, operations, probes
 from tests.support.who_may import PEOPLE
 
 from marey_server.store.database.connections import Database
@@ -46,16 +46,16 @@ class Round:
         """Send requests; fail if an answer contradicts the OpenAPI document or takes too long."""
         end = time.monotonic() + seconds
         for of_seed in itertools.count():
-            for operation, mode, name in random.Random(f"{self._caller} {of_seed}").sample(PROBES, len(PROBES)):
+            for label, mode in random.Random(f"{self._caller} {of_seed}").sample(PROBES, len(PROBES)):
                 self._restore()
-                for requests in self._fuzzed.requests(operation, mode):
+                for requests in self._fuzzed.requests(operations()[label], mode):
                     if time.monotonic() > end or len(self._faults) >= MOST_FAULTS:
                         self._report()
                         return
                     try:
                         generate(requests, AT_ONCE, of_seed, self._send)
                     except Exception as error:
-                        self._faults.append(f"{name}, seed {of_seed}: {error!r}"[:4000])
+                        self._faults.append(f"{label} {mode.value}, seed {of_seed}: {error!r}"[:4000])
 
     def _send(self, case: AnyCase) -> None:
         status, took_s = self._fuzzed.send(case, self._caller)

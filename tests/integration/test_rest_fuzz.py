@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from schemathesis.generation import GenerationMode
-from tests.support.generated_requests import AnyOperation, FuzzedServer, fuzzed_server, generate, probes
+from tests.support.generated_requests import FuzzedServer, fuzzed_server, generate, operations, probes
 from tests.support.tiers import examples
 
 from marey_server.store.database.connections import Database
@@ -27,11 +27,18 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FuzzedServer]:
         yield server
 
 
+def test_requests_are_sent_to_all_published_operations() -> None:
+    published = operations()
+    unfit = {label for label, operation in published.items() if operation.query or operation.body}
+    assert {label for label, mode in probes() if mode is GenerationMode.POSITIVE} == published.keys()
+    assert {label for label, mode in probes() if mode is GenerationMode.NEGATIVE} == unfit
+
+
 @pytest.mark.parametrize(
-    ("operation", "mode"), [pytest.param(operation, mode, id=name) for operation, mode, name in probes()]
+    ("label", "mode"), [pytest.param(label, mode, id=f"{label} {mode.value}") for label, mode in probes()]
 )
 def test_every_answer_is_as_published_and_none_is_a_fault_of_ours(
-    fuzzed: FuzzedServer, operation: AnyOperation, mode: GenerationMode
+    fuzzed: FuzzedServer, label: str, mode: GenerationMode
 ) -> None:
-    for requests in fuzzed.requests(operation, mode):
+    for requests in fuzzed.requests(operations()[label], mode):
         generate(requests, examples(FEW), SEED, lambda case: [fuzzed.send(case, name) for name in CALLERS])

@@ -9,8 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import openapi_python_client
-from openapi_python_client.config import Config, ConfigFile, MetaType
 from tests.support.tiers import NODE_PACKAGES
 
 BYTES_TYPES = ("application/zip", "image/png")
@@ -21,6 +19,9 @@ ONLY_AS_JSON = ("Unsupported content type application/msgpack", "Unsupported con
 
 def generate_python_client(document: Path, package: Path) -> list[str]:
     """Generate a Python package from an OpenAPI document in a file; return the warnings of the generator."""
+    import openapi_python_client  # takes long to load, and each test process imports this module
+    from openapi_python_client.config import Config, ConfigFile, MetaType
+
     types = dict.fromkeys(BYTES_TYPES, "application/octet-stream")
     settings = ConfigFile(literal_enums=True, post_hooks=[], content_type_overrides=types)
     config = Config.from_sources(settings, MetaType.NONE, document, "utf-8", overwrite=True, output_path=package)

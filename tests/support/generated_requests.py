@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
-from tests.support.api_document import api_document
+from tests.support.api_document import api_document, api_routes
 from tests.support.furnished_house import CANARY, INVENTED, House, build_house
 from tests.support.rest_server import running
 from tests.support.tiers import is_soak
@@ -102,22 +102,24 @@ def fuzzed_server(database: Database, folder: Path) -> Iterator[FuzzedServer]:
 
 
 @functools.cache
-def operations() -> list[AnyOperation]:
-    """Return every operation of the OpenAPI document."""
+def operations() -> Mapping[str, AnyOperation]:
+    """Return every operation of the OpenAPI document by its label, as in `GET /api/v1/projects`."""
     schema = schemathesis.openapi.from_dict(deepcopy(api_document()), config=schemathesis.config.SchemathesisConfig())
     results: Any = schema.get_all_operations()
-    return [result.ok() for result in results]
+    return {operation.label: operation for operation in (result.ok() for result in results)}
 
 
-def probes() -> Iterator[tuple[AnyOperation, GenerationMode, str]]:
-    """Yield (operation, mode, name) for valid requests to each operation.
+def probes() -> Iterator[tuple[str, GenerationMode]]:
+    """Yield (label of the operation, mode) for valid requests to each operation.
 
-    If the operation has a query or a body, also yield it for invalid requests.
+    If the operation has a query or a body, also yield it for invalid requests. The table of routes contains all this:
+    building the OpenAPI document takes a second, and each test process names its tests.
     """
-    for operation in operations():
-        yield operation, GenerationMode.POSITIVE, f"{operation.label} fitting"
-        if operation.query or operation.body:
-            yield operation, GenerationMode.NEGATIVE, f"{operation.label} unfit"
+    for route in api_routes():
+        label = f"{route.operation.method} {route.template}"
+        yield label, GenerationMode.POSITIVE
+        if (route.operation.query and route.operation.query.model_fields) or route.operation.body:
+            yield label, GenerationMode.NEGATIVE
 
 
 def generate(requests: Any, number: int, of_seed: int, send: Callable[[AnyCase], object]) -> None:

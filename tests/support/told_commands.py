@@ -1,5 +1,6 @@
 """Commands of `marey` that pages and files of the project name, compared with the command line."""
 
+import functools
 import re
 from typing import Any
 
@@ -8,7 +9,11 @@ from typer.main import get_command
 
 from marey_client.cli.app import app
 
-COMMANDS = get_command(app)
+
+@functools.cache
+def commands() -> Any:
+    """Return the command line. Building all its commands takes long, and each test process imports this module."""
+    return get_command(app)
 
 
 def unknown_options(words: list[str]) -> set[str]:
@@ -16,7 +21,7 @@ def unknown_options(words: list[str]) -> set[str]:
 
     Raises `AssertionError` if there is no such command.
     """
-    command: Any = COMMANDS
+    command = commands()
     told = list(words)
     of_all = {option: parameter for parameter in command.params for option in parameter.opts}
     known = set(of_all)

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.alignment_examples import body_of, moved, walk
 from tests.support.edited_takes import under_static_root
+from tests.support.tiers import examples
 
 from marey_motion import quaternions
 from marey_motion.alignment.canonical import placed, to_canonical
@@ -22,6 +23,7 @@ def facing(motion: Motion, body: MatchingBody) -> Floats:
     return forward_directions(motion.positions(body.skeleton), body.lefts, body.rights)
 
 
+@settings(max_examples=examples(30, soak=100))
 @given(st.floats(-3.1, 3.1), st.floats(-9, 9), st.floats(-9, 9))
 def test_wherever_a_clip_was_it_begins_where_the_axes_cross_and_faces_z(heading_rad: float, x: float, z: float) -> None:
     clip = moved(walk(), heading_rad, x, z)

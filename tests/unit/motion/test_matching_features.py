@@ -1,3 +1,5 @@
+import functools
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -31,20 +33,30 @@ def moved(clip: Clip) -> Clip:
     return replace(clip, translations=translations.astype(np.float32), translated_joints=joints)
 
 
-CLIPS = {
-    "walk to the left": generate_gait(1.3, 0.7, 3.0, style=GaitStyle.varied(3)),
-    "run to the right": generate_gait(3.4, -0.6, 2.5, style=GaitStyle.varied(5)),
-    "sideways": generate_gait(0.6, 0.0, 2.0, travel_angle_rad=np.pi / 2),
-    "on the spot": generate_gait(0.0, -1.0, 8.0),
-    "start and stop": generate_along(start_and_stop(1.35, wait_s=0.5, ramp_s=0.6, cruise_s=1.0)),
-    "joints that move": moved(generate_gait(1.3, 0.7, 2.0)),
-    **{f"{frames} frames": generate_gait(1.2, 0.4, frames / 60.0) for frames in (1, 2, 3, 4, 5, 6, 21)},
+CLIPS: dict[str, Callable[[], Clip]] = {
+    "walk to the left": lambda: generate_gait(1.3, 0.7, 3.0, style=GaitStyle.varied(3)),
+    "run to the right": lambda: generate_gait(3.4, -0.6, 2.5, style=GaitStyle.varied(5)),
+    "sideways": lambda: generate_gait(0.6, 0.0, 2.0, travel_angle_rad=np.pi / 2),
+    "on the spot": lambda: generate_gait(0.0, -1.0, 8.0),
+    "start and stop": lambda: generate_along(start_and_stop(1.35, wait_s=0.5, ramp_s=0.6, cruise_s=1.0)),
+    "joints that move": lambda: moved(generate_gait(1.3, 0.7, 2.0)),
+    **{
+        f"{frames} frames": functools.partial(generate_gait, 1.2, 0.4, frames / 60.0)
+        for frames in (1, 2, 3, 4, 5, 6, 21)
+    },
 }
+
+
+@functools.cache
+def clip_named(name: str) -> Clip:
+    """Return a clip of `CLIPS`, which is only made if a test uses it: each test process imports this module."""
+    return CLIPS[name]()
 
 
 @pytest.mark.parametrize("name", CLIPS)
 def test_rows_are_those_of_plain_loops(name: str) -> None:
-    database, plain = built(CLIPS[name]), plain_rows(CLIPS[name], BODY)
+    clip = clip_named(name)
+    database, plain = built(clip), plain_rows(clip, BODY)
     np.testing.assert_allclose(database.features, plain.features, atol=1e-9)
     np.testing.assert_allclose(database.root_positions, plain.positions, atol=1e-11)
     np.testing.assert_allclose(database.root_headings, plain.headings, atol=1e-11)
@@ -79,7 +91,7 @@ def test_a_walk_in_a_circle_says_so_in_its_trajectory() -> None:
 
 
 def test_other_horizons_look_as_far_ahead_as_they_say() -> None:
-    database = built(CLIPS["walk to the left"], DatabaseOptions(horizons_s=(0.25, 0.5)))
+    database = built(clip_named("walk to the left"), DatabaseOptions(horizons_s=(0.25, 0.5)))
     assert database.features.shape[1] == 15 + 8
     row, root = 30, (database.root_positions, database.root_headings)
     step = root[0][row + 30] - root[0][row]
@@ -89,8 +101,8 @@ def test_other_horizons_look_as_far_ahead_as_they_say() -> None:
 
 
 def test_extra_joints_bring_their_position_and_velocity_between_hips_and_trajectory() -> None:
-    database = built(CLIPS["walk to the left"], DatabaseOptions(extra_joints=("left_wrist",)))
-    plain = plain_rows(CLIPS["walk to the left"], BODY)
+    database = built(clip_named("walk to the left"), DatabaseOptions(extra_joints=("left_wrist",)))
+    plain = plain_rows(clip_named("walk to the left"), BODY)
     wrist = BODY.pose_joints.index(BODY.standard_joints["left_wrist"])
     assert database.layout.names[15:22:6] == ("left_wrist_position.x", "trajectory_positions.0.333s.x")
     np.testing.assert_allclose(database.features[:, 15:18], plain.points[:, wrist], atol=1e-9)
@@ -100,7 +112,7 @@ def test_extra_joints_bring_their_position_and_velocity_between_hips_and_traject
 
 def test_many_joints_are_warned_of() -> None:
     options = DatabaseOptions(extra_joints=("left_wrist", "right_wrist", "head"))
-    notes = [note for note in built(CLIPS["walk to the left"], options).notes if note.code == "many-joints"]
+    notes = [note for note in built(clip_named("walk to the left"), options).notes if note.code == "many-joints"]
     assert [str(note) for note in notes] == ["6 joints are matched; with more than 5 the trajectory hardly counts"]
 
 
@@ -125,4 +137,4 @@ def test_options_that_make_no_sense_are_refused_by_name(options: dict[str, objec
 
 def test_a_joint_that_the_skeleton_lacks_is_refused_by_name() -> None:
     with pytest.raises(MotionError, match="extra_joints: the joint mapping of the skeleton has no tail; it has head"):
-        built(CLIPS["5 frames"], DatabaseOptions(extra_joints=("tail",)))
+        built(clip_named("5 frames"), DatabaseOptions(extra_joints=("tail",)))

@@ -9,6 +9,7 @@ from tests.support.modelling_examples import bending_chains, chain, walks
 from tests.support.present import present
 
 from marey_motion.errors import MotionError
+from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.primitive_documents import (
     primitive_from_tree,
     primitive_to_tree,
@@ -26,6 +27,11 @@ SKELETON = {"item": "skel_1", "revision": 2}
 @pytest.fixture(scope="module")
 def trained() -> TrainedPrimitive:
     return train_primitive(walks(12, 30), name="walk", seed=4)
+
+
+@pytest.fixture(scope="module")
+def swaying() -> MotionPrimitive:
+    return train_primitive(bending_chains()).primitive
 
 
 @pytest.mark.parametrize("media_type", MEDIA_TYPES)
@@ -84,30 +90,28 @@ def test_a_range_of_steps_that_is_none_is_refused(trained: TrainedPrimitive) -> 
         primitive_from_tree(tree, trained.primitive.skeleton)
 
 
-def test_joints_may_stand_in_another_order() -> None:
-    model = train_primitive(bending_chains()).primitive
-    tree = primitive_to_tree(model, SKELETON)
+def test_joints_may_stand_in_another_order(swaying: MotionPrimitive) -> None:
+    tree = primitive_to_tree(swaying, SKELETON)
     branched = Skeleton(
         ("bone_0", "bone_2", "bone_1", "bone_3"), np.array([-1, 0, 0, 0]), chain().offsets, chain().rest_rotations
     )
     read = primitive_from_tree(tree, branched)
-    latents = model.sample(2, 0)
-    here, there = (one.poses(latents)[..., 3:].reshape(2, -1, 4, 4) for one in (read, model))
+    latents = swaying.sample(2, 0)
+    here, there = (one.poses(latents)[..., 3:].reshape(2, -1, 4, 4) for one in (read, swaying))
     np.testing.assert_array_equal(here, there[:, :, [0, 2, 1, 3]])
 
 
-def test_splines_whose_degree_is_not_told_are_cubic() -> None:
-    model = train_primitive(bending_chains()).primitive
-    tree = primitive_to_tree(model, SKELETON)
+def test_splines_whose_degree_is_not_told_are_cubic(swaying: MotionPrimitive) -> None:
+    tree = primitive_to_tree(swaying, SKELETON)
     untold = {
         name: {key: one for key, one in tree[name].items() if key != "degree"} for name in ("spatial", "temporal")
     }
-    read = primitive_from_tree({**tree, **untold}, model.skeleton)
+    read = primitive_from_tree({**tree, **untold}, swaying.skeleton)
     assert (read.spatial.basis.degree, read.temporal.basis.degree) == (3, 3)
 
 
-def test_a_model_of_other_joints_is_refused() -> None:
-    tree = primitive_to_tree(train_primitive(bending_chains()).primitive, SKELETON)
+def test_a_model_of_other_joints_is_refused(swaying: MotionPrimitive) -> None:
+    tree = primitive_to_tree(swaying, SKELETON)
     with pytest.raises(MotionError, match="the model and the skeleton differ: bone_4"):
         primitive_from_tree(tree, chain(5))
     with pytest.raises(MotionError, match="marey/motion@1"):
@@ -125,8 +129,8 @@ def test_a_model_of_other_joints_is_refused() -> None:
         (("mixture", "weights"), "weights"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(place: tuple[Any, ...], told: str) -> None:
-    tree = primitive_to_tree(train_primitive(bending_chains()).primitive, SKELETON)
+def test_arrays_that_do_not_fit_are_refused(place: tuple[Any, ...], told: str, swaying: MotionPrimitive) -> None:
+    tree = primitive_to_tree(swaying, SKELETON)
     holder = tree
     for name in place[:-1]:
         holder = holder[name]

@@ -1,5 +1,6 @@
 """Sequences of motions: their continuity and their constraints, in the world and in real time."""
 
+import functools
 from dataclasses import replace
 from typing import Any
 
@@ -32,6 +33,7 @@ from marey_schemas.search_constraints import (
 START = Placement(0.5, 1.0, -2.0)
 
 
+@functools.cache
 def tree() -> SampleTree:
     return build_tree(walking()[0], 1, TreeOptions(samples=2000, features="latent"))
 
@@ -44,12 +46,15 @@ def walk_to(*places: Any) -> list[Step]:
     ]
 
 
-THREE = walk_to((1.6, -0.9), (2.3, 0.2), (3.1, 1.2))
+@functools.cache
+def three_steps() -> list[Step]:
+    """Return three steps of a walk, which are only made if a test uses them: each test process imports this module."""
+    return walk_to((1.6, -0.9), (2.3, 0.2), (3.1, 1.2))
 
 
 def found_three(**options: Any) -> tuple[Sequel, FoundMotion]:
-    sequel = search_steps(THREE, [tree()] * 3, start=START, **options)
-    return sequel, found_motion(THREE, sequel)
+    sequel = search_steps(three_steps(), [tree()] * 3, start=START, **options)
+    return sequel, found_motion(three_steps(), sequel)
 
 
 def heading_at(positions: Floats) -> Floats:
@@ -69,7 +74,7 @@ def test_a_step_may_begin_beyond_the_range_that_positions_in_requests_are_limite
 def test_the_body_goes_on_where_and_as_it_stood(refining: RefineOptions | None) -> None:
     sequel, found = found_three(refining=refining)
     ends = [found.frame_of(step, walking()[0], "end") for step in range(3)]
-    for number, (step, latent) in enumerate(zip(THREE, sequel.latents, strict=True)):
+    for number, (step, latent) in enumerate(zip(three_steps(), sequel.latents, strict=True)):
         if not number:
             continue
         # The first pose of a step, which stands in for the last one of the step before.
@@ -108,7 +113,7 @@ def test_both_hands_and_both_feet_go_on_within_centimetres_of_where_they_were() 
 def test_steps_end_where_they_were_asked_to() -> None:
     sequel, found = found_three(transitions=TransitionOptions(tolerance_m=0.3))
     positions = found.motion.positions(found.skeleton)[:, standard_joints()["pelvis"]]
-    for number, step in enumerate(THREE):
+    for number, step in enumerate(three_steps()):
         root = step.constraints[0]
         assert isinstance(root, RootPositionConstraint)
         place = positions[found.frame_of(number, step.primitive, "end"), [0, 2]]
@@ -135,7 +140,7 @@ def test_a_row_of_motions_has_the_frames_of_all_of_them_and_the_seams_once() -> 
 
 def test_a_tolerance_that_is_larger_lets_joints_jump_more() -> None:
     tight, loose = (
-        search_steps(THREE, [tree()] * 3, start=START, transitions=TransitionOptions(tolerance_m=size))
+        search_steps(three_steps(), [tree()] * 3, start=START, transitions=TransitionOptions(tolerance_m=size))
         for size in (0.005, 0.5)
     )
     assert sum(map(np.sum, tight.measured.jumps_m)) < sum(map(np.sum, loose.measured.jumps_m))
@@ -153,7 +158,7 @@ def test_one_step_needs_no_hips_and_shoulders() -> None:
 
 def test_a_constraint_that_is_wrong_is_told_by_step_and_place() -> None:
     steps = [
-        THREE[0],
+        three_steps()[0],
         Step(
             walking()[0],
             (RootHeadingConstraint(at="end", heading_deg=0.0), RootHeadingConstraint(at="never", heading_deg=0.0)),
@@ -168,16 +173,16 @@ def test_a_constraint_that_is_wrong_is_told_by_step_and_place() -> None:
 @pytest.mark.parametrize("count", [0, MOST_SEARCH_STEPS + 1])
 def test_the_number_of_steps_is_limited(count: int) -> None:
     with pytest.raises(InvalidConstraint, match="steps"):
-        search_steps(THREE[:1] * count, [tree()] * count)
+        search_steps(three_steps()[:1] * count, [tree()] * count)
 
 
 def test_steps_of_different_skeletons_make_no_motion() -> None:
-    sequel = search_steps(THREE[:1], [tree()])
+    sequel = search_steps(three_steps()[:1], [tree()])
     primitive = sliding(2)
     other = Step(primitive, (), {})
     wrong = search_steps([other], [build_tree(primitive, 0, TreeOptions(samples=10, features="latent"))])
     with pytest.raises(InvalidConstraint, match="another skeleton") as caught:
-        found_motion([THREE[0], other], joined(sequel, wrong))
+        found_motion([three_steps()[0], other], joined(sequel, wrong))
     assert caught.value.where == "steps[1]"
 
 
@@ -211,7 +216,7 @@ def test_inverse_kinematics_removes_what_is_left() -> None:
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_straight_legs_are_finished_with_knees_that_bend_forwards(side: str) -> None:
-    step = THREE[0]
+    step = three_steps()[0]
     found = found_motion([step], search_steps([step], [tree()], start=START))
     hip, knee, ankle = (standard_joints()[f"{side}_{part}"] for part in ("hip", "knee", "ankle"))
     rotations = found.motion.rotations.copy()
@@ -234,6 +239,6 @@ def test_straight_legs_are_finished_with_knees_that_bend_forwards(side: str) -> 
 
 
 def test_where_nothing_can_be_finished_the_motion_stays() -> None:
-    step = THREE[0]
+    step = three_steps()[0]
     found = found_motion([step], search_steps([step], [tree()], start=START))
     assert finish_motion([step], found, map_joints(found.skeleton)).found is found

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tests.support.judged_rigs import Actor, JudgedRetargeting, degrees_between, plan_between
 from tests.support.present import present
+from tests.support.tiers import is_soak
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import AnyFloats, Floats
@@ -174,9 +175,11 @@ def with_lowered_arms(skeleton: Skeleton, angle_deg: float) -> Skeleton:
     return replace(skeleton, rest_rotations=rest)
 
 
-def algorithm_1(source: SimpleNamespace, target: Actor, plan: RetargetPlan, frame: int) -> Floats:
-    """Return the local rotations (K, 4) of one pose, computed joint by joint (Herrmann et al. 2019, Algorithm 1)."""
-    source_global = kinematics.global_rotations(source.clip).astype(np.float64)[frame]
+def algorithm_1(source: SimpleNamespace, source_global: Floats, target: Actor, plan: RetargetPlan) -> Floats:
+    """Return the local rotations (K, 4) of one pose, computed joint by joint (Herrmann et al. 2019, Algorithm 1).
+
+    `source_global` (J, 4) are the rotations of the joints of the source in this pose.
+    """
     target_global = quaternions.identity(target.skeleton.joint_count)
     local = target.skeleton.rest_rotations.copy()
     followed = {pair.target: pair.source for pair in plan.pairs}
@@ -205,8 +208,10 @@ def test_the_precomputed_corrections_equal_algorithm_1_done_pose_by_pose(studio:
         plan = plan_between(source, target)
         result = transfer(moving.clip, plan, moving.clip.poses[:, 3:])
 
-        for frame in range(moving.clip.frame_count):
-            expected = algorithm_1(moving, target, plan, frame)
+        globally = kinematics.global_rotations(moving.clip).astype(np.float64)
+        frames = range(moving.clip.frame_count)
+        for frame in frames if is_soak() else (*frames[:6], *frames[6::10]):  # the first ones are the half turns
+            expected = algorithm_1(moving, globally[frame], target, plan)
             assert quaternions.angle_between(result.rotations[frame].astype(float), expected).max() < 1e-5
 
 

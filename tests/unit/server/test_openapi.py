@@ -4,7 +4,7 @@ import base64
 import hashlib
 import json
 import re
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import pytest
 from jsonschema import Draft202012Validator
@@ -14,26 +14,45 @@ from marey_schemas.encoding.codecs import MEDIA_TYPES
 from marey_schemas.items import ItemCreate
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.http.docs_page import POLICY, render_page
-from marey_server.http.routes import RouteTable
-
-DOCUMENT = api_document()
-OPERATIONS = [
-    (path, method, operation)
-    for path, entry in DOCUMENT["paths"].items()
-    for method, operation in entry.items()
-    if method != "parameters"
-]
+from marey_server.http.routes import Route, RouteTable
 
 
-def test_every_route_is_described_once_and_nothing_else_is() -> None:
-    described = {(path, method.upper()) for path, method, _ in OPERATIONS}
+class Described(NamedTuple):
+    """Path, method and description of an operation."""
+
+    path: str
+    method: str
+    operation: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def document() -> dict[str, Any]:
+    """The whole document; only read it."""
+    return api_document()
+
+
+@pytest.fixture(scope="module")
+def operations(document: dict[str, Any]) -> list[Described]:
+    """All operations of the document."""
+    return [
+        Described(path, method, operation)
+        for path, entry in document["paths"].items()
+        for method, operation in entry.items()
+        if method != "parameters"
+    ]
+
+
+def test_every_route_is_described_once_and_nothing_else_is(operations: list[Described]) -> None:
+    described = {(path, method.upper()) for path, method, _ in operations}
     assert described == {(route.template, route.operation.method) for route in api_routes()}
-    names = [operation["operationId"] for _, _, operation in OPERATIONS]
+    names = [operation["operationId"] for _, _, operation in operations]
     assert len(set(names)) == len(names)
 
 
-@pytest.mark.parametrize(("path", "operation"), [(path, operation) for path, _, operation in OPERATIONS])
-def test_an_operation_says_what_it_does_who_may_and_what_can_go_wrong(path: str, operation: dict[str, Any]) -> None:
+@pytest.mark.parametrize("route", api_routes(), ids=lambda route: f"{route.operation.method} {route.template}")
+def test_an_operation_says_what_it_does_who_may_and_what_can_go_wrong(document: dict[str, Any], route: Route) -> None:
+    path, entry = route.template, document["paths"][route.template]
+    operation = entry[route.operation.method.lower()]
     assert operation["summary"]
     assert operation["description"].endswith(".")
     (sample,) = operation["x-codeSamples"]
@@ -46,41 +65,43 @@ def test_an_operation_says_what_it_does_who_may_and_what_can_go_wrong(path: str,
     if operation["x-access"] not in ("anyone",):
         assert {"401", "403", "404"} <= operation["responses"].keys()
     variables = set(re.findall(r"\{(\w+)\}", path))
-    assert {parameter["name"] for parameter in DOCUMENT["paths"][path]["parameters"]} == variables
+    assert {parameter["name"] for parameter in entry["parameters"]} == variables
 
 
-def test_models_are_offered_in_every_form() -> None:
-    content = DOCUMENT["paths"]["/api/v1/projects/{project}"]["get"]["responses"]["200"]["content"]
+def test_models_are_offered_in_every_form(document: dict[str, Any]) -> None:
+    content = document["paths"]["/api/v1/projects/{project}"]["get"]["responses"]["200"]["content"]
     assert set(content) == set(MEDIA_TYPES)
-    part = DOCUMENT["paths"]["/api/v1/projects/{project}/{kind}/{item}/parts/{part}"]["get"]["responses"]["200"]
+    part = document["paths"]["/api/v1/projects/{project}/{kind}/{item}/parts/{part}"]["get"]["responses"]["200"]
     assert "application/msgpack; arrays=blocks" in part["content"]
 
 
-def test_preconditions_and_keys_are_parameters() -> None:
-    patch = DOCUMENT["paths"]["/api/v1/projects/{project}"]["patch"]["parameters"]
+def test_preconditions_and_keys_are_parameters(document: dict[str, Any]) -> None:
+    patch = document["paths"]["/api/v1/projects/{project}"]["patch"]["parameters"]
     assert {parameter["name"]: parameter["required"] for parameter in patch} == {"If-Match": True}
-    post = DOCUMENT["paths"]["/api/v1/projects"]["post"]["parameters"]
+    post = document["paths"]["/api/v1/projects"]["post"]["parameters"]
     assert [parameter["name"] for parameter in post] == ["Idempotency-Key"]
 
 
-def test_every_reference_leads_somewhere() -> None:
-    references = set(re.findall(r'"#/components/(\w+)/([^"]+)"', json.dumps(DOCUMENT)))
+def test_every_reference_leads_somewhere(document: dict[str, Any]) -> None:
+    references = set(re.findall(r'"#/components/(\w+)/([^"]+)"', json.dumps(document)))
     assert references
     for section, name in references:
-        assert name in DOCUMENT["components"][section]
+        assert name in document["components"][section]
 
 
-def test_lists_that_can_show_some_fields_are_described_so() -> None:
-    schema = DOCUMENT["paths"]["/api/v1/projects/{project}/{kind}"]["get"]["responses"]["200"]["content"]
+def test_lists_that_can_show_some_fields_are_described_so(document: dict[str, Any]) -> None:
+    schema = document["paths"]["/api/v1/projects/{project}/{kind}"]["get"]["responses"]["200"]["content"]
     element = schema["application/json"]["schema"]["properties"]["items"]["items"]["$ref"].rpartition("/")[2]
-    assert "required" not in DOCUMENT["components"]["schemas"][element]
+    assert "required" not in document["components"]["schemas"][element]
 
 
-def test_the_page_shows_every_operation_and_asks_nobody_else() -> None:
-    page = render_page(DOCUMENT).decode()
+def test_the_page_shows_every_operation_and_asks_nobody_else(
+    document: dict[str, Any], operations: list[Described]
+) -> None:
+    page = render_page(document).decode()
     assert page.count("<main>") == page.count("</main>") == 1
-    assert page.count("<pre tabindex=0>") == len(DOCUMENT["components"]["schemas"])  # they scroll, also by keys
-    for path, _, operation in OPERATIONS:
+    assert page.count("<pre tabindex=0>") == len(document["components"]["schemas"])  # they scroll, also by keys
+    for path, _, operation in operations:
         assert path in page
         assert f"id='{operation['operationId']}'" in page
     assert re.findall(r"(?:src|href|action|url\(|import)[=\s'\"]*(?:https?:)?//", page) == []
@@ -97,11 +118,11 @@ def test_no_two_resources_share_an_address() -> None:
         RouteTable(cast(Any, None), [*RESOURCES, RESOURCES[0]])
 
 
-def test_every_body_and_answer_has_a_schema() -> None:
+def test_every_body_and_answer_has_a_schema(operations: list[Described]) -> None:
     """Generators of clients leave out operations with content whose schema is missing."""
     contents = [
         (path, media)
-        for path, _, operation in OPERATIONS
+        for path, _, operation in operations
         for one in (operation.get("requestBody", {}), *operation["responses"].values())
         for media, content in one.get("content", {}).items()
         if not content.get("schema")
@@ -109,8 +130,8 @@ def test_every_body_and_answer_has_a_schema() -> None:
     assert contents == []
 
 
-def test_members_have_no_titles_that_would_name_the_classes_of_clients_twice() -> None:
-    schemas = DOCUMENT["components"]["schemas"]
+def test_members_have_no_titles_that_would_name_the_classes_of_clients_twice(document: dict[str, Any]) -> None:
+    schemas = document["components"]["schemas"]
     titled = {
         (name, member, inner["title"])
         for name, schema in schemas.items()
@@ -124,19 +145,19 @@ def test_members_have_no_titles_that_would_name_the_classes_of_clients_twice() -
     }
 
 
-def test_defaults_are_told_but_not_sent_by_generated_clients() -> None:
+def test_defaults_are_told_but_not_sent_by_generated_clients(document: dict[str, Any]) -> None:
     """A token whose request names no time ends with the token that creates it; the default as a number is refused."""
-    expiry = DOCUMENT["components"]["schemas"]["TokenCreate"]["properties"]["expires_in_s"]
+    expiry = document["components"]["schemas"]["TokenCreate"]["properties"]["expires_in_s"]
     assert "default" not in expiry
     assert expiry["description"].endswith("Default: 7776000.")
-    motion = DOCUMENT["components"]["schemas"]["MotionDocument"]["properties"]["schema"]
+    motion = document["components"]["schemas"]["MotionDocument"]["properties"]["schema"]
     assert motion["default"] == motion["const"] == "marey/motion@1"
 
 
-def test_every_example_fits_its_schema() -> None:
+def test_every_example_fits_its_schema(document: dict[str, Any], operations: list[Described]) -> None:
     shown = 0
-    for path, method, operation in OPERATIONS:
-        parameters = [*DOCUMENT["paths"][path]["parameters"], *operation["parameters"]]
+    for path, method, operation in operations:
+        parameters = [*document["paths"][path]["parameters"], *operation["parameters"]]
         holders = (operation.get("requestBody", {}), *operation["responses"].values())
         media = [
             holder["content"]["application/json"]
@@ -144,15 +165,15 @@ def test_every_example_fits_its_schema() -> None:
             if "application/json" in holder.get("content", {})
         ]
         for described in (*parameters, *media):
-            schema = {**described["schema"], "components": DOCUMENT["components"]}
+            schema = {**described["schema"], "components": document["components"]}
             faults = [fault.message for fault in Draft202012Validator(schema).iter_errors(described["example"])]
             assert faults == [], f"{method} {path}"
             shown += 1
-    assert shown > 4 * len(OPERATIONS)
+    assert shown > 4 * len(operations)
 
 
-def test_the_example_of_a_command_can_be_sent() -> None:
-    create = DOCUMENT["paths"]["/api/v1/projects/{project}/{kind}"]["post"]
+def test_the_example_of_a_command_can_be_sent(document: dict[str, Any]) -> None:
+    create = document["paths"]["/api/v1/projects/{project}/{kind}"]["post"]
     assert ItemCreate.model_validate(create["requestBody"]["content"]["application/json"]["example"]).name == "walk"
     command = create["x-codeSamples"][0]["source"]
     assert command.startswith('curl -X POST -H "Authorization: Bearer $MAREY_TOKEN"')

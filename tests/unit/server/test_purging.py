@@ -70,6 +70,14 @@ class House:
         )
         return self.desk.publish(draft)[0].item
 
+    def add_many(self, count: int) -> list[str]:
+        """Create studies in one transaction, and return their ids."""
+        drafts = [
+            Draft(f"d{n}", Kind.CHARACTER, f"s{n}", {"character": document(content=n, name=f"s{n}")}, "raw")
+            for n in range(count)
+        ]
+        return [one.item for one in self.desk.publish(*drafts)]
+
     def add_clips(self, *names: str) -> tuple[str, list[str]]:
         """Create clips of one skeleton; return the ids of the skeleton and of the clips."""
         rig = Draft("rig", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree()}, collection="rigs")
@@ -297,7 +305,7 @@ def test_a_version_that_has_an_earlier_revision_holds_the_item(house: House) -> 
 
 
 def test_a_large_version_is_searched_whole(house: House) -> None:
-    many = [house.add(f"s{n}", n) for n in range(300)]
+    many = house.add_many(300)
     house.gaits.change(*(PutEntry(path=f"folder-{n:03}/entry", item=one) for n, one in enumerate(many)))
     free = house.add("free", "other")
     house.delete(*many, free)
