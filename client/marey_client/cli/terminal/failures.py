@@ -60,7 +60,7 @@ def reported(*, verbose: bool) -> Iterator[None]:
 def usage_in_plain_words() -> Iterator[None]:
     """Explain wrong options and arguments in words for people, where typer passes on the words of its libraries."""
     from typer import BadParameter
-    from typer.core import _click
+    from typer._click.exceptions import NoSuchOption  # typer exports no class for it
 
     try:
         yield
@@ -69,7 +69,7 @@ def usage_in_plain_words() -> Iterator[None]:
         if faults is not None:
             error.message = plain_reason(faults()[0])
         raise
-    except _click.exceptions.NoSuchOption as error:
+    except NoSuchOption as error:
         files = [one for one in sys.argv[1:] if one.startswith(error.option_name) and os.path.exists(one)]
         if files:
             error.message = f"{files[0]} is read as an option; for the file of this name, write ./{files[0]}"
