@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.integration.test_matching_on_real_motion import body_of, read_takes
+from tests.support.real_takes import body_of, read_takes
 
 from marey_motion.evaluation.compare import MetricChange, corrected, paired_change
 from marey_motion.evaluation.relevance import sum_by_source
