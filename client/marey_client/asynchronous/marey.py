@@ -70,7 +70,7 @@ class AsyncMarey(Connection):
         return await self._run(self._sync.me)
 
     def project(self, name: str) -> AsyncProjectHandle:
-        """Return a project by its name, without a request."""
+        """Return a project by its name, without a request. Raises `BadArgument` for the path of a folder."""
         exchanged: AsyncProjectHandle = self._now(self._sync.project, name)
         return exchanged
 

@@ -39,6 +39,10 @@ class AsyncEvaluationHandle(AsyncReportedHandle):
         """Return one row per trial: name, requested motion, verdict, and metrics."""
         return await self._run(self._sync.trials)
 
+    async def worst_trials(self) -> list[dict[str, Any]]:
+        """Return the rows of `trials` from the worst trial to the best, in the order of the report."""
+        return await self._run(self._sync.worst_trials)
+
     async def clips(self) -> list[dict[str, Any]]:
         """Return one row per clip: name, number of frames, and use of the clip by the trials."""
         return await self._run(self._sync.clips)
