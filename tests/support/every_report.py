@@ -36,7 +36,7 @@ from marey_reports.drawing.head import ReportInput
 from marey_reports.evaluation.page import render_comparison, render_report
 from marey_reports.evaluation.several import render_several
 from marey_reports.models.page import render_model_report
-from marey_reports.perception.compared import ComparedSet
+from marey_reports.perception.compared import ComparedClip, ComparedSet
 from marey_reports.perception.page import draw_distance_figures, render_distances
 from marey_reports.perception.study_page import render_study_report
 from marey_schemas.documents.metrics import built_in_metric
@@ -114,7 +114,8 @@ def _distances() -> str:
         prepare_comparison(one.clip, body_of(one.clip), metric, document.frame_rate_hz, name=one.name) for one in takes
     ]
     distances = compare_clips([clip.compared for clip in clips], metric)
-    subject = ComparedSet(document, clips, distances, DistanceOptions())
+    facts = [ComparedClip.of(clip) for clip in clips]
+    subject = ComparedSet(document, facts, dict(enumerate(clips)), distances, DistanceOptions())
     inputs = inputs_of(takes)
     return render_distances(subject, draw_distance_figures(subject), title="Four walks", inputs=inputs)
 
