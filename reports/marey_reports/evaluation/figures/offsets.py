@@ -188,7 +188,7 @@ def _draw_field(
 
     Returns the drawn contours or dots, from which the colour scale can be made, or None if there are no trials.
     """
-    panel = add_panel(figure, place, title=title, grid=False, **labels)
+    panel = add_panel(figure, place, title=title, x=labels["x"], y=labels["y"], grid=False)
     known = np.isfinite(field.offset_m)
     if not known.any():
         write(panel, (0.5, 0.5), "no trials", transform=panel.transAxes, ha="center")
