@@ -1,7 +1,6 @@
 """Strips of small figures: poses of motions in the same frames, one motion or one set of motions per row.
 
-All cells of a column show the same patch of the floor, so that differences between rows are visible in place. The lines
-of a body are joined to one shape per side, which keeps the file of a drawing of a hundred bodies small.
+All cells of a column show the same patch of the floor, so that differences between rows are visible in place.
 """
 
 from __future__ import annotations
@@ -9,49 +8,42 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from marey_motion.arrays import Floats, Indices
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_directions, global_positions
-from marey_reports.drawing.paper import (
-    COLOURS,
-    HAIRLINE,
-    INK,
-    PAPER,
-    QUIET,
-    REFERENCE,
-    TEXT,
-    new_figure,
-    shortened,
-    to_svg,
-    write,
+from marey_reports.drawing.paper import HAIRLINE, INK, QUIET, REFERENCE, TEXT, new_figure, shortened, to_svg, write
+from marey_reports.drawing.stick_figures import LEFT, RIGHT, Camera, StickFigure, body_of
+from marey_reports.drawing.strip_bodies import (
+    FLOOR_SHARE,
+    GHOST,
+    HEAD_SHARE,
+    LINE_POINTS,
+    SIDE_COLOURS,
+    BodyShapes,
+    Look,
+    StripCell,
+    draw_body,
+    draw_way,
+    shapes_of,
 )
-from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, StickFigure, body_of, runs_of
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.path import Path
-    from matplotlib.transforms import BboxBase
 
 
-SIDE_COLOURS = {LEFT: COLOURS[0], CENTRE: INK, RIGHT: COLOURS[1]}
 CAMERA_TILT_RAD = np.radians(10.0)
 
 # In inches.
 MARGIN, HEADER, ABOUT, MOMENT, GAP = 0.10, 0.42, 0.22, 0.40, 0.10
 LABEL_LINE = 0.16
 LABEL_LETTERS, MOST_LABEL_LINES = 26, 4
-RIM_STOPS = 0.05  # before a bone's ends
-FLOOR_SHARE = 0.09  # of a cell's height: the floor's distance from its lower edge
 FILLED = 0.84  # of a cell's height, by the highest point
-HEAD_SHARE = 0.055  # radius of the head, of the height of the highest point
-LINE_POINTS = 1.7
 
 POSE_CELL_IN = (1.15, 1.7)
 """Width and height of a cell in the strip of a clip, inches."""
@@ -115,7 +107,7 @@ def draw_strips(
     axes.axis("off")
     camera = Camera(direction_rad, float(CAMERA_TILT_RAD))
     scale = _scale(body, rows, moments, camera, cell_in, whole=whole)
-    shapes = _shapes(body, rows)
+    shapes = shapes_of(body, (row.bodies for row in rows))
     _draw_legend(axes, labels, page[1], legend)
     if about:
         write(axes, (labels + 0.05, page[1] - 0.17 - ABOUT), about, color=QUIET)
@@ -123,7 +115,7 @@ def draw_strips(
         bottom = page[1] - header - (number + 1) * (height + GAP) + GAP
         _draw_label(axes, row, bottom + 0.5 * height)
         for column in range(columns):
-            stage = _StripCell((labels + column * width, bottom), cell_in, moments.middles[column], camera, scale)
+            stage = StripCell((labels + column * width, bottom), cell_in, moments.middles[column], camera, scale)
             _draw_cell(axes, stage, shapes, row, column)
     for column, (name, label) in enumerate(zip(moments.names, moments.labels, strict=True)):
         middle = labels + (column + 0.5) * width
@@ -225,23 +217,6 @@ def _camera_direction(points: Floats, facing: tuple[tuple[int, ...], tuple[int, 
     return float(np.arctan2(*ahead) + CAMERA_TURN_RAD)
 
 
-@dataclass(frozen=True)
-class _StripCell:
-    """Cell of a strip: lower left corner and size in inches, (x, z) in metres at its centre, and inches per metre."""
-
-    corner: tuple[float, float]
-    size: tuple[float, float]
-    middle: Floats
-    camera: Camera
-    scale: float
-
-    def placed(self, points: Floats) -> Floats:
-        """Project points (..., 3) to (right, up, towards the viewer) in inches on the page."""
-        seen = self.camera.seen(points - np.array((self.middle[0], 0.0, self.middle[1]))) * self.scale
-        below = np.array((self.corner[0] + 0.5 * self.size[0], self.corner[1] + FLOOR_SHARE * self.size[1], 0.0))
-        return np.asarray(seen + below, dtype=np.float64)
-
-
 def _scale(
     body: StickFigure,
     rows: Sequence[StripRow],
@@ -298,23 +273,7 @@ def _lines(label: str) -> list[str]:
     return wrap(shortened(label, MOST_LABEL_LINES * LABEL_LETTERS), LABEL_LETTERS) or [""]
 
 
-class _Look(NamedTuple):
-    """Style of the lines of a body.
-
-    If `colour` is None, each side of the body has its own colour. A `rim` is a light edge that separates overlapping
-    sides of the body.
-    """
-
-    width: float
-    alpha: float = 1.0
-    colour: str | None = None
-    rim: bool = False
-
-
-GHOST = _Look(LINE_POINTS, 0.55, REFERENCE)
-
-
-def _draw_cell(axes: Axes, stage: _StripCell, shapes: _Shapes, row: StripRow, column: int) -> None:
+def _draw_cell(axes: Axes, stage: StripCell, shapes: BodyShapes, row: StripRow, column: int) -> None:
     """Draw the floor, the root's paths on it, the ghost and the bodies, clipped at the sides of the cell."""
     from matplotlib.transforms import Bbox, TransformedBbox
 
@@ -324,82 +283,10 @@ def _draw_cell(axes: Axes, stage: _StripCell, shapes: _Shapes, row: StripRow, co
     frame = TransformedBbox(Bbox.from_bounds(left, bottom - GAP, width, height + 2 * GAP), axes.transData)
     axes.plot([left + 0.03, left + width - 0.03], [floor] * 2, color=HAIRLINE, lw=0.8)
     for way in row.ways:
-        _draw_way(axes, stage.placed(way * (1.0, 0.0, 1.0)), frame)
+        draw_way(axes, stage.placed(way * (1.0, 0.0, 1.0)), frame)
     if row.ghost is not None:
-        _draw_body(axes, shapes, stage, row.ghost[column], GHOST, frame)
+        draw_body(axes, shapes, stage, row.ghost[column], GHOST, frame)
     count = len(row.bodies)
-    look = _Look(LINE_POINTS, rim=True) if count == 1 else _Look(0.6 * LINE_POINTS, max(0.25, 1.0 / np.sqrt(count)))
+    look = Look(LINE_POINTS, rim=True) if count == 1 else Look(0.6 * LINE_POINTS, max(0.25, 1.0 / np.sqrt(count)))
     for points in row.bodies[:, column]:
-        _draw_body(axes, shapes, stage, points, look, frame)
-
-
-def _draw_way(axes: Axes, way: Floats, frame: BboxBase) -> None:
-    if len(way):
-        (line,) = axes.plot(way[:, 0], way[:, 1], color=QUIET, lw=0.9, alpha=0.8)
-        line.set_clip_box(frame)
-
-
-class _Shapes(NamedTuple):
-    """Shapes of a body: for each side, lines of joined bones (`runs`) and the single bones (n, 2); and the head."""
-
-    runs: dict[int, list[Indices]]
-    bones: dict[int, Indices]
-    head: tuple[Indices, float] | None
-    head_m: float
-
-
-def _shapes(body: StickFigure, rows: Sequence[StripRow]) -> _Shapes:
-    shown = np.ones(len(body.bones), dtype=bool)
-    if body.head is not None and body.head[1] < 1.0:
-        shown[body.head[0]] = False  # the circle stands for it
-    sides = sorted({int(side) for side in body.sides})
-    bones = {side: body.bones[shown & (body.sides == side)] for side in sides}
-    heights = np.concatenate([np.ptp(row.bodies[..., body.bones[:, 0], 1], axis=-1).ravel() for row in rows])
-    return _Shapes(
-        {side: runs_of(bones[side]) for side in sides},
-        bones,
-        None if body.head is None else (body.bones[body.head[0]], body.head[1]),
-        HEAD_SHARE * float(np.median(heights)),
-    )
-
-
-def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, look: _Look, frame: BboxBase) -> None:
-    """Draw the bones of a body with points (P, 3): each side as one shape, the far side before the near one."""
-    from matplotlib.patches import Circle, PathPatch
-
-    seen = stage.placed(points)
-    options: dict[str, Any] = {"facecolor": "none", "capstyle": "round", "joinstyle": "round"}
-    sides = sorted(shapes.bones, key=lambda side: float(seen[shapes.bones[side], 2].mean()))
-    for place, side in enumerate(sides):
-        if look.rim and place:
-            rim = _path(_middles(seen[shapes.bones[side], :2]))
-            _add(axes, PathPatch(rim, edgecolor=PAPER, lw=look.width + 1.8, **{**options, "capstyle": "butt"}), frame)
-        lines = _path([seen[run, :2] for run in shapes.runs[side]])
-        colour = look.colour or SIDE_COLOURS[side]
-        _add(axes, PathPatch(lines, edgecolor=colour, lw=look.width, alpha=look.alpha, **options), frame)
-    if shapes.head is not None:
-        (outer, inner), share = shapes.head
-        centre = share * seen[inner, :2] + (1.0 - share) * seen[outer, :2]
-        fill = PAPER if look.rim else "none"
-        circle = Circle(tuple(centre), shapes.head_m * stage.scale, facecolor=fill, edgecolor=look.colour or INK)
-        circle.set(linewidth=0.75 * look.width, alpha=look.alpha)
-        _add(axes, circle, frame)
-
-
-def _add(axes: Axes, artist: Artist, frame: BboxBase) -> None:
-    """Add an artist, then clip it to `frame`. This order matters: `add_artist` replaces the box."""
-    axes.add_artist(artist).set_clip_box(frame)
-
-
-def _middles(bones: Floats) -> list[Floats]:
-    """Shorten bones (n, 2, 2) at both ends, where their rims would cover the neighbouring bones."""
-    middle = bones.mean(axis=1, keepdims=True)
-    length = np.linalg.norm(bones[:, 1] - bones[:, 0], axis=-1)[:, None, None]
-    return list(middle + (bones - middle) * np.maximum(1.0 - 2.0 * RIM_STOPS / np.maximum(length, RIM_STOPS), 0.0))
-
-
-def _path(runs: Sequence[Floats]) -> Path:
-    from matplotlib.path import Path
-
-    codes = [np.append(Path.MOVETO, np.full(len(run) - 1, Path.LINETO)) for run in runs]
-    return Path(np.concatenate(runs), np.concatenate(codes))
+        draw_body(axes, shapes, stage, points, look, frame)
