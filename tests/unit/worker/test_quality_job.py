@@ -31,6 +31,7 @@ from marey_schemas.queue.facets import MOST_FACETS
 from marey_schemas.queue.job_params import QualityParams
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import JobRefused
+from marey_worker.job_io.stored_reports import inputs_of
 from marey_worker.kinds import quality
 
 
@@ -177,3 +178,12 @@ def test_annotated_contacts_replace_detected_ones(project: ProjectInMemory) -> N
     del segments[0:2]
     with pytest.raises(JobRefused, match="contact_left or contact_right or contact_both"):
         quality.run(project, params)
+
+
+def test_the_head_of_a_report_names_the_kinds_of_inputs_in_words(project: ProjectInMemory) -> None:
+    pins = tuple(
+        PinnedInput(item=f"processed_{n}", revision=n, kind=Kind.PROCESSED, name=f"walk {n}", collection="aligned")
+        for n in (1, 2)
+    )
+    project.inputs = {"aligned": pins}
+    assert inputs_of(project) == (("aligned clip", "aligned/walk 1", 1), ("aligned clip", "aligned/walk 2", 2))

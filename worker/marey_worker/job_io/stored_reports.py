@@ -15,7 +15,7 @@ from marey_worker.context import Context
 def inputs_of(context: Context) -> tuple[ReportInput, ...]:
     """Return the inputs of the job for the head of its report, in the order of the submission."""
     pins = (pin for many in context.inputs.values() for pin in many)
-    return tuple(ReportInput(pin.kind.value, pin.path, pin.revision) for pin in pins)
+    return tuple(ReportInput(pin.kind.noun, pin.path, pin.revision) for pin in pins)
 
 
 def store_report(
