@@ -199,7 +199,7 @@ class MetricDocument(Request):
 
     @property
     def judgement_error(self) -> float:
-        """The standard error of the judgements that the weights were fitted to; if unknown, that of the paper's."""
+        """The standard error of the judgements behind the weights; `PUBLISHED_ERROR` if it is unknown."""
         known = None if self.fit is None else self.fit.noise_ceiling
         return PUBLISHED_ERROR if known is None else known
 

@@ -1,8 +1,8 @@
 """Places in stored reports that are filled when a report is handed out.
 
 The bytes of a stored report depend only on inputs, parameters, seed and version of the code, so that identical jobs can
-share it. Who asked for it, when, and in which project are facts about a job. So a stored page has an empty place for
-them, and for the program that plays motion. The server, or the command that draws a page, fills both places.
+share a report. Project, author and date differ from job to job. So a stored page has an empty place for them, and one
+for the program that plays motion. The server fills both places. A command that draws a page itself fills the first.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class ReportOrigin(NamedTuple):
     ----------
     project : name of the project
     address : address of the server, without a slash at the end
-    author : name of the user who asked for the report; None if it is not known, as of a user who no longer exists
-    made_at : time at which the result was published, or at which a report was drawn that is not stored
+    author : name of the user who requested the report; None if unknown, for example because the user no longer exists
+    made_at : time at which the result was published; of a report that is not stored, the time at which it was drawn
     """
 
     project: str
