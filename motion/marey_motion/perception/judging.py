@@ -16,7 +16,7 @@ from marey_schemas.documents.studies import SHOWN
 
 TRIALS = 63
 LEAST_REPEATS = 30
-"""Number of answers about pairs that others were asked about before, from which the noise is known within a quarter."""
+"""Least number of repeated answers (those after the first about each pair), which give the noise within a quarter."""
 _CANDIDATE_DRAWS = 24
 _FIRST, _SECOND = np.triu_indices(SHOWN, 1)
 _PAIR_OF = {(int(one), int(other)): pair for pair, (one, other) in enumerate(zip(_FIRST, _SECOND, strict=True))}
@@ -80,8 +80,7 @@ class DifferenceTable:
 
         The variance of a single answer is that of repeated answers about the same pair. A pair that was shown once has
         the difference 0 or 1, which says nothing about its error, so the variance is estimated from all pairs together.
-        None if fewer than `LEAST_REPEATS` answers repeat a pair. How much people differ from each other is not
-        included.
+        None if there are fewer than `LEAST_REPEATS` repeated answers. Differences between people are not included.
         """
         shown = self.shown[np.triu_indices(len(self.shown), 1)]
         p = self.differences[np.triu_indices(len(self.shown), 1)][shown > 0]
