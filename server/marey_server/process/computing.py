@@ -79,7 +79,7 @@ def compute_on_one_thread_each() -> None:
 def leave() -> None:
     """End this process at once, without waiting for running computations and without freeing its objects one by one.
 
-    Nothing needs their end: clients of the computations have disconnected, and freeing the objects takes 0.3 s.
+    Nobody waits for the computations, because their clients have disconnected. Freeing all objects would take 0.3 s.
     """
     logging.shutdown()
     sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""Explanations of settings that are wrong: the place where each is set, the reason, and the most similar setting."""
+"""Explanations of invalid settings: where each is set, the reason, and the setting with the most similar name."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def explain_faults(error: ValidationError, given: Mapping[str, Any]) -> str:
 
 
 def explain_variable(error: SettingsError) -> str:
-    """Return the reason why the variable of a setting is refused that must contain a list or an object."""
+    """Return the reason for refusing the variable of a setting whose value must be a list or an object."""
     setting = re.search(r'field "(\w+)"', str(error))
     variable = f"{PREFIX}{setting[1]}".upper() if setting else f"a variable that begins with {PREFIX}"
     return f"{variable}: the value is not JSON ({error.__cause__}); {_JSON_FORMS}"
@@ -49,9 +49,9 @@ def _reason(fault: Any) -> str:
 
 
 def _setting_at(steps: Sequence[int | str], given: Mapping[str, Any]) -> str:
-    """Return the name of a setting, or of the variable that sets it; the file and the line precede a setting in a file.
+    """Return where a setting is set: its name, the name of its variable, or the file and the line with its name.
 
-    Of a setting in the command line, only the name is returned.
+    The name alone stands for a setting in the command line (`given`), and for one that is not found anywhere.
     """
     name, whole = str(steps[0]) if steps else "", ".".join(map(str, steps))
     if given.get(name) is not None:
