@@ -48,8 +48,8 @@ class Invocation:
     verbose: bool
 
 
-MOST_COMPARED = 1000
-"""Greatest number of projects with whose names a misspelt name is compared."""
+MOST_PROJECTS = 1000
+"""Greatest number of projects whose names are compared with a misspelt name."""
 NO_OPTIONS = Invocation(None, None, False)
 
 
@@ -135,5 +135,5 @@ def _nearest_project(marey: Marey, name: str) -> str:
 
     from marey_schemas.wording import nearest
 
-    near = nearest(name, (one.name for one in islice(marey.projects(), MOST_COMPARED)))
+    near = nearest(name, (one.name for one in islice(marey.projects(), MOST_PROJECTS)))
     return f"did you mean {near}?" if near else "`marey project ls` lists the projects that you may see"
