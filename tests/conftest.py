@@ -10,6 +10,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from tests.support.patience import PATIENCE_S
 
 from marey_motion.warm_up import discard_outdated_kernels
 from marey_schemas.processes.memory import loading_modules
@@ -31,9 +32,6 @@ pytest.register_assert_rewrite("tests.support.launcher_contract", "tests.support
 MEMORY = Path("/dev/shm")
 ENOUGH_BYTES = 4 << 30
 """Free space that is enough: databases of two test processes and the largest files of tests need less than half."""
-
-
-PATIENCE_S = 60.0
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -15,6 +15,7 @@ import pytest
 from kubernetes.aio.config import incluster_config
 from tests.support.cluster.kubelet import SCRIPT
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
+from tests.support.patience import PATIENCE_S
 from tests.support.present import present
 from tests.support.webhook_receiver import SELF_SIGNED
 
@@ -31,7 +32,6 @@ SECRET = "marey_secret_of_workers"
 WAITS = (*SCRIPT, "import signal, sys, time; signal.signal(15, lambda *_: sys.exit(0)); time.sleep(600)")
 FAILS = (*SCRIPT, "import sys; print('first line', flush=True); sys.exit('no such device')")
 ENDS = (*SCRIPT, "pass")
-PATIENCE_S = 60.0
 
 
 class Bench:

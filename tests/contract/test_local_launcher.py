@@ -11,7 +11,8 @@ import psutil
 import pytest
 from tests.support.attached_worker import python_path
 from tests.support.forked_programs import start_program
-from tests.support.launcher_contract import LABELS, PATIENCE_S, Engine, LauncherContract, processes_of
+from tests.support.launcher_contract import LABELS, Engine, LauncherContract, processes_of
+from tests.support.patience import PATIENCE_S
 from tests.support.present import present
 from tests.support.server_process import ServerProcess
 

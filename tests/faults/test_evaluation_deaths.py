@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from tests.support.evaluation_takes import write_walks
+from tests.support.patience import PATIENCE_S
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 from tests.support.tiers import is_soak
 
@@ -22,7 +23,6 @@ from marey_schemas.queue.jobs import Job, JobState
 
 pytestmark = pytest.mark.timeout(900)
 
-PATIENCE_S = 240.0
 
 LONG: dict[str, Any] = {
     "name": "walks-eval",

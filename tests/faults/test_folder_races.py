@@ -9,7 +9,8 @@ from concurrent.futures import TimeoutError as StillRunning
 from typing import Any
 
 import pytest
-from tests.support.interleaving import HEAD_START_S, PATIENCE_S, Abandoned, Step, interleave
+from tests.support.interleaving import HEAD_START_S, Abandoned, Step, interleave
+from tests.support.patience import PATIENCE_S
 from tests.support.store_fixtures import WRITE, Lab, declared, requiring, skeleton_tree
 
 from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, Role

@@ -10,6 +10,7 @@ import obstore
 import pytest
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.faulty_s3 import FaultyS3, faulty_s3
+from tests.support.patience import PATIENCE_S
 from tests.support.present import present
 from tests.support.s3_servers import S3Server
 from tests.support.store_fixtures import Lab
@@ -31,7 +32,6 @@ from marey_server.store.object_storage.client import Bucket, ObjectStorage, Obje
 
 pytestmark = pytest.mark.xdist_group("object storage")
 
-PATIENCE_S = 120.0
 DATA = os.urandom(100_000)
 DIGEST = digest_of(DATA)
 OLD_S = 2 * 24 * 3600.0

@@ -13,6 +13,7 @@ from tests.support.cluster.dispatching import LARGE, OWN_IMAGE
 from tests.support.cluster.kubelet import MAREY
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
 from tests.support.git_repositories import committed
+from tests.support.patience import PATIENCE_S
 from tests.support.present import present
 from tests.support.server_process import QUICK_LEASES, ServerProcess
 
@@ -23,8 +24,6 @@ from marey_schemas.queue.jobs import Job, JobCreate
 from marey_schemas.queue.scripts import ScriptCreate
 
 pytestmark = pytest.mark.timeout(900)
-
-PATIENCE_S = 120.0
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.patience import PATIENCE_S
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 from tests.support.short_walks import write_short_walks
 from tests.support.tiers import is_soak
@@ -26,7 +27,6 @@ from marey_schemas.queue.pipelines import PipelineCreate
 
 pytestmark = pytest.mark.timeout(900)
 
-PATIENCE_S = 240.0
 
 StartWorker = Callable[..., WorkerProcess]
 

@@ -17,6 +17,7 @@ from tests.support.cluster.kubelet import MAREY
 from tests.support.cluster.objects import Document
 from tests.support.cluster.quick_pools import QuickPoolsServer
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
+from tests.support.patience import PATIENCE_S
 from tests.support.server_process import QUICK_LEASES, ServerProcess
 
 from marey_client import Marey
@@ -25,7 +26,6 @@ from marey_schemas.queue.jobs import Job, JobCreate
 
 pytestmark = pytest.mark.timeout(900)
 
-PATIENCE_S = 300.0
 LIES = """
 import argparse, httpx
 parser = argparse.ArgumentParser()

@@ -13,6 +13,7 @@ import numpy as np
 import psutil
 import pytest
 import sqlalchemy
+from tests.support.patience import PATIENCE_S
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 from tests.support.short_walks import write_short_walks
 from tests.support.tcp_proxy import TcpProxy
@@ -31,8 +32,6 @@ from marey_schemas.imports import ImportEntry
 from marey_schemas.queue.jobs import Job, JobCreate, JobState
 
 pytestmark = pytest.mark.timeout(900)
-
-PATIENCE_S = 240.0
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 from tests.support.committing_desk import CommittingDesk
-from tests.support.interleaving import HEAD_START_S, PATIENCE_S, Step, interleave
+from tests.support.interleaving import HEAD_START_S, Step, interleave
+from tests.support.patience import PATIENCE_S
 from tests.support.queue_desk import Desk, document, output
 from tests.support.store_fixtures import ALL_RIGHTS, WRITE, motion_tree, requiring, skeleton_tree
 

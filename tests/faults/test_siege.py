@@ -24,6 +24,7 @@ from typing import Any
 
 import httpx
 import pytest
+from tests.support.patience import PATIENCE_S
 from tests.support.queue_desk import Desk
 from tests.support.server_process import PATIENT, QUICK_LEASES, MareyProcess, ServerProcess, WorkerProcess
 from tests.support.short_walks import write_short_walks
@@ -47,7 +48,6 @@ JOBS, JOB_KILLS, WORKERS = (1_800, 206, 4) if LONG else (12, 2, 1)
 CANCELS = 10_000 if LONG else 128
 CANCELS_AT_ONCE = 64
 TAKES = 20 if LONG else 6
-PATIENCE_S = 180.0
 SLEEP_S = 4.0
 """Time for which a process is suspended; longer than a lease."""
 

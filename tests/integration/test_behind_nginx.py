@@ -16,10 +16,10 @@ from pathlib import Path
 import httpx
 import pytest
 from docs.generate import ROOT
+from tests.support.patience import PATIENCE_S
 from tests.support.server_process import ServerProcess, reserved_port
 
 NGINX = shutil.which("nginx", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
-PATIENCE_S = 60.0
 UPLOAD_BYTES = 32 * 2**20
 UPLOAD_PAUSE_S = 20.0
 

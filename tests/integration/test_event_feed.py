@@ -17,8 +17,9 @@ import pytest
 import sqlalchemy
 from tests.support.database_copies import dump, restore_dump
 from tests.support.database_fixtures import database_address
+from tests.support.patience import PATIENCE_S
 from tests.support.queue_desk import KINDS
-from tests.support.rest_server import PATIENCE_S, Server, running
+from tests.support.rest_server import Server, running
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.queue import job_kinds

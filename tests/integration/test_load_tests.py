@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 from tests.support.command_line import run_here
-from tests.support.rest_server import ALL_SCOPES, PATIENCE_S, USER_SCOPES, Server
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import ALL_SCOPES, USER_SCOPES, Server
 
 from marey_client.errors import Forbidden, MareyError
 from marey_client.load import offering, scratch

@@ -11,7 +11,8 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
-from tests.support.rest_server import PATIENCE_S, Server, running
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server, running
 
 from marey_schemas.access import Role
 from marey_schemas.encoding import blocks

@@ -8,7 +8,8 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from tests.support.rest_server import PATIENCE_S, Server
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server
 
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document

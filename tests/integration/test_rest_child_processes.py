@@ -16,7 +16,8 @@ import psutil
 import pytest
 from tests.support.api_document import api_document
 from tests.support.edited_takes import make_walk
-from tests.support.rest_server import PATIENCE_S, Server
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server
 
 from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_schemas.access import ProjectChange, Visibility

@@ -13,7 +13,8 @@ import msgpack
 import numpy as np
 import pytest
 from tests.support.database_fixtures import AdjustableClock
-from tests.support.rest_server import PATIENCE_S, Server, running
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server, running
 
 from marey_schemas.encoding import codecs, tiles
 from marey_schemas.encoding.arrays import EncodedArray

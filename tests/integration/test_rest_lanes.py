@@ -11,7 +11,8 @@ from typing import Any
 import httpx
 import pytest
 from sqlalchemy import update
-from tests.support.rest_server import PATIENCE_S, Server, running
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server, running
 
 from marey_schemas.encoding.codecs import encode_tree
 from marey_schemas.encoding.digests import digest_of

@@ -17,7 +17,8 @@ import httpx
 import psutil
 import pytest
 from tests.support.forked_programs import nursery
-from tests.support.rest_server import PATIENCE_S, Server, running
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server, running
 
 from marey_client.cli.doctor import check_server
 from marey_client.marey import Marey

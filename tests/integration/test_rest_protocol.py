@@ -18,7 +18,8 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
-from tests.support.rest_server import PATIENCE_S, Server
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server
 from tests.support.store_fixtures import random_poses
 from tornado.iostream import IOStream
 

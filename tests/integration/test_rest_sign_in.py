@@ -8,7 +8,8 @@ from typing import Any
 
 import httpx
 import pytest
-from tests.support.rest_server import PATIENCE_S, Server, running
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server, running
 
 from marey_schemas.access import UserCreate
 from marey_server.access import passwords

@@ -15,7 +15,8 @@ from threading import Event
 import httpx
 import numpy as np
 import pytest
-from tests.support.rest_server import PATIENCE_S, Server, running
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server, running
 
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_server.http.accepting import ADDRESS_SHARE

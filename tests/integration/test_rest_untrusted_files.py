@@ -15,7 +15,8 @@ import httpx
 import numpy as np
 import psutil
 import pytest
-from tests.support.rest_server import PATIENCE_S, Server, running
+from tests.support.patience import PATIENCE_S
+from tests.support.rest_server import Server, running
 
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait

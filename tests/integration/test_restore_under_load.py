@@ -17,6 +17,7 @@ import pytest
 from sqlalchemy import make_url
 from tests.support.database_copies import dump, restore_dump
 from tests.support.database_fixtures import database_address, empty_postgres_database
+from tests.support.patience import PATIENCE_S
 from tests.support.rest_server import Server, running
 from tests.support.s3_servers import SECRET_KEY, S3Server
 
@@ -30,7 +31,6 @@ from marey_server.store.fsck import check_store
 from marey_server.store.object_storage.client import Bucket, ObjectStorage
 
 pytestmark = pytest.mark.xdist_group("object storage")
-PATIENCE_S = 60.0
 
 
 class Writers:

@@ -19,6 +19,7 @@ import sqlalchemy
 from alembic import command
 from sqlalchemy import Connection
 from tests.support.attached_worker import python_path
+from tests.support.patience import PATIENCE_S
 from tests.support.queue_desk import KINDS
 from tests.support.rest_server import Server
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
@@ -48,7 +49,6 @@ def upgrade() -> None:
 def downgrade() -> None:
     {downgrade}
 '''
-PATIENCE_S = 120.0
 ADD = 'op.add_column("job", sa.Column("next_note", sa.String(40), server_default="new"))'
 DROP = 'op.drop_column("job", "next_note")'
 

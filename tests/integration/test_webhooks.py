@@ -14,8 +14,9 @@ from typing import Any
 import httpx
 import pytest
 from tests.support.database_fixtures import AdjustableClock
+from tests.support.patience import PATIENCE_S
 from tests.support.rest_server import Server, running
-from tests.support.webhook_receiver import PATIENCE_S, SELF_SIGNED, Open
+from tests.support.webhook_receiver import SELF_SIGNED, Open
 
 from marey_schemas.backoff import Backoff
 from marey_server.store.database.connections import Database

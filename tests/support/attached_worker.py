@@ -9,12 +9,12 @@ from pathlib import Path
 
 from tests.support.fake_server import FakeServer
 from tests.support.forked_programs import ForkedProgram, nursery
+from tests.support.patience import PATIENCE_S
 
 KINDS_OF_TESTS = Path(__file__).parents[1] / "unit" / "worker" / "thirdparty"
 """Distribution with the kinds of job that only tests know."""
 NAMES_OF_KINDS = ("add", "misbehave", "tally", "make")
 """Names of these kinds. Their modules take less time to load than the modules of the built-in kinds."""
-PATIENCE_S = 240.0
 
 
 def python_path() -> str:

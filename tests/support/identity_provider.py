@@ -18,12 +18,12 @@ from urllib.parse import urlencode
 
 from joserfc import jws
 from joserfc.jwk import ECKey, RSAKey
+from tests.support.patience import PATIENCE_S
 from tornado.httpserver import HTTPServer
 from tornado.testing import bind_unused_port
 from tornado.web import Application, RequestHandler
 
 CLIENT, SECRET = "marey", "s3cret: with & odd characters"
-PATIENCE_S = 120.0
 
 
 @cache

@@ -10,6 +10,8 @@ from concurrent.futures import TimeoutError as StillRunning
 from dataclasses import dataclass
 from typing import Any
 
+from tests.support.patience import PATIENCE_S
+
 from marey_server.access.principal import Principal
 from marey_server.errors import ApiProblem
 from marey_server.store.database.connections import Database
@@ -20,7 +22,6 @@ Action = Callable[..., Any]
 
 HEAD_START_S = 0.1
 """Time for which the second transaction may run, or wait for locks of the first, before the first one commits."""
-PATIENCE_S = 120.0
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import psutil
 import pytest
 from tests.support.attached_worker import python_path
+from tests.support.patience import PATIENCE_S
 from tests.support.present import present
 from tests.support.server_process import QUICK_LEASES, ServerProcess
 
@@ -27,7 +28,6 @@ from marey_server.launchers.launcher import LaunchContext, Launcher, WorkerEnd, 
 from marey_server.process.administrators import write_secret
 
 T = TypeVar("T")
-PATIENCE_S = 120.0
 LABELS = {"site": "lyon"}
 REQUEST = WorkerRequest(labels=LABELS, kinds=("add", "misbehave"), cpus=1, memory_bytes=512 * 2**20, deadline_s=3600)
 

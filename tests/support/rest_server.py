@@ -12,6 +12,7 @@ from typing import Any
 
 import httpx
 import pytest
+from tests.support.patience import PATIENCE_S
 
 from marey_schemas.access import MemberChange, ProjectCreate, Role, TokenCreate, UserCreate
 from marey_server.access.principal import SYSTEM, Principal
@@ -26,8 +27,6 @@ ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 USER_SCOPES = ("read", "write", "jobs")
 SCRIPTS_AT = "https://git.invalid/"
 """Address below which the servers of tests allow the repositories of scripts."""
-PATIENCE_S = 240
-"""Longest wait for an answer in seconds: long, because machines may be busy, but shorter than the limit of a test."""
 
 
 @dataclass

@@ -15,12 +15,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.support.patience import PATIENCE_S
 from tests.support.server_process import reserved_port
 from tests.support.tiers import SYSTEM_PATH
 
 CPUS = 4
 MEMORY_MB = 8000
-PATIENCE_S = 60.0
 
 
 class SlurmCluster:

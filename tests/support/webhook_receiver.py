@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-PATIENCE_S = 60.0
+from tests.support.patience import PATIENCE_S
 
 SELF_SIGNED = """\
 -----BEGIN PRIVATE KEY-----

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from tests.support.command_line import CommandLine
 from tests.support.evaluation_takes import write_walks
+from tests.support.patience import PATIENCE_S
 
 from marey_client import Marey
 from marey_client.errors import CannotBisect
@@ -36,7 +37,6 @@ WORDS = ("--speeds", "1", "--turns=-50,50", "--duration", "3", "--no-baseline")
 """The options of `GRID` on the command line."""
 BISECT_WITHOUT_LIMIT = ("dataset", "bisect", "lab/gaits", "--good", "v1", "--metric", "offset_mean_m", *WORDS)
 BISECT = (*BISECT_WITHOUT_LIMIT, "--half-way")
-PATIENCE_S = 240.0
 LONG = ("--speeds", "1:3:0.5", "--duration", "20", "--replicates", "3")
 """Options that make an evaluation take so long that it can be interrupted."""
 LEFT_TURNS = [f"raw/walk {speed} 60" for speed in ("1", "1.5", "2")]

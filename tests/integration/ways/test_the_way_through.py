@@ -13,6 +13,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from tests.support.command_line import CommandLine, run_here
+from tests.support.patience import PATIENCE_S
 from tests.support.present import present
 from tests.support.server_process import ServerProcess
 
@@ -32,7 +33,6 @@ from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.job_params import ImportParams
 from marey_schemas.queue.jobs import CollectionInput, ItemInput, JobCreate
 
-PATIENCE_S = 240.0
 pytestmark = pytest.mark.parametrize("server", ["sqlite"], indirect=True, scope="session")
 
 

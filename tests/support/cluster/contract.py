@@ -19,13 +19,13 @@ import pytest
 from kubernetes import client, config
 from tests.support.cluster.dispatching import LARGE, DispatchBench, name_of
 from tests.support.cluster.objects import Document
+from tests.support.patience import PATIENCE_S
 from tests.support.queue_desk import Desk
 
 from marey_server.launchers.kubernetes.worker_jobs import WorkerJobs
 from marey_server.launchers.launcher import EngineError
 
 T = TypeVar("T")
-PATIENCE_S = 180.0
 
 
 @dataclass

@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 from tests.support.cluster.kubelet import SCRIPT
 from tests.support.cluster.objects import Document
+from tests.support.patience import PATIENCE_S
 from tests.support.queue_desk import KINDS, Desk
 
 from marey_schemas.queue.jobs import Resources
@@ -27,7 +28,6 @@ ENDS = (*SCRIPT, "pass")
 REFUSED = (*SCRIPT, "import sys; sys.exit(42)")
 LARGE = Resources(memory_limit_mb=8000)
 OWN_IMAGE = f"registry.example.org/motion/torch@sha256:{'cd' * 32}"
-PATIENCE_S = 60.0
 
 
 class Seconds:

@@ -17,6 +17,7 @@ from tests.support.cluster.api import KINDS, NAMESPACE, Api, Faults
 from tests.support.cluster.controllers import Controllers
 from tests.support.cluster.kubelet import MAREY, Kubelet
 from tests.support.cluster.objects import Document, Objects
+from tests.support.patience import PATIENCE_S
 from tornado.httpserver import HTTPServer
 from tornado.netutil import bind_sockets
 
@@ -24,7 +25,6 @@ T = TypeVar("T")
 
 IMAGE = f"registry.example.org/marey-worker@sha256:{'ab' * 32}"
 STEP_S = 0.05
-PATIENCE_S = 90.0
 
 
 class StubCluster:

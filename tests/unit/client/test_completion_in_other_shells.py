@@ -11,10 +11,10 @@ import time
 from pathlib import Path
 
 import pytest
+from tests.support.patience import PATIENCE_S
 
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
 """Folders of programs, first that of `marey`."""
-PATIENCE_S = 120.0
 
 
 def environment(folder: Path) -> dict[str, str]:

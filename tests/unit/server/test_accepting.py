@@ -12,13 +12,13 @@ from collections.abc import Awaitable, Callable, Collection
 from typing import Any
 
 import pytest
+from tests.support.patience import PATIENCE_S
 from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream
 
 from marey_server.http import accepting
 from marey_server.http.accepting import LEAST_TAKEN_BYTES, Connections
 
-PATIENCE_S = 30
 TIMEOUT_S = 3600.0
 UNSENT_BYTES = 8 * 2**20
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import psutil
 import pytest
-from tests.support.rest_server import PATIENCE_S
+from tests.support.patience import PATIENCE_S
 
 from marey_schemas.processes.forking import FORKS
 from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem, UnavailableProblem

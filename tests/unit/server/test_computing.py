@@ -8,10 +8,11 @@ import sys
 import threading
 from pathlib import Path
 
+from tests.support.patience import PATIENCE_S
+
 from marey_server.process.computing import ComputeThreads
 from marey_server.store.database.lanes import Client
 
-PATIENCE_S = 30
 ENDLESS = """
 import sys, time
 from marey_server import app, commands

@@ -8,11 +8,11 @@ import weakref
 from collections.abc import Iterator
 
 import pytest
+from tests.support.patience import PATIENCE_S
 
 from marey_server.errors import ClientGoneProblem, UnavailableProblem
 from marey_server.store.database.lanes import SERVER, Client, FairLine, Lane
 
-PATIENCE_S = 30
 ANNA, BEN = Client("anna"), Client("ben")
 STRANGER, OTHER = Client("192.0.2.1", known=False), Client("192.0.2.2", known=False)
 
