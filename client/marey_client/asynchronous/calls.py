@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from functools import partial
-from itertools import islice
 from threading import Lock
 from typing import Any, ParamSpec, TypeVar
 
@@ -19,8 +19,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 MOST_CONCURRENT = 64
-MOST_THREADS = 256
-"""Greatest number of threads of a client: calls that run, and calls that wait, for example for the end of a job."""
+MOST_THREADS = 4096
+"""Greatest number of threads of a client: calls that run, and calls that wait, for example for the end of a job.
+
+It is far above the number of jobs for which programs wait, because if all threads wait, no further call can begin.
+"""
 GRACE_S = 1.0
 """Longest time in seconds for which a cancelled task waits for its thread to stop."""
 
@@ -47,6 +50,10 @@ class _ThreadCall(RunningCall):
     def _outcome(self) -> tuple[Any, BaseException | None]:
         try:
             return self._work(), None
+        except StopIteration as error:
+            ended = RuntimeError("the function raised StopIteration, which a task cannot raise")
+            ended.__cause__ = error
+            return None, ended
         except BaseException as error:  # noqa: BLE001 - the task that awaits the result raises it
             return None, error
 
@@ -70,12 +77,21 @@ class Calls:
         if not 1 <= concurrency <= MOST_CONCURRENT:
             raise BadArgument(f"concurrency: give a number from 1 to {MOST_CONCURRENT}, not {concurrency}")
         self._concurrency = concurrency
+        self._closed = False
+        self._begin()
+
+    def _begin(self) -> None:
+        self._process = os.getpid()
         self._threads = ThreadPoolExecutor(MOST_THREADS, thread_name_prefix="marey-async")
         self._lock = Lock()
         self._running = 0
         self._queue: deque[_ThreadCall] = deque()
         self._live: set[_ThreadCall] = set()
-        self._closed = False
+
+    def _begin_again_if_forked(self) -> None:
+        """Forget the threads and the calls of the parent, which a forked process does not have."""
+        if self._process != os.getpid():
+            self._begin()
 
     async def run(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Run a function in a thread, and return its result.
@@ -115,6 +131,7 @@ class Calls:
 
     async def close(self, last: Callable[[], None]) -> None:
         """Interrupt all calls, which then raise `ConnectionClosed`, wait for their threads, and call `last`."""
+        self._begin_again_if_forked()
         with self._lock:
             self._closed = True
             queued, live = tuple(self._queue), tuple(self._live)
@@ -147,6 +164,7 @@ class Calls:
             self._running += 1
 
     def _add(self, call: _ThreadCall) -> None:
+        self._begin_again_if_forked()
         with self._lock:
             if self._closed:
                 raise ConnectionClosed
@@ -155,7 +173,7 @@ class Calls:
                 self._queue.append(call)
                 return
             self._running += 1
-        self._threads.submit(call.perform)
+            self._threads.submit(call.perform)  # under the lock: otherwise another thread may close the client before
 
     def _end(self, last: Callable[[], None]) -> None:
         self._threads.shutdown()
@@ -166,10 +184,10 @@ def _at_hand(iterator: Iterator[T]) -> Iterator[T]:
     """Yield the next entry, and all further entries that need no request."""
     call = current_call()
     assert call is not None
-    for one in islice(iterator, 1):
+    for one in iterator:
         yield one
-        while call.at_hand:
-            yield next(iterator)
+        if not call.at_hand:
+            return
 
 
 def _ignore(answer: asyncio.Future[Any]) -> None:

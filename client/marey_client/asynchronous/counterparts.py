@@ -11,7 +11,7 @@ from typing import Any, ClassVar, ParamSpec, Self, TypeVar
 import httpx
 
 from marey_client.asynchronous.calls import MOST_THREADS, Calls
-from marey_client.asynchronous.interruption import current_call
+from marey_client.asynchronous.interruption import current_call, leave_call, stop_if_interrupted
 from marey_client.asynchronous.sockets import InterruptibleConnections
 from marey_client.credentials import TokenFile
 from marey_client.marey import Marey
@@ -87,14 +87,17 @@ class Counterpart:
         """Return a function for threads that calls `function` in this event loop, and waits for its result."""
         loop = asyncio.get_running_loop()
 
-        async def run(*args: Any) -> Any:
-            result = function(*map(self._as_async, args))
+        async def run(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+            leave_call()  # the function may start tasks, which go on when the call has ended
+            result = function(*map(self._as_async, args), **{name: self._as_async(one) for name, one in kwargs.items()})
             return self._as_sync(await result if isawaitable(result) else result)
 
-        def called(*args: Any) -> Any:
+        def called(*args: Any, **kwargs: Any) -> Any:
+            stop_if_interrupted()
+            future = asyncio.run_coroutine_threadsafe(run(args, kwargs), loop)
             call = current_call()
-            assert call is not None
-            future = asyncio.run_coroutine_threadsafe(run(*args), loop)
+            if call is None:  # a thread that a function of the user started
+                return future.result()
             with call.waiting(), call.ending_by(future.cancel):  # the function may use the client
                 return future.result()
 

@@ -109,6 +109,11 @@ def run_as(call: RunningCall, function: Callable[[], T]) -> T:
         _current.reset(token)
 
 
+def leave_call() -> None:
+    """Let what runs in this context from now on be no part of a call, so that nothing interrupts it."""
+    _current.set(None)
+
+
 class CallPool(ThreadPoolExecutor):
     """Threads of one call: what they run belongs to the call, and to the trace, of the thread that submits it."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import ssl
 from collections.abc import Callable, Iterable
@@ -19,25 +20,44 @@ T = TypeVar("T")
 
 
 class InterruptibleConnections(httpx.BaseTransport):
-    """HTTP connections for calls that can be interrupted. The first request that uses TLS reads its certificates."""
+    """HTTP connections for calls that can be interrupted. A forked process opens connections of its own."""
 
     def __init__(self, limits: httpx.Limits) -> None:
         self._limits = limits
-        self._plain = _Pool(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), limits)  # trusts nobody
+        self._opened = (os.getpid(), _Pools(limits))
 
-    @cached_property
-    def _tls(self) -> _Pool:
-        return _Pool(trusted_authorities(), self._limits)
+    def _pools(self) -> _Pools:
+        process, pools = self._opened
+        if process != os.getpid():
+            pools = _Pools(self._limits)
+            self._opened = (os.getpid(), pools)
+        return pools
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Send a request, and return the answer; its body is read later."""
-        return (self._tls if request.url.scheme == "https" else self._plain).handle_request(request)
+        pools = self._pools()
+        return (pools.tls if request.url.scheme == "https" else pools.plain).handle_request(request)
 
     def close(self) -> None:
         """Close every connection."""
-        self._plain.close()
-        if "_tls" in self.__dict__:
-            self._tls.close()
+        self._pools().close()
+
+
+class _Pools:
+    """Connections of one process without TLS, and with TLS; the first request that uses TLS reads its certificates."""
+
+    def __init__(self, limits: httpx.Limits) -> None:
+        self._limits = limits
+        self.plain = _Pool(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), limits)  # trusts nobody
+
+    @cached_property
+    def tls(self) -> _Pool:
+        return _Pool(trusted_authorities(), self._limits)
+
+    def close(self) -> None:
+        self.plain.close()
+        if "tls" in self.__dict__:
+            self.tls.close()
 
 
 class _Pool(httpx.HTTPTransport):

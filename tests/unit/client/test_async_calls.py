@@ -1,9 +1,14 @@
 """Calls of the async client in threads: order, cancellation, waits, functions of the user."""
 
 import asyncio
+import json
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import httpx
@@ -199,3 +204,128 @@ def test_a_function_of_the_user_runs_in_the_loop_and_may_use_the_client(script: 
 
     script.answers = [httpx.Response(200, json=ME)]
     asyncio.run(main())
+
+
+def test_an_iterator_that_ends_raises_an_error_in_the_task() -> None:
+    async def program(calls: Calls) -> None:
+        with pytest.raises(RuntimeError, match="raised StopIteration"):
+            async with asyncio.timeout(SOON_S):
+                await calls.run(next, iter(()))
+
+    run(program)
+
+
+def test_many_waits_and_functions_of_the_user_leave_threads_for_other_calls(script: ScriptedServer) -> None:
+    async def main() -> None:
+        async with AsyncMarey("http://server.test", "t", http=script.transport()) as server:
+
+            async def ask(number: int) -> int:
+                await asyncio.sleep(0.1)
+                return int(await server.call(str, number))
+
+            many = range(300)
+            async with asyncio.timeout(LONG_S):
+                asked = [server.call(lambda function, number: function(number), ask, number) for number in many]
+                assert await asyncio.gather(*asked) == list(many)
+            waits = [asyncio.create_task(server.call(pause, LONG_S)) for _ in many]
+            async with asyncio.timeout(SOON_S):
+                assert await server.call(int, "7") == 7
+            for one in waits:
+                one.cancel()
+            await asyncio.gather(*waits, return_exceptions=True)
+
+    asyncio.run(main())
+
+
+def test_no_function_of_the_user_begins_after_the_call_was_cancelled(script: ScriptedServer) -> None:
+    go_on = threading.Event()
+    ran: list[int] = []
+
+    def work(function: Callable[[int], None]) -> None:
+        go_on.wait(LONG_S)
+        function(1)
+
+    async def main() -> None:
+        async with AsyncMarey("http://server.test", "t", http=script.transport()) as server:
+            task = asyncio.create_task(server.call(work, ran.append))
+            await asyncio.sleep(0.1)
+            await cancelled(task)
+            go_on.set()
+            await asyncio.sleep(0.2)
+
+    asyncio.run(main())
+    assert ran == []
+
+
+def test_tasks_that_a_function_of_the_user_starts_outlive_the_call(script: ScriptedServer) -> None:
+    later: list[asyncio.Task[None]] = []
+
+    async def main() -> None:
+        async with AsyncMarey("http://server.test", "t", http=script.transport()) as server:
+
+            async def start(*, pause_s: float) -> None:
+                later.append(asyncio.create_task(asyncio.to_thread(pause, pause_s)))
+                await asyncio.sleep(LONG_S)
+
+            task = asyncio.create_task(server.call(lambda function: function(pause_s=0.3), start))
+            while not later:
+                await asyncio.sleep(0.01)
+            await cancelled(task)
+            await later[0]  # the synchronous SDK is not interrupted there
+
+    asyncio.run(main())
+
+
+def test_a_function_of_the_user_may_be_called_in_threads_that_the_user_starts(script: ScriptedServer) -> None:
+    def work(function: Callable[[int], int]) -> list[int]:
+        with ThreadPoolExecutor(2) as pool:
+            return list(pool.map(function, range(3)))
+
+    async def main() -> None:
+        async with AsyncMarey("http://server.test", "t", http=script.transport()) as server:
+
+            async def double(number: int) -> int:
+                return 2 * number
+
+            assert await server.call(work, double) == [0, 2, 4]
+
+    asyncio.run(main())
+
+
+def test_a_forked_process_has_threads_and_connections_of_its_own() -> None:
+    program = """
+import asyncio, os, sys
+from marey_client.asynchronous.marey import AsyncMarey
+
+client = AsyncMarey(sys.argv[1], "t")
+asyncio.run(client.me())
+child = os.fork()
+asyncio.run(client.me())
+asyncio.run(client.close())
+sys.exit(os.waitpid(child, 0)[1] if child else 0)
+"""
+    connections: set[Any] = set()
+
+    class Answer(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_GET(self) -> None:
+            connections.add(self.client_address)
+            body = json.dumps(ME).encode()
+            self.send_response(200)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - named by the base class
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Answer) as server:
+        threading.Thread(target=server.serve_forever).start()
+        address = f"http://127.0.0.1:{server.server_port}"
+        try:
+            subprocess.run([sys.executable, "-c", program, address], check=True, timeout=LONG_S)
+        finally:
+            server.shutdown()
+    assert len(connections) == 2
