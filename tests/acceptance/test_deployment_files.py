@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import yaml
 from docs.generate import ROOT
+from tests.support.named_commands import unknown_options
 from tests.support.s3_servers import seaweedfs
-from tests.support.told_commands import unknown_options
 
 from marey_schemas.address import SERVER_VARIABLES
 from marey_server.process.settings import Settings

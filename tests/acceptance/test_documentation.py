@@ -4,7 +4,7 @@ import re
 import shlex
 
 from docs.generate import ROOT, files
-from tests.support.told_commands import unknown_options
+from tests.support.named_commands import unknown_options
 from tests.support.who_may import table
 
 from marey_server.process.observe import Metrics
@@ -51,7 +51,7 @@ def test_metrics_that_a_page_names_exist_with_these_labels() -> None:
     assert wrong == []
 
 
-def told_commands() -> list[tuple[str, str]]:
+def named_commands() -> list[tuple[str, str]]:
     """Return (page name, command) for each `marey` command in a shell block of the pages."""
     found = []
     for page in WRITTEN:
@@ -61,9 +61,9 @@ def told_commands() -> list[tuple[str, str]]:
     return found
 
 
-def test_every_command_that_a_page_tells_exists_with_these_options() -> None:
+def test_every_command_that_a_page_names_exists_with_these_options() -> None:
     wrong = []
-    for page, line in told_commands():
+    for page, line in named_commands():
         words = shlex.split(line.rstrip("&").replace("…", ""), comments=True)[1:]
         try:
             unknown = unknown_options(words)

@@ -11,8 +11,8 @@ import pytest
 import yaml
 from docs.generate import ROOT
 from tests.support.cluster.admission import VERSIONS, validate
+from tests.support.named_commands import unknown_options
 from tests.support.present import present
-from tests.support.told_commands import unknown_options
 
 from marey_server.launchers.kubernetes.launcher import make_kubernetes_launcher
 from marey_server.launchers.kubernetes.manifests import TOKEN_FILE, USER

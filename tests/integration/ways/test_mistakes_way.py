@@ -82,13 +82,13 @@ def test_every_mistake_gets_an_answer_in_plain_words(lab: ProjectHandle, run: Co
         (tmp_path / name).write_bytes(content)
     clips = len(lab.clips)
     wrong = []
-    for line, status, told in MISTAKES:
+    for line, status, answer in MISTAKES:
         try:
             done = run(*shlex.split(line), status=status)
         except Exception as error:  # also one that the command line does not expect
             wrong.append(f"{line}: {error}")
             continue
-        if told not in done.stderr or CLUMSY.search(done.stderr):
+        if answer not in done.stderr or CLUMSY.search(done.stderr):
             wrong.append(f"{line}: {done.stderr}")
     assert not wrong, "\n".join(wrong)
     assert (len(lab.clips), (tmp_path / "half.bvh").read_bytes()) == (clips, half)

@@ -101,12 +101,12 @@ def test_joints_may_stand_in_another_order(swaying: MotionPrimitive) -> None:
     np.testing.assert_array_equal(here, there[:, :, [0, 2, 1, 3]])
 
 
-def test_splines_whose_degree_is_not_told_are_cubic(swaying: MotionPrimitive) -> None:
+def test_splines_without_a_degree_are_cubic(swaying: MotionPrimitive) -> None:
     tree = primitive_to_tree(swaying, SKELETON)
-    untold = {
+    without_degree = {
         name: {key: one for key, one in tree[name].items() if key != "degree"} for name in ("spatial", "temporal")
     }
-    read = primitive_from_tree({**tree, **untold}, swaying.skeleton)
+    read = primitive_from_tree({**tree, **without_degree}, swaying.skeleton)
     assert (read.spatial.basis.degree, read.temporal.basis.degree) == (3, 3)
 
 
@@ -119,7 +119,7 @@ def test_a_model_of_other_joints_is_refused(swaying: MotionPrimitive) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "told"),
+    ("place", "message"),
     [
         (("joints",), "19 channels, but the joints need 15"),
         (("spatial", "knots"), "knots"),
@@ -129,7 +129,7 @@ def test_a_model_of_other_joints_is_refused(swaying: MotionPrimitive) -> None:
         (("mixture", "weights"), "weights"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(place: tuple[Any, ...], told: str, swaying: MotionPrimitive) -> None:
+def test_arrays_that_do_not_fit_are_refused(place: tuple[Any, ...], message: str, swaying: MotionPrimitive) -> None:
     tree = primitive_to_tree(swaying, SKELETON)
     holder = tree
     for name in place[:-1]:
@@ -138,5 +138,5 @@ def test_arrays_that_do_not_fit_are_refused(place: tuple[Any, ...], told: str, s
     holder[place[-1]] = value[..., :-1] if isinstance(value, np.ndarray) else value[:-1]
     if place == ("mixture", "means"):
         tree["mixture"]["covariances"] = tree["mixture"]["covariances"][:, :-1, :-1]
-    with pytest.raises(ValidationError, match=told):
+    with pytest.raises(ValidationError, match=message):
         MotionPrimitiveDocument.model_validate(tree)

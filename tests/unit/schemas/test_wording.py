@@ -12,21 +12,21 @@ from marey_schemas.wording import counted, first_reason, plain_reason
 
 
 @pytest.mark.parametrize(
-    ("number", "told"), [(0, "0 frames"), (1, "1 frame"), (2, "2 frames"), (103_568, "103,568 frames")]
+    ("number", "expected"), [(0, "0 frames"), (1, "1 frame"), (2, "2 frames"), (103_568, "103,568 frames")]
 )
-def test_a_noun_takes_an_s_unless_there_is_exactly_one(number: int, told: str) -> None:
-    assert counted(number, "frame") == told
+def test_a_noun_takes_an_s_unless_there_is_exactly_one(number: int, expected: str) -> None:
+    assert counted(number, "frame") == expected
 
 
 @pytest.mark.parametrize(
-    ("noun", "told"), [("trajectory", "2 trajectories"), ("day", "2 days"), ("index", "2 indexes")]
+    ("noun", "expected"), [("trajectory", "2 trajectories"), ("day", "2 days"), ("index", "2 indexes")]
 )
-def test_a_noun_in_y_or_x_takes_the_plural_of_its_kind(noun: str, told: str) -> None:
-    assert counted(2, noun) == told
+def test_a_noun_in_y_or_x_takes_the_plural_of_its_kind(noun: str, expected: str) -> None:
+    assert counted(2, noun) == expected
 
 
 @pytest.mark.parametrize(
-    ("form", "wrong", "told"),
+    ("form", "wrong", "expected"),
     [
         (ProjectName, "My Lab", "at most 64 lower-case letters"),
         (UserName, "Ann!", "letters, digits, dots"),
@@ -35,11 +35,11 @@ def test_a_noun_in_y_or_x_takes_the_plural_of_its_kind(noun: str, told: str) -> 
         (Tag, "a,b", "no comma"),
     ],
 )
-def test_a_refused_text_is_explained_in_words_and_not_by_its_pattern(form: Any, wrong: str, told: str) -> None:
+def test_a_refused_text_is_explained_in_words_and_not_by_its_pattern(form: Any, wrong: str, expected: str) -> None:
     with pytest.raises(ValidationError) as refused:
         TypeAdapter(form).validate_python(wrong)
     reason = plain_reason(refused.value.errors()[0])
-    assert told in reason
+    assert expected in reason
     assert not any(pattern in reason for pattern in FORMS)
 
 
@@ -66,7 +66,7 @@ class Session(BaseModel):
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "expected"),
     [
         ({"uniit": 1}, "uniit: there is no field of this name; did you mean 'unit'?"),
         ({"zzz": 1}, "zzz: there is no field of this name"),
@@ -99,20 +99,20 @@ class Session(BaseModel):
         ([], "the value must be an object with named fields"),
     ],
 )
-def test_a_fault_is_told_with_its_place_in_plain_words(given: Any, told: str) -> None:
+def test_a_fault_is_explained_with_its_place_in_plain_words(given: Any, expected: str) -> None:
     with pytest.raises(ValidationError) as refused:
         Session.model_validate(given)
-    assert first_reason(refused.value, Session, given) == told
+    assert first_reason(refused.value, Session, given) == expected
 
 
-def test_a_value_of_neither_of_two_types_is_told_by_both() -> None:
+def test_a_value_that_fits_no_type_of_a_union_gets_the_reasons_of_all() -> None:
     class Found(BaseModel):
         at: int | Literal["end"]
 
     with pytest.raises(ValidationError) as refused:
         Found.model_validate({"at": []})
-    told = first_reason(refused.value, Found, {"at": []})
-    assert told == "at: the value must be a whole number; or the value must be 'end'"
+    reason = first_reason(refused.value, Found, {"at": []})
+    assert reason == "at: the value must be a whole number; or the value must be 'end'"
 
 
 def test_every_pattern_of_a_text_has_an_explanation_in_words() -> None:

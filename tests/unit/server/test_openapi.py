@@ -145,7 +145,7 @@ def test_members_have_no_titles_that_would_name_the_classes_of_clients_twice(doc
     }
 
 
-def test_defaults_are_told_but_not_sent_by_generated_clients(document: dict[str, Any]) -> None:
+def test_defaults_are_documented_but_not_sent_by_generated_clients(document: dict[str, Any]) -> None:
     """A token whose request names no time ends with the token that creates it; the default as a number is refused."""
     expiry = document["components"]["schemas"]["TokenCreate"]["properties"]["expires_in_s"]
     assert "default" not in expiry
