@@ -110,6 +110,14 @@ def test_a_report_names_its_project_its_author_and_the_date_of_its_revision(
     assert owner.get(f"{evaluation}/report").content == PAGE
 
 
+def test_a_page_that_is_larger_than_stated_is_not_read_into_memory(owner: httpx.Client, evaluation: str) -> None:
+    report = owner.get(f"{evaluation}/parts/report").json()
+    report["html"]["size_bytes"] = 1
+    assert owner.put(f"{evaluation}/parts/report", json=report, headers={"If-Match": "*"}).is_success
+    answer = owner.get(f"{evaluation}/report")
+    assert (answer.content, answer.headers["Accept-Ranges"]) == (PAGE, "bytes")  # streamed as it is stored
+
+
 def test_a_report_gets_the_player_of_this_installation_and_may_run_its_script(
     owner: httpx.Client, evaluation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

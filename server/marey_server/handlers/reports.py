@@ -18,7 +18,7 @@ from marey_schemas.items import Revision
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
-from marey_server.handlers.browser.pages import packed_player
+from marey_server.handlers.browser.pages import PackedPlayer, packed_player
 from marey_server.handlers.items import kind_of
 from marey_server.http.caching import REVALIDATED, caching_of_revision
 from marey_server.http.declarations import Access, Bytes, reads
@@ -92,19 +92,21 @@ class ReportSender(StoredFileSender):
 
         `scripts` are digests of the page's scripts. Pages above `MOST_FILLED_BYTES` are sent as they are stored.
         """
-        if file.size_bytes > MOST_FILLED_BYTES:
+        self.holding.grow(2 * min(file.size_bytes, MOST_FILLED_BYTES))
+        stored = await self.look_up(_read_page, file)
+        if stored is None:
             return await self.send_file(file, PAGE_TYPE, REVALIDATED, _sandbox(scripts))
-        self.holding.grow(2 * file.size_bytes)
-        page = with_origin(await self.look_up(_read_page, file.blob), origin)
-        if scripts and PLAYER_PLACE.encode() in page and (player := await self.compute(packed_player)) is not None:
+        player = await self.compute(packed_player) if scripts and PLAYER_PLACE.encode() in stored else None
+        if player is not None:
             self.holding.grow(len(player.content))
-            page, scripts = with_player(page, player.content), [*scripts, player.script]
+            scripts = [*scripts, player.script]
+        page, digest = await self.compute(_filled, stored, origin, player)
         headers = {
             "Cache-Control": REVALIDATED,
             "Content-Disposition": "inline",
             "Content-Security-Policy": f"{SHOWN_ONLY}; {_sandbox(scripts)}",
         }
-        return Reply(page, rev=hashlib.sha256(page).hexdigest()[:32], media_type=PAGE_TYPE, headers=headers)
+        return Reply(page, rev=digest, media_type=PAGE_TYPE, headers=headers)
 
     def origin(self, project: str, author: str | None, made_at: datetime) -> ReportOrigin:
         """Return the origin of a report, with the address at which the caller has reached the server."""
@@ -117,8 +119,21 @@ def _sandbox(scripts: Sequence[str]) -> str:
     return f"script-src {' '.join(map(repr, scripts))}; sandbox allow-scripts" if scripts else "sandbox"
 
 
-def _read_page(tx: Transaction, digest: str) -> bytes:
-    return blobs.read_blob(tx, digest, 0, blobs.require_readable(tx, digest))
+def _read_page(tx: Transaction, file: StoredFile) -> bytes | None:
+    """Return a page; None if it is too large to be filled, or larger than the document states that refers to it.
+
+    Clients write such documents. If they state a small size of a large blob, it must not be read into memory.
+    """
+    size = blobs.require_readable(tx, file.blob)
+    return None if size > min(file.size_bytes, MOST_FILLED_BYTES) else blobs.read_blob(tx, file.blob, 0, size)
+
+
+def _filled(stored: bytes, origin: ReportOrigin, player: PackedPlayer | None) -> tuple[bytes, str]:
+    """Return a page with its origin and the player, and a digest of this page."""
+    page = with_origin(stored, origin)
+    if player is not None:
+        page = with_player(page, player.content)
+    return page, hashlib.sha256(page).hexdigest()[:32]
 
 
 class ItemReport(ReportSender):
