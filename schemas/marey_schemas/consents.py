@@ -20,7 +20,9 @@ CONSENT_REMEDY = (
 ConsentReason = Annotated[
     str,
     StringConstraints(
-        min_length=1, max_length=500, pattern=form(r"^[^\x00-\x1f\x7f]*\S[^\x00-\x1f\x7f]*$", "be a line with words")
+        min_length=1,
+        max_length=500,
+        pattern=form(r"^[^\x00-\x1f\x7f]*\S[^\x00-\x1f\x7f]*$", "be one line that is not blank"),
     ),
 ]
 """Reason for an export after the end of the consent: one line of text."""

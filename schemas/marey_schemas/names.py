@@ -6,11 +6,11 @@ from typing import Annotated
 from pydantic import StringConstraints
 
 FORMS: dict[str, str] = {}
-"""Requirements by pattern, in words, for messages to people; each continues a sentence after "must"."""
+"""Explanations of patterns for messages to people, by pattern; each continues a sentence that ends with "must"."""
 
 
 def form(pattern: str, words: str) -> str:
-    """Return `pattern`, after `words` have been noted in `FORMS` as its explanation for people."""
+    """Register the explanation of a pattern in `FORMS`, and return the pattern."""
     FORMS[pattern] = words
     return pattern
 

@@ -44,9 +44,9 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 
 
 def suggestion(name: str, known: Collection[str], what: str) -> str:
-    """Return a question with the known name nearest to a misspelt one, or else the list of all known names.
+    """Ask whether the nearest known name was meant; if no known name is similar, list all of them.
 
-    `what` are the known names, such as "kinds".
+    `what` is the noun of the known names in the plural, such as "kinds".
     """
     near = nearest(name, known)
     return f"did you mean '{near}'?" if near else f"the {what} are {', '.join(known)}"
@@ -154,6 +154,8 @@ _REASONS = {
 
 def _length_reason(kind: str, context: Mapping[str, Any]) -> str:
     what, unit = ("text", "character") if kind.startswith("string") else ("list", "entry")
+    if context.get("field_type") == "Dictionary":
+        what, unit = "object", "field"
     if kind.endswith("short"):
         least = context["min_length"]
         return (

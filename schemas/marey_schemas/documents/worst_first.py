@@ -39,10 +39,10 @@ def worst_first(
 
 
 def increase(before: float | None, after: float | None) -> float | None:
-    """Return the badness of a change of a measure that should be small; None if either value is not defined."""
+    """Return by how much a measure that should be small has grown; None if one of the values is not defined."""
     return None if before is None or after is None else after - before
 
 
 def middle_of(ranked: list[T]) -> T:
-    """Return the typical row of a list in order: the one in the middle, and of two the worse one."""
+    """Return the row in the middle of rows that are sorted from the worst to the best; of two, the worse one."""
     return ranked[(len(ranked) - 1) // 2]

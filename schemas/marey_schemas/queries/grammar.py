@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
-from difflib import get_close_matches
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
 from marey_schemas.queries.fields import OPERATORS, QueryField, field_names, find_field
 from marey_schemas.queries.moments import Moment, read_moment
-from marey_schemas.wording import one_of
+from marey_schemas.wording import one_of, suggestion
 
 if TYPE_CHECKING:
     from lark import Lark
@@ -315,10 +314,7 @@ def _require_field(token: Any) -> QueryField:
         return field
     if name == "like":
         raise QueryError('write like("walks/take-01:30-90") < 0.2, with a clip and its frames', _column(token))
-    names = field_names()
-    near = get_close_matches(name, names, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"the fields are {', '.join(names)}"
-    raise QueryError(f"there is no field {str(token)!r}; {hint}", _column(token))
+    raise QueryError(f"there is no field {str(token)!r}; {suggestion(name, field_names(), 'fields')}", _column(token))
 
 
 def _value(field: QueryField, token: Any) -> str | float | date | datetime:
