@@ -36,8 +36,7 @@ def missing_path(transport: Transport, project: str, kind: Kind, path: str) -> s
         return f"{path!r} is a folder of {project}; {kind.plural}.where({path!r}) selects the {kind.plural} in it"
     if folder and not is_folder(transport, project, folder):
         return _missing_folder(transport, project, folder)
-    listed = pages(transport, Item, f"/projects/{project}/{kind.plural}", {"directly_in": folder, "limit": 500})
-    known = [one.name for one in islice(listed, MOST_COMPARED)]
+    known = _names_in(transport, project, kind, folder)
     near = nearest(name, known if folder else [*known, *_folders(transport, project)])
     place = folder or project
     hint = f"; did you mean {f'{folder}/{near}'.lstrip('/')!r}?" if near else ""
@@ -57,8 +56,7 @@ def nearest_path(transport: Transport, project: str, path: str, kinds: Iterable[
         return None
     names = [one.rpartition("/")[2] for one in folders if one.rpartition("/")[0] == found]
     for kind in kinds:
-        listed = pages(transport, Item, f"/projects/{project}/{kind.plural}", {"directly_in": found, "limit": 500})
-        names += (one.name for one in islice(listed, MOST_COMPARED))
+        names += _names_in(transport, project, kind, found)
     near = nearest(name, names)
     return "/".join(filter(None, (found, near))) or None
 
@@ -68,6 +66,11 @@ def _missing_folder(transport: Transport, project: str, folder: str) -> str:
     near = nearest(folder, known)
     hint = f"did you mean {near!r}?" if near else f"the folders are {', '.join(known[:5]) or 'none yet'}"
     return f"there is no folder {folder!r} in {project}; {hint}"
+
+
+def _names_in(transport: Transport, project: str, kind: Kind, folder: str) -> list[str]:
+    listed = pages(transport, Item, f"/projects/{project}/{kind.plural}", {"directly_in": folder, "limit": 500})
+    return [one.name for one in islice(listed, MOST_COMPARED)]
 
 
 def _folders(transport: Transport, project: str) -> list[str]:

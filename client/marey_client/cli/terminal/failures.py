@@ -58,7 +58,7 @@ def reported(*, verbose: bool) -> Iterator[None]:
 
 @contextmanager
 def usage_in_plain_words() -> Iterator[None]:
-    """Explain wrong options and arguments in words for people, where typer passes on the words of its libraries."""
+    """Replace the messages of pydantic and typer about wrong options and arguments by plain words."""
     from typer import BadParameter
     from typer._click.exceptions import NoSuchOption  # typer exports no class for it
 
