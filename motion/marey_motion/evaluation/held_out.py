@@ -1,7 +1,7 @@
 """Trials along the paths of real takes: the path of a clip is asked for, and the clip itself is left out of the set.
 
-Such a path can be followed by a person, so what the set cannot follow is missing in the set. Clips that stand are not
-asked for, and long clips only at their beginning.
+A person walked such a path, so what the set cannot follow is missing in the set. Clips without a path, such as those of
+standing people, have no trial; of long clips, only the beginning is asked for.
 """
 
 from __future__ import annotations
