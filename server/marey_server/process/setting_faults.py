@@ -51,7 +51,7 @@ def _reason(fault: Any) -> str:
 def _setting_at(steps: Sequence[int | str], given: Mapping[str, Any]) -> str:
     """Return where a setting is set: its name, the name of its variable, or the file and the line with its name.
 
-    The name alone stands for a setting in the command line (`given`), and for one that is not found anywhere.
+    The name alone is returned for a setting of the command line (`given`), and for one that is set nowhere.
     """
     name, whole = str(steps[0]) if steps else "", ".".join(map(str, steps))
     if given.get(name) is not None:
