@@ -14,6 +14,7 @@ from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.lru import LruCache
+from marey_schemas.queue.job_params import count_evaluation_tasks
 from marey_worker.context import JobRefused, Task
 from marey_worker.job_io import matching_clips
 from marey_worker.kinds import evaluate
@@ -41,6 +42,20 @@ def test_the_trials_of_all_tasks_together_are_the_suite_whatever_their_number(pr
     first, second = (output.parts["records"] for output in project.staged)
     assert first["trials"] == second["trials"]
     np.testing.assert_array_equal(first["positions"], second["positions"])
+
+
+def test_tasks_are_without_trials_if_there_are_fewer_takes_than_allowed(project: ProjectInMemory) -> None:
+    params = PARAMS.model_copy(update={"families": ("takes",), "most_takes": 40, "replicates": 3})
+    assert count_evaluation_tasks(params) == 5
+    results = []
+    for position in range(5):
+        project.task = Task(position, 5)
+        results.append(evaluate.run(project, params))
+    assert [result["trials"] for result in results] == [1, 1, 1, 0, 0]
+    evaluate.gather(project, params, results)
+    (output,) = project.staged
+    names = [trial["trial"]["label"] for trial in output.parts["evaluation"]["trials"]]
+    assert names == [pin.path for pin in project.inputs["clips"]]
 
 
 def test_the_database_is_built_once_for_all_tasks_of_an_evaluation(

@@ -54,9 +54,9 @@ Headline = dict[str, float | int | None]
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
     """Simulate the trials of this task and their replicates; the result refers to the file with their records."""
     options = EvaluationOptions.of(params)
+    trials = _trials(context, params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
-    trials = _trials(params, options, clips.database)[context.task.position :: context.task.size]
-    runs = len(trials) * options.replicates
+    runs = max(1, len(trials) * options.replicates)  # a task is without trials if there are fewer takes than allowed
     started = time.monotonic()
     with refusing_motion_errors():
         records = run_suite(
@@ -75,7 +75,6 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
             threads=context.threads,
             progress=lambda done, _total, note: context.progress(len(trials) + done, runs, note),
         )
-    # If there are fewer takes than asked for, a task can be without trials.
     found = {"records": records_to_tree(trials, records)} if trials else {}
     if replicates is not None:
         found["replicates"] = replicates.as_tree()
@@ -92,8 +91,8 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     """Compute the measures from the records of all trials; stage the evaluation, and its report if one is requested."""
     options = EvaluationOptions.of(params)
     context.progress(0, GATHERING_STEPS, "reading the records of the trials")
+    trials = _trials(context, params, options)
     database = read_clips(context, params, options.database).database
-    trials = _trials(params, options, database)
     records, replicates = _read_trials(context, results, trials)
     with refusing_motion_errors():
         baseline = None
@@ -126,13 +125,15 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     return {"verdict": evaluation["verdict"], **headline, **perceived, "simulating_s": simulating_s}
 
 
-def _trials(params: EvaluateParams, options: EvaluationOptions, database: MatchingDatabase) -> tuple[Trial, ...]:
-    """Return all trials of the evaluation; those along takes depend on the clips.
+def _trials(context: Context, params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:
+    """Return all trials of the evaluation; clips are read only for trials along takes, which depend on them.
 
     Raises `JobRefused` if a figure is requested for a trial that the evaluation does not have.
     """
     with refusing_motion_errors():
-        trials = (*suite_trials(options), *take_trials(database, options))
+        trials = suite_trials(options)
+        if "takes" in options.families:
+            trials += take_trials(read_clips(context, params, options.database).database, options)
     if unknown := set(params.trial_figures) - {trial.name for trial in trials}:
         named = f"{min(unknown)!r}; a name is like {trials[0].name!r}"
         raise JobRefused("unknown-trial", f"trial_figures: the evaluation has no trial {named}")
