@@ -45,14 +45,14 @@ httpx.post(place, json={}, headers=headers, timeout=60).raise_for_status()
 
 
 class FirstLies(dict[str, tuple[str, ...]]):
-    """Commands by image, of which the first that is run is `LIES` instead."""
+    """Commands by image; the first look-up returns `LIES` instead."""
 
-    told = False
+    lied = False
 
     def __getitem__(self, image: str) -> tuple[str, ...]:
-        if self.told:
+        if self.lied:
             return super().__getitem__(image)
-        self.told = True
+        self.lied = True
         return (sys.executable, "-c", LIES)
 
 
