@@ -49,11 +49,12 @@ class Blobs:
         self.transport.send("PUT", f"/blobs/{name}", content=data, media_type=OCTETS)
         return name
 
-    def put_file(self, path: Path, *, digest: str | None = None) -> str:
+    def put_file(self, path: str | Path, *, digest: str | None = None) -> str:
         """Stream a file to the server and return its digest; a large file is sent as a resumable upload.
 
         Raises `FileChanged` if the length of the file changes while it is sent.
         """
+        path = Path(path)
         name = digest or digest_of_file(path)
         size_bytes = path.stat().st_size
         if size_bytes > RESUMABLE_FROM_BYTES:

@@ -11,6 +11,7 @@ import httpx
 from pydantic import SecretStr
 
 from marey_client.access import Tokens, Users
+from marey_client.arguments import checked
 from marey_client.audit import AuditConditions, read_audit
 from marey_client.blobs import Blobs
 from marey_client.credentials import TokenFile, resolve
@@ -118,9 +119,10 @@ class Marey:
         """List the projects that the token may read."""
         return pages(self.transport, Project, "/projects")
 
-    def create_project(self, project: ProjectCreate) -> ProjectHandle:
-        """Create a project; the caller becomes its owner."""
-        return self.project(self.transport.post(Project, "/projects", project).name)
+    def create_project(self, project: str | ProjectCreate) -> ProjectHandle:
+        """Create a project with a name, or with the fields of `ProjectCreate`; the caller becomes its owner."""
+        wanted = checked(ProjectCreate, name=project) if isinstance(project, str) else project
+        return self.project(self.transport.post(Project, "/projects", wanted).name)
 
     def audit(self, **conditions: Unpack[AuditConditions]) -> Iterator[AuditEntry]:
         """List the audit log of the server, newest entries first.

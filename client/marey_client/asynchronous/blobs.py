@@ -27,7 +27,7 @@ class AsyncBlobs(Counterpart):
         """Upload bytes, even if the server already has them; return their digest."""
         return await self._run(self._sync.put, data, digest=digest)
 
-    async def put_file(self, path: Path, *, digest: str | None = None) -> str:
+    async def put_file(self, path: str | Path, *, digest: str | None = None) -> str:
         """Stream a file to the server and return its digest; a large file is sent as a resumable upload.
 
         Raises `FileChanged` if the length of the file changes while it is sent.

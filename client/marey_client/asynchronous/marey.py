@@ -78,8 +78,8 @@ class AsyncMarey(Connection):
         """List the projects that the token may read."""
         return self._each(self._sync.projects)
 
-    async def create_project(self, project: ProjectCreate) -> AsyncProjectHandle:
-        """Create a project; the caller becomes its owner."""
+    async def create_project(self, project: str | ProjectCreate) -> AsyncProjectHandle:
+        """Create a project with a name, or with the fields of `ProjectCreate`; the caller becomes its owner."""
         exchanged: AsyncProjectHandle = await self._exchange(self._sync.create_project, project)
         return exchanged
 

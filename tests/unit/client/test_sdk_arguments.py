@@ -153,6 +153,8 @@ MISTAKES: dict[str, Callable[[ProjectHandle], object]] = {
     "samples": lambda lab: lab.evaluate("raw", **cast(Any, {"samples": -1})),
     "url": lambda lab: lab.webhooks.create("ftp://x", kinds=["item.created"]),
     "commands": lambda lab: as_edit([{"command": "nope"}]),
+    "clips": lambda lab: lab.clips[cast(Any, 0)],
+    "parts": lambda lab: lab.clips.create("walk", {}),
 }
 
 
@@ -163,3 +165,19 @@ def test_a_wrong_argument_is_an_error_of_this_package_that_names_it(script: Scri
     assert isinstance(wrong.value, MareyError)
     assert isinstance(wrong.value, ValueError)
     assert script.requests == []
+
+
+def test_a_project_is_created_by_its_name_and_a_wrong_name_is_explained(script: ScriptedServer) -> None:
+    created = {
+        "id": "project_1",
+        "name": "lab",
+        "visibility": "private",
+        "created_at": NOW,
+        "updated_at": NOW,
+        "rev": 1,
+    }
+    script.answers = [httpx.Response(201, json=created)]
+    assert script.marey().create_project("lab").name == "lab"
+    assert json.loads(script.requests[0].content) == {"name": "lab"}
+    with pytest.raises(BadArgument, match="name: the text must have at most 64 lower-case letters"):
+        script.marey().create_project("My Lab")

@@ -60,7 +60,7 @@ class Session(BaseModel):
     unit: Literal["cm", "m", "inch"] = "cm"
     name: str = Field("n", min_length=1, max_length=9)
     code: Annotated[str, StringConstraints(pattern="^x$")] = "x"
-    counts: dict[str, int] = {}
+    counts: dict[str, int] = Field({}, min_length=1)
     range: tuple[int, int] = (0, 1)
     quiet: bool = False
 
@@ -92,6 +92,7 @@ class Session(BaseModel):
         ({"name": "n" * 10}, "name: the text must have at most 9 characters"),
         ({"name": 5}, "name: the value must be text"),
         ({"code": "y"}, "code: the text must have another form; it may contain a character that is not allowed"),
+        ({"counts": {}}, "counts: the object must not be empty"),
         ({"counts": {"a": "many"}}, "counts.a: the value must be a whole number"),
         ({"range": [1]}, "range: the list has too few entries"),
         ({"range": [1, 2.5]}, "range.1: the value must be a whole number"),
