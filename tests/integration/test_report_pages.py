@@ -18,6 +18,8 @@ from marey_reports.drawing.page import scripts_of
 from marey_schemas.documents.report_pages import with_origin, with_player
 from marey_server.handlers.browser.pages import packed_player
 
+pytestmark = pytest.mark.timeout(900)
+
 MOST_PAGE_BYTES = 4_000_000
 """Greatest size of the report of the evaluation of a few takes, with the player and two trials."""
 
@@ -59,4 +61,4 @@ def test_every_report_fits_every_screen_and_plays_its_motion(
         "names": names,
         "served": {"file": str(tmp_path / "served.html"), "policy": answer.headers["Content-Security-Policy"]},
     }
-    run_vitest("browser", "browser/reports.test.ts", longest_s=900.0, MAREY_WEB_GIVEN=json.dumps(given))
+    run_vitest("browser", "browser/reports.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
