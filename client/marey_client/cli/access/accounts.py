@@ -151,7 +151,7 @@ def create_user(
 
     wanted = UserCreate(name=name, display_name=display_name, administrator=administrator)
     if not without_password:  # a name that is not valid has been refused before
-        password = ask_secret(f"the password for {name}", twice=True)
+        password = ask_secret(f"Password for {name}", twice=True)
         wanted = UserCreate(name=name, display_name=display_name, password=password, administrator=administrator)
     with connect(context) as marey:
         made = marey.users.create(wanted)

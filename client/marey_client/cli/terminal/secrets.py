@@ -16,6 +16,6 @@ def ask_secret(what: str, *, twice: bool = False) -> str:
     if secret := sys.stdin.readline().rstrip("\r\n"):
         return secret
     raise WrongUsage(
-        f"the command needs {what}, but standard input is not a terminal and contains no line of text; run the "
+        f"nothing was given for “{what}”: standard input is not a terminal and contains no line of text; run the "
         "command in a terminal"
     )
