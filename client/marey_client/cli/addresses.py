@@ -104,7 +104,7 @@ def _missing(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -
 
 
 def advice(project: ProjectHandle, path: str, kinds: Iterable[Kind]) -> str:
-    """Return advice to somebody who gave a path at which there is no folder, nor an item of these kinds."""
+    """Return advice about a path at which there is neither a folder nor an item of these kinds."""
     from marey_client.listing.paths import nearest_path
 
     near = nearest_path(project.transport, project.name, path, kinds) if path and not Address("", path).has_id else None
@@ -326,7 +326,7 @@ def require_apart(things: Sequence[Thing]) -> None:
 
 
 def _kinds_of(kind: str | None) -> Sequence[Kind]:
-    """Return the kinds of items that somebody may mean who gave `kind`, which may also be that of folders."""
+    """Return the kinds of items that an option selects: all kinds if `kind` is None, and none for folders."""
     from marey_schemas.kinds import Kind
 
     return () if kind == FOLDER else tuple(Kind) if kind is None else (kind_named(kind),)

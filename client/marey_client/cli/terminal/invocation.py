@@ -130,7 +130,7 @@ def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Mare
 
 
 def _nearest_project(marey: Marey, name: str) -> str:
-    """Return advice to somebody who named a project that does not exist."""
+    """Return advice about the name of a project that does not exist."""
     from itertools import islice
 
     from marey_schemas.wording import nearest
