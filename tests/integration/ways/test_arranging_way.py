@@ -521,8 +521,8 @@ def test_quotas_are_shown_and_changed(run: Command, marey: Marey, lab: ProjectHa
     assert marey.users.quotas("quincy").items.allowed == 7
 
 
-def test_a_place_where_nothing_is_is_told_and_an_item_listed_by_its_name(run: Command, lab: ProjectHandle) -> None:
-    assert "there is no item or folder at lab/rwa; `marey ls lab` lists" in run("ls", "lab/rwa", status=2).stderr
+def test_a_path_without_an_item_is_refused_and_an_item_is_listed_by_its_name(run: Command, lab: ProjectHandle) -> None:
+    assert "there is no item or folder at lab/rwa; did you mean lab/raw?" in run("ls", "lab/rwa", status=2).stderr
     (item,) = json.loads(run("ls", "lab/raw/a", "--json").stdout)["items"]
     assert (item["kind"], item["name"]) == ("clip", "a")
     assert json.loads(run("ls", "lab/raw", "--tag", "nobody", "--json").stdout) == {"collections": [], "items": []}
