@@ -132,11 +132,11 @@ def test_two_hundred_reads_at_a_time_give_what_one_after_another_gives(takes: Pa
 def test_errors_are_those_of_the_synchronous_client(takes: Path) -> None:
     async def program(server: marey.AsyncMarey, lab: AsyncProjectHandle) -> None:
         await lab.upload(takes, collection="raw", shown=False)
-        with pytest.raises(NoSuchPath) as told:
+        with pytest.raises(NoSuchPath) as raised:
             await lab.clips["rwa"]
         with pytest.raises(NoSuchPath) as expected:
             marey.connect().project("lab").clips["rwa"]
-        assert str(told.value) == str(expected.value)
+        assert str(raised.value) == str(expected.value)
         with pytest.raises(BadArgument, match="frames"):
             await (await lab.clips.list().__anext__()).motion(frames=slice(0, 10, 2))
         with pytest.raises(TypeError, match="not iterable"):

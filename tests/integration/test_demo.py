@@ -28,7 +28,7 @@ def surroundings() -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Told:
+class Printed:
     """Output and error output of a run."""
 
     output: str
@@ -36,7 +36,7 @@ class Told:
 
 
 @pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Told]:
+def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Printed]:
     """The folder of a first run in a process of its own, and the output of this run."""
     folder = tmp_path_factory.mktemp("demo")
     command = ["marey_client.cli", "demo", "--data", str(folder / "data")]
@@ -48,9 +48,9 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Told]:
             status = process.wait()
         finally:
             process.kill()
-    told = Told((folder / "output").read_text("utf-8"), (folder / "errors").read_text("utf-8"))
-    assert status == 0, told
-    return folder, told
+    printed = Printed((folder / "output").read_text("utf-8"), (folder / "errors").read_text("utf-8"))
+    assert status == 0, printed
+    return folder, printed
 
 
 def demo_again(folder: Path, *arguments: str) -> dict[str, Any]:
@@ -64,14 +64,14 @@ def demo_again(folder: Path, *arguments: str) -> dict[str, Any]:
 
 
 def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(
-    first: tuple[Path, Told],
+    first: tuple[Path, Printed],
 ) -> None:
     folder, shown = first
-    told = shown.output
+    text = shown.output
     assert f"ls demo --token-file {folder}/data/admin.token" in shown.errors
-    sentence = told.splitlines()[0]
+    sentence = text.splitlines()[0]
     assert "trajectories" in sentence
-    assert "retargeted clips: those whose root moves at least 0.5 m within 1 s" in told
+    assert "retargeted clips: those whose root moves at least 0.5 m within 1 s" in text
 
     again = demo_again(folder)
     assert again["evaluation"]["verdict"] == sentence
@@ -80,14 +80,14 @@ def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(
     assert again["statuses"] == {"unchanged": again["files"]}
     version = again["version"]
     assert (version["dataset"], version["tag"], version["entries"]) == ("results", "v1", again["retargeted_clips"] + 1)
-    assert f"{version['edited']} was smoothed on a branch and merged" in told
+    assert f"{version['edited']} was smoothed on a branch and merged" in text
     assert Path(version["picture"]).read_text("utf-8").endswith("</svg>\n")
     with open(again["evaluation_report"], encoding="utf-8") as page:
         assert "</html>" in page.read()
 
 
 def test_a_run_with_other_files_reports_on_these_alone(
-    first: tuple[Path, Told], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    first: tuple[Path, Printed], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, _ = first
     shutil.copytree(folder / "data", tmp_path / "data")

@@ -143,7 +143,7 @@ def test_a_long_name_is_broken_into_lines_and_leaves_the_width_to_the_poses(name
     figure = draw_pose_rows([PoseRow(name, "revision 1", poses)], ["0", "1", "2"], ["", "", ""])
     assert figure.get_size_inches()[0] < 3 * POSE_CELL_IN[0] + 3.0
     assert not cut_off(figure)
-    told = [text.get_text() for text in figure.axes[0].texts]
-    assert "revision 1" in told
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert "revision 1" in texts
     if len(name) <= 60:
-        assert name.replace(" ", "") in "".join(told).replace(" ", "")
+        assert name.replace(" ", "") in "".join(texts).replace(" ", "")

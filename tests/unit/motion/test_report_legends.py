@@ -1,4 +1,4 @@
-"""Legends of figures never lie over data, and many clips are told apart by their names."""
+"""Legends of figures never cover data, and many clips are distinguished by their names."""
 
 from __future__ import annotations
 
