@@ -39,7 +39,7 @@ class Findings:
 
     def report(self) -> bytes:
         """Return the report, one self-contained page of HTML. Raises `LookupError` if the job made no report."""
-        self._blob("report")  # raises the error without a request
+        self._blob("report")  # raises LookupError if the job made no report
         path = f"/projects/{self.job.project}/jobs/{self.job.id}/files/report"
         return self.transport.send("GET", path, headers={"Accept": "text/html"}).content
 
