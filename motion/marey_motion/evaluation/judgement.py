@@ -220,7 +220,7 @@ def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[Limit
         regimes = [(trial.speed_m_s, base), (trial.switch_speed_m_s, switched)]
     fastest = max(wanted for wanted, _ in regimes)
     for wanted, own in regimes:
-        # A character that shall stand may move by the share of the speed from which it stops.
+        # The limit at a stop is the share of the speed before the stop.
         limit = limits.speed_share * (wanted or fastest)
         yield _check("speed", own, "settled_se_v" if "settled_se_v" in own else "se_v", limit)
         if "settled_dse_v" in own:

@@ -318,7 +318,7 @@ def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
     Returns None if the next switch, at step `stop`, comes first.
     """
     wanted = series.wanted_speeds_m_s[first:stop]
-    # A stop is answered when only a share of the other speed is left.
+    # The character has responded to a stop when its speed is below the share of the other speed.
     scale = np.where(wanted > 0.0, wanted, series.wanted_speeds_m_s.max())
     right = np.abs(series.speeds_m_s[first:stop] - wanted) < RESPONSE_SHARE * scale
     hold = _hold_steps(series)
