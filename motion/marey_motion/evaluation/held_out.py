@@ -45,9 +45,11 @@ def take_trials(database: MatchingDatabase, options: EvaluationOptions) -> tuple
     """
     if "takes" not in options.families:
         return ()
-    sources = [clip for clip in database.clips if clip.mirrored_from is None]
+    plain = np.array([clip.mirrored_from is None for clip in database.clips])
+    asked = plain if plain.any() else ~plain  # all clips are mirrored copies if only these are in the set
+    sources = [clip for clip, wanted in zip(database.clips, asked, strict=True) if wanted]
     found = [(clip, path) for clip in sources if (path := _path_of(database, clip, options.duration_s)) is not None]
-    if not found or len(np.unique(equal_clips(database))) < 2:
+    if not found or len(np.unique(equal_clips(database)[asked])) < 2:
         raise MotionError(
             f"no clip has a path to ask for: trials along takes need another clip, at least {LEAST_S + LOOK_AHEAD_S:g} "
             f"s, and a path of {LEAST_PATH_M:g} m",

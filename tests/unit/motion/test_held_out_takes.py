@@ -1,6 +1,7 @@
 """The paths of real takes as trials, each without the take itself."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -92,6 +93,30 @@ def test_takes_are_chosen_evenly_and_refused_if_there_are_none(database: Matchin
     for clips in ([LEFT], [arc_track(0.0, 0.0, 9.0, uid="one"), arc_track(2.0, 0.0, 2.0, uid="two")]):
         with pytest.raises(MotionError, match="no clip has a path to ask for"):
             take_trials(synthetic_database(clips), TAKES)
+
+
+def with_copies(tracks: list[Track], *copies: str) -> MatchingDatabase:
+    """Return a database in which the clips `copies`, such as `left~`, are mirrored copies of clips such as `left`."""
+    pool = synthetic_database(tracks)
+    clips = tuple(
+        replace(clip, mirrored_from=clip.uid.partition("~")[0]) if clip.uid in copies else clip for clip in pool.clips
+    )
+    return replace(pool, clips=clips)
+
+
+def test_a_set_of_mirrored_copies_alone_has_takes() -> None:
+    wide = arc_track(2.0, 20.0, 9.0, uid="wide~")
+    pool = with_copies([mirrored_track(LEFT)._replace(uid="left~"), wide], "left~", "wide~")
+    trials = take_trials(pool, TAKES)
+    assert [one.left_out for one in trials] == ["left", "wide"]
+    for one in trials:
+        assert index_for(pool, index_of(pool), one).selectable.any()
+
+
+def test_the_mirrored_copy_of_the_only_clip_is_no_other_clip() -> None:
+    pool = with_copies([LEFT, mirrored_track(LEFT)._replace(uid="left~")], "left~")
+    with pytest.raises(MotionError, match="need another clip"):
+        take_trials(pool, TAKES)
 
 
 def test_trials_along_takes_travel_in_documents(result: EvaluationResult) -> None:
