@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from tests.support.drawn_evaluations import (
     DEFAULT_FIGURES,
     DRAWN_EVALUATIONS,
@@ -38,7 +39,14 @@ from marey_motion.evaluation.scenario import demand
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status
 from marey_reports.drawing.paper import labels_of, nice_levels, shortened, without_shared_folder
-from marey_reports.evaluation.figures import FIGURES, USE_FIGURES, FigureOptions, draw_figure, draw_figures
+from marey_reports.evaluation.figures import (
+    FIGURES,
+    USE_FIGURES,
+    FigureOptions,
+    draw_figure,
+    draw_figures,
+    draw_shared_figures,
+)
 from marey_reports.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
 from marey_reports.evaluation.figures.mixtures import fit_one, fit_two
 from marey_schemas.options.evaluation import EvaluationOptions, Family
@@ -46,6 +54,7 @@ from marey_schemas.options.evaluation import EvaluationOptions, Family
 pytestmark = DRAWN_EVALUATIONS
 
 ONE_TRIAL = [name for name, kind in FIGURES.items() if kind.trials == "one"]
+SMALL_MULTIPLES_APART_IN = 0.26
 SWITCHING = "switching v=2 w=50"
 ARRANGED = ("points", "usage", "clip-graph")
 """Figures that select or arrange their contents by both of two compared results."""
@@ -188,6 +197,18 @@ def test_offsets_are_those_of_the_trials(result: EvaluationResult) -> None:
     for each in result.trials:
         key = each.trial.family, each.trial.speed_m_s, round(np.degrees(each.trial.turn_rate_rad_s))
         assert drawn[key] == each.metrics["offset_mean"]
+
+
+def test_titles_of_many_results_end_before_the_next_panel() -> None:
+    names = [f"walks/{number}_with_a_name_that_is_much_too_long_for_a_panel" for number in range(5)]
+    for figure in draw_shared_figures([usual()] * len(names), names).values():
+        drawn = figure.sketch.figure
+        panels = [axes for axes in drawn.axes if axes.get_title("left")]
+        assert len({axes.get_title("left") for axes in panels}) == len(names)
+        for axes in panels:
+            title = next(text for text in axes.findobj(Text) if text.get_text() == axes.get_title("left"))
+            beyond_in = (title.get_window_extent().x1 - axes.get_window_extent().x1) / drawn.dpi
+            assert beyond_in < SMALL_MULTIPLES_APART_IN, figure.name
 
 
 def test_levels_of_a_scale_are_round_numbers_that_reach_the_largest_value() -> None:

@@ -16,6 +16,8 @@ SPEED = "speed (m/s)"
 TURN_RATE = "turn rate (deg/s, left positive)"
 COLUMNS = 4
 """Greatest number of small multiples side by side."""
+LONGEST_TITLE = 19
+"""Greatest number of letters in the title of a small multiple."""
 
 
 def mark_sides(axes: Axes) -> None:

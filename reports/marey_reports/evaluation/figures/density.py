@@ -22,8 +22,8 @@ from marey_reports.drawing.paper import (
     square_root_ticks,
     write,
 )
-from marey_reports.evaluation.figures.axes import COLUMNS, SPEED, TURN_RATE
-from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
+from marey_reports.evaluation.figures.axes import COLUMNS, LONGEST_TITLE, SPEED, TURN_RATE
+from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, shorter_labels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -127,7 +127,7 @@ def _draw_many(
     figure = new_figure(9.6, bands * (height + beneath) + 0.95)
     ceiling = nice_ceiling(max(float(each.max()) for each in maps))
     drawn = []
-    for number, (subject, each) in enumerate(zip(subjects, maps, strict=True)):
+    for number, (subject, each) in enumerate(zip(shorter_labels(subjects, LONGEST_TITLE), maps, strict=True)):
         band, column = divmod(number, COLUMNS)
         place = Place(0.68 + column * (width + gap), 1.3 + (bands - 1 - band) * (height + beneath), width, height)
         x, y = plane.labels

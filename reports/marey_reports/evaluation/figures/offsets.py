@@ -24,8 +24,8 @@ from marey_reports.drawing.paper import (
     nice_levels,
     write,
 )
-from marey_reports.evaluation.figures.axes import COLUMNS, SPEED, TURN_RATE
-from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
+from marey_reports.evaluation.figures.axes import COLUMNS, LONGEST_TITLE, SPEED, TURN_RATE
+from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, shorter_labels
 from marey_schemas.options.evaluation import Family
 
 if TYPE_CHECKING:
@@ -148,16 +148,14 @@ def _draw_many(
         for family, row in zip(families, fields, strict=True)
     ]
     figure = new_figure(9.6, len(bands) * (height + beneath) + 0.95)
+    titles = [subject.label for subject in shorter_labels(subjects, LONGEST_TITLE)]
     shared = None
     for number, (family, row, columns) in enumerate(bands):
         bottom = 1.3 + (len(bands) - 1 - number) * (height + beneath)
         for column, subject in enumerate(columns):
             place = Place(0.85 + column * (width + gap), bottom, width, height)
             labels = {"x": TURN_RATE, "y": f"{FAMILY_TITLES[family]}\n{SPEED}" if column == 0 else ""}
-            shared = (
-                _draw_field(figure, place, row[subject], subjects[subject].label, labels, levels, MORE_IS_WORSE)
-                or shared
-            )
+            shared = _draw_field(figure, place, row[subject], titles[subject], labels, levels, MORE_IS_WORSE) or shared
     if shared is not None:
         across = COLUMNS * width + (COLUMNS - 1) * gap
         add_colour_bar(figure, shared, Place(0.85, 0.52, across, 0.12), "mean offset (m)", levels)

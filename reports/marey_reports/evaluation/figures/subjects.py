@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from marey_motion.evaluation.relevance import count_switches, measure_usage
 from marey_motion.evaluation.result import ClipUsage, EvaluationResult
 from marey_motion.evaluation.scenario import Trial, reference
 from marey_motion.matching.record import Status, TrialRecord
+from marey_reports.drawing.paper import labels_of
 from marey_schemas.options.evaluation import Family
 
 
@@ -65,6 +66,12 @@ class Subject:
         Columns are the database row before the jump, the row after the jump, and the number of these jumps.
         """
         return self.result.switches if trial is None else count_switches(self.result.clips, [find_record(self, trial)])
+
+
+def shorter_labels(subjects: Sequence[Subject], longest: int) -> list[Subject]:
+    """Return the subjects with labels of at most `longest` characters; different labels stay different."""
+    labels = labels_of([subject.label for subject in subjects], longest)
+    return [replace(subject, label=label) for subject, label in zip(subjects, labels, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
