@@ -112,11 +112,10 @@ def _side_by_side(first: ClipOfStrip, second: ClipOfStrip, moments: int, file_ty
             f"{first.clip.path!r} and {second.clip.path!r} have different joints; draw them to a .png file, at "
             f"most {sheets.MAX_MOMENTS} moments"
         )
-    paper = room("marey_reports.drawing.paper", FIGURES_EXTRA)
-    white, tinted = (paper.shortened(one.clip.path) for one in (second, first))
-    title = f"white: {white}, tinted: {tinted}"
-    pair = sheets.TakePair(title, second.whole(), first.whole())
-    data: bytes = sheets.contact_sheet([pair], heading=first.clip.name, moments=moments)
+    pair = sheets.TakePair("", second.whole(), first.whole())
+    data: bytes = sheets.contact_sheet(
+        [pair], heading=first.clip.name, moments=moments, sides=(second.clip.path, first.clip.path)
+    )
     return data
 
 

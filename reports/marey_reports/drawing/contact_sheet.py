@@ -15,7 +15,7 @@ import numpy as np
 from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
-from marey_reports.drawing.paper import HAIRLINE, INK, to_png
+from marey_reports.drawing.paper import HAIRLINE, INK, shortened, to_png
 from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, Stances, StickFigure, body_of, stances_at
 from marey_schemas.wording import counted, part_of
 
@@ -60,6 +60,7 @@ def contact_sheet(
     moments: int = 6,
     total: int | None = None,
     choice: str = "",
+    sides: tuple[str, str] = ("source", "result"),
 ) -> bytes:
     """Draw a PNG with one row per take: at each of several times, the source and the result side by side.
 
@@ -74,6 +75,7 @@ def contact_sheet(
     moments : number of evenly spaced times at which a take is drawn, at most `MAX_MOMENTS` and one per frame
     total : number of takes from which the drawn takes were chosen; None if all takes are drawn
     choice : order in which they were chosen, such as "the worst first"; written only if not all takes are drawn
+    sides : what the clips on white and on tinted background are
 
     Raises
     ------
@@ -91,7 +93,7 @@ def contact_sheet(
     figure = Figure(figsize=(PAGE_WIDTH, height), dpi=DPI, facecolor="white")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, PAGE_WIDTH), ylim=(0.0, height))
     axes.axis("off")
-    _draw_header(axes, height, heading, _shown_of(len(rows), total, choice))
+    _draw_header(axes, height, heading, f"{_shown_of(len(rows), total, choice)}, {_legend(sides)}")
     for number, row in enumerate(rows):
         _draw_row(axes, row, height - HEADER - number * ROW, (PAGE_WIDTH - 2 * MARGIN) / moments)
     return to_png(figure)
@@ -200,10 +202,14 @@ def _shown_of(shown: int, total: int | None, choice: str) -> str:
     return ", ".join(filter(None, (part_of(shown, total, "take"), choice)))
 
 
-def _draw_header(axes: Axes, top: float, heading: str, takes: str) -> None:
+def _legend(sides: tuple[str, str]) -> str:
+    white, tinted = (shortened(side) for side in sides)
+    return f"each moment as {white} (white) and {tinted} (tinted)"
+
+
+def _draw_header(axes: Axes, top: float, heading: str, legend: str) -> None:
     line = top - 0.50
     _write(axes, (MARGIN, line), heading, 21, weight="bold")
-    legend = f"{takes}, each moment as source (white) and result (tinted)"
     _write(axes, (MARGIN, line - 0.31), legend, 10.5, QUIET)
     right, middle = PAGE_WIDTH - MARGIN, line + 0.08
     for place, (label, side) in enumerate((("left side", LEFT), ("right side", RIGHT))):

@@ -117,7 +117,22 @@ def test_a_title_is_taken_literally_and_a_long_one_is_cut(walk: Clip) -> None:
 def test_a_sheet_says_how_many_of_all_takes_it_shows(
     walk: Clip, monkeypatch: pytest.MonkeyPatch, total: int | None, said: str
 ) -> None:
-    texts = []
+    texts = written_texts(monkeypatch)
+    contact_sheet([TakePair("walk", walk, walk)], moments=1, total=total, choice="the worst first")
+    assert any(text.startswith(said) for text in texts)
+
+
+def test_a_sheet_says_which_clip_is_on_which_background(walk: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = written_texts(monkeypatch)
+    contact_sheet([TakePair("", walk, walk)], moments=1)
+    assert "1 take, each moment as source (white) and result (tinted)" in texts
+    contact_sheet([TakePair("", walk, walk)], moments=1, sides=("dogs/trot", "walks/" + 50 * "x"))
+    assert f"1 take, each moment as dogs/trot (white) and walks/{9 * 'x'}…{14 * 'x'} (tinted)" in texts
+
+
+def written_texts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return a list to which all texts are added that sheets contain from now on."""
+    texts: list[str] = []
     original = sheets._write
 
     def written(axes: Any, place: Any, text: str, *arguments: Any, **options: Any) -> Any:
@@ -125,8 +140,7 @@ def test_a_sheet_says_how_many_of_all_takes_it_shows(
         return original(axes, place, text, *arguments, **options)
 
     monkeypatch.setattr(sheets, "_write", written)
-    contact_sheet([TakePair("walk", walk, walk)], moments=1, total=total, choice="the worst first")
-    assert any(text.startswith(said) for text in texts)
+    return texts
 
 
 def test_the_same_takes_give_the_same_picture_in_many_threads(walk: Clip) -> None:
