@@ -111,7 +111,7 @@ def _caption(subject: ComparedSubject, column: ComparedColumn, shown: list[Point
     if not bars:
         parts.append("the axis does not begin at 0, so there are no bars")
     if replicated:
-        parts.append("dots are runs with different seeds, and a short black line is their mean")
+        parts.append("dots are runs with different seeds, and a short upright line is their mean")
     if any(one.summary.low is not None for one in shown):
         parts.append(f"horizontal lines are {interval_words()}")
     if (number := len(subject.points(column.name))) > len(shown):

@@ -147,7 +147,7 @@ def _draw_map(one: PlayedTrial) -> Sketch:
     }
     apart = np.linalg.norm(desired - simulated, axis=1)
     caption = (
-        f"Seen from above, from the black dot on; numbers are seconds. The character is {apart.mean():.2f} m from the "
+        f"Seen from above, from the largest dot on; numbers are seconds. The character is {apart.mean():.2f} m from the "
         f"desired place on average, at most {apart.max():.2f} m."
     )
     return Sketch(figure, {"paths": table}, caption)
