@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol, cast
+from urllib.parse import urlsplit
 
 from marey_server.launchers.launcher import (
     ENTRY_POINTS,
@@ -57,7 +58,8 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     ]
     fixed = None
     if settings.local_workers:
-        token = make_worker_token(services.database, settings)
+        port = urlsplit(address).port or settings.port  # the setting is 0 for any free port
+        token = make_worker_token(services.database, settings, port)
         data = settings.data.absolute()
         variables = settings.worker_trace_variables
         fixed = LocalLauncher(

@@ -18,13 +18,14 @@ from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
 
 
-def make_worker_token(database: Database, settings: Settings) -> str:
-    """Create a token for the workers that end with this process.
+def make_worker_token(database: Database, settings: Settings, port: int) -> str:
+    """Create a token for the workers that end with this process, which listens at `port`.
 
     Tokens of earlier starts at this address are revoked; servers at other addresses with the same database keep
     their tokens.
     """
-    return database.write(SYSTEM, _replace_token, f"workers beside the server at {_place(settings)}", {})
+    name = f"workers beside the server at {_place(settings.host, port)}"
+    return database.write(SYSTEM, _replace_token, name, {})
 
 
 def keep_pool_token(database: Database, settings: Settings, pool: str, labels: Mapping[str, str], file: Path) -> str:
@@ -36,12 +37,12 @@ def keep_pool_token(database: Database, settings: Settings, pool: str, labels: M
     kept = _read_token(file)
     if kept is not None and _is_usable(database, kept, labels):
         return kept
-    name = f"workers of the pool {pool} of the server at {_place(settings)}"
+    name = f"workers of the pool {pool} of the server at {_place(settings.host, settings.port)}"
     return database.write(SYSTEM, _replace_token, name, labels, file)
 
 
-def _place(settings: Settings) -> str:
-    return f"{settings.host}:{settings.port} on {socket.gethostname()}"
+def _place(host: str, port: int) -> str:
+    return f"{host}:{port} on {socket.gethostname()}"
 
 
 def _read_token(file: Path) -> str | None:

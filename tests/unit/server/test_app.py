@@ -67,15 +67,14 @@ def test_local_workers_get_a_token_though_the_first_administrator_is_disabled(
     database.write(admin, users.create_user, UserCreate(name="ops", administrator=True))
     ops = database.read(SYSTEM, users.administrator_principal, "ops")
     database.write(ops, partial(users.change_user, expected_rev=None), "admin", UserChange(disabled=True))
-    assert database.read(SYSTEM, tokens.resolve_token, make_worker_token(database, Settings())).user_name == "ops"
+    assert database.read(SYSTEM, tokens.resolve_token, make_worker_token(database, Settings(), 8460)).user_name == "ops"
 
 
 def test_a_server_that_starts_again_replaces_its_workers_token_and_no_other_servers(database: Database) -> None:
     database.write(SYSTEM, users.ensure_first_administrator)
-    one, other = Settings(port=8460), Settings(port=8461)
-    first = make_worker_token(database, one)
-    beside = make_worker_token(database, other)
-    again = make_worker_token(database, one)
+    first = make_worker_token(database, Settings(), 8460)
+    beside = make_worker_token(database, Settings(), 8461)
+    again = make_worker_token(database, Settings(), 8460)
     for secret in (beside, again):
         holder = database.read(SYSTEM, tokens.resolve_token, secret)
         assert (holder.scopes, holder.labels) == (("work",), {})

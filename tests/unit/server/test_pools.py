@@ -78,6 +78,25 @@ def test_each_pool_gets_a_launcher_with_its_own_token_and_options(database: Data
     assert database.read(SYSTEM, tokens.resolve_token, context.token).labels == {"gpu": "a100"}
 
 
+def test_servers_at_free_ports_of_one_machine_keep_the_tokens_of_each_others_workers(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pools, "LocalLauncher", make_launcher)
+    database.write(SYSTEM, users.ensure_first_administrator)
+    app = create_app(Settings(data=tmp_path, port=0, local_workers=1), database)
+
+    async def run_both() -> None:
+        async with (
+            keeping_workers(app.services, "http://127.0.0.1:50001"),
+            keeping_workers(app.services, "http://[::1]:50002"),
+        ):
+            for context, _ in made:
+                assert database.read(SYSTEM, tokens.resolve_token, context.token).scopes == ("work",)
+
+    asyncio.run(run_both())
+    assert len(made) == 2
+
+
 def test_a_launcher_that_does_not_exist_is_an_error_in_one_line(tmp_path: Path) -> None:
     file = tmp_path / "marey.toml"
     file.write_text('launcher = "slrum"\n[[pools]]\nname = "gpu"\nmost = 1\n')
