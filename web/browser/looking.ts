@@ -63,7 +63,7 @@ export async function faults(where: Page): Promise<string[]> {
 }
 
 /** Least height and width in pixels of what fingers can press. */
-const FINGER_PX = 44;
+export const FINGER_PX = 44;
 
 /** Return the names of buttons, lists and sliders that are too small for fingers. */
 export function smallTargets(where: Page): Promise<string[]> {
@@ -77,7 +77,7 @@ export function smallTargets(where: Page): Promise<string[]> {
 /** Return the state of the scene as soon as it meets a condition. */
 export async function scene(where: Page, meets: (state: SceneState) => boolean): Promise<SceneState> {
   let state: SceneState | undefined;
-  for (let tries = 0; tries < 1200; tries++) {
+  for (const end = Date.now() + PATIENCE_MS; Date.now() < end; ) {
     state = await where.evaluate(() => window.marey);
     if (state !== undefined && meets(state)) return state;
     await where.waitForTimeout(50);

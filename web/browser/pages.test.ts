@@ -87,7 +87,7 @@ it("works with keys alone, and keeps all that is seen in its address, but not th
   await page.keyboard.press("Space");
   await page.keyboard.press("Home");
   await page.keyboard.press("ArrowRight");
-  await expect.poll(() => page.url()).toMatch(new RegExp(`frame=1&camera=${front},8,3&look=skeleton`));
+  await expect.poll(() => page.url(), { timeout: PATIENCE_MS }).toMatch(new RegExp(`frame=1&camera=${front},8,3&look=skeleton`));
   await picture(page, "view-skeletons");
 });
 
@@ -104,7 +104,7 @@ it("copies a link to the frame that is shown, or says what to copy", async () =>
   await page.getByRole("button", { name: "Copy the page’s address" }).waitFor();
   await page.keyboard.press("Home");
   await page.keyboard.press("ArrowRight");
-  await expect.poll(() => page.url()).toContain("frame=1&");
+  await expect.poll(() => page.url(), { timeout: PATIENCE_MS }).toContain("frame=1&");
 });
 
 it("shows the same again from the copied address, in a narrow window, with the cookie alone", async () => {

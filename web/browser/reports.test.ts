@@ -1,8 +1,8 @@
 /** Reports in a real Chromium: pages of every kind on a phone and on a desk, and the motion that they play. */
 import { readFileSync } from "node:fs";
 import { type Browser, type BrowserContextOptions, chromium, type Page } from "playwright-core";
-import { afterAll, beforeAll, expect, it, vi } from "vitest";
-import { faults, launch, picture, shownColours } from "./looking";
+import { afterAll, beforeAll, expect, it } from "vitest";
+import { faults, FINGER_PX, launch, PATIENCE_MS, picture, shownColours } from "./looking";
 
 interface Given {
   chromium: string;
@@ -17,7 +17,6 @@ const GIVEN = JSON.parse(process.env["MAREY_WEB_GIVEN"]!) as Given;
 const WIDTHS = [390, 1280];
 const HINT = "Scroll sideways";
 
-vi.setConfig({ testTimeout: 180_000 });
 let browser: Browser;
 
 beforeAll(async () => {
@@ -28,6 +27,7 @@ afterAll(() => browser.close());
 
 async function opened(name: string, width: number, options: BrowserContextOptions = {}): Promise<Page> {
   const context = await browser.newContext({ viewport: { width, height: 844 }, ...options });
+  context.setDefaultTimeout(PATIENCE_MS);
   const page = await context.newPage();
   page.on("pageerror", (error) => expect.fail(`${name}: ${error.message}`));
   page.on("request", (request) => {
@@ -88,12 +88,40 @@ it.each(GIVEN.names)("shows the report %s without its script, and on paper", asy
   await printed.context().close();
 });
 
-it("has no fault that axe finds, in light and in dark colours", async () => {
-  const page = await opened("played", 390);
+it.each([...GIVEN.names, "played"])("finds no fault in the report %s by axe, in light and in dark colours", async (name) => {
+  const page = await opened(name, 390);
   for (const colorScheme of ["light", "dark"] as const) {
     await page.emulateMedia({ colorScheme });
     expect(await faults(page)).toEqual([]);
   }
+  await page.context().close();
+});
+
+it.each([...GIVEN.names, "played"])("has links, lists and heads of tables in the report %s that are large enough for fingers", async (name) => {
+  const page = await opened(name, 390, { hasTouch: true, isMobile: true });
+  const small = await page.evaluate((least) =>
+    [...document.querySelectorAll<HTMLElement>("nav a, summary, button")]
+      .filter((one) => one.checkVisibility() && Math.min(one.offsetHeight, one.offsetWidth) < least)
+      .map((one) => `${one.innerText}: ${one.offsetWidth} x ${one.offsetHeight}`), FINGER_PX);
+  expect(small).toEqual([]);
+  expect(await tooWide(page)).toEqual({ beyond: 0, cut: [] });
+  await picture(page, `report-${name}-fingers`, true);
+  await page.context().close();
+});
+
+it("offers no player in a page into which none was inserted", async () => {
+  const page = await opened("evaluation", 390);
+  expect(await page.locator(".player").count()).toBe(2);
+  expect(await page.getByRole("button", { name: /Play/ }).count()).toBe(0);
+  await page.context().close();
+});
+
+it("jumps to a chapter without motion for people who want none", async () => {
+  const page = await opened("runs", 390);
+  const behaviour = () => page.evaluate(() => getComputedStyle(document.documentElement).scrollBehavior);
+  expect(await behaviour()).toBe("smooth");
+  await page.emulateMedia({ reducedMotion: "reduce" });
+  expect(await behaviour()).toBe("auto");
   await page.context().close();
 });
 
@@ -114,10 +142,10 @@ it("plays the worst trial from disk, beside the desired path", async () => {
   for (const width of WIDTHS) {
     const page = await opened("played", width);
     const frame = await playing(page);
-    await expect.poll(() => shownColours(frame.locator("canvas").last()), { timeout: 60_000 }).toBeGreaterThan(LIT);
+    await expect.poll(() => shownColours(frame.locator("canvas").last()), { timeout: PATIENCE_MS }).toBeGreaterThan(LIT);
     const position = () => frame.locator("footer .position").innerText();
     const before = await position();
-    await expect.poll(position).not.toBe(before);
+    await expect.poll(position, { timeout: PATIENCE_MS }).not.toBe(before);
     expect(await tooWide(page)).toEqual({ beyond: 0, cut: [] });
     expect(await page.getByRole("img", { name: "Paths of the worst trial" }).isVisible()).toBe(true);
     await page.locator("#motion").scrollIntoViewIfNeeded();
@@ -128,6 +156,7 @@ it("plays the worst trial from disk, beside the desired path", async () => {
 
 it("plays a trial as the server sends the report, under its content security policy", async () => {
   const context = await browser.newContext({ viewport: { width: 1280, height: 844 } });
+  context.setDefaultTimeout(PATIENCE_MS);
   const page = await context.newPage();
   const complaints: string[] = [];
   page.on("console", (message) => message.type() === "error" && complaints.push(message.text()));
@@ -139,17 +168,19 @@ it("plays a trial as the server sends the report, under its content security pol
   );
   await page.goto("http://marey.example/report");
   const frame = await playing(page);
-  await expect.poll(() => shownColours(frame.locator("canvas").last()), { timeout: 60_000 }).toBeGreaterThan(LIT);
+  await expect.poll(() => shownColours(frame.locator("canvas").last()), { timeout: PATIENCE_MS }).toBeGreaterThan(LIT);
   expect(complaints).toEqual([]);
   await context.close();
 });
 
 it("plays a trial without WebGL, seen from the side", async () => {
   const plain = await chromium.launch({ executablePath: GIVEN.chromium, args: ["--no-sandbox", "--disable-3d-apis"] });
-  const page = await (await plain.newContext()).newPage();
+  const context = await plain.newContext();
+  context.setDefaultTimeout(PATIENCE_MS);
+  const page = await context.newPage();
   await page.goto(`${GIVEN.folder}/played.html`);
   const frame = await playing(page);
   await frame.getByText("This browser offers no WebGL").waitFor();
-  await expect.poll(() => shownColours(frame.locator("canvas").last())).toBeGreaterThan(10);
+  await expect.poll(() => shownColours(frame.locator("canvas").last()), { timeout: PATIENCE_MS }).toBeGreaterThan(10);
   await plain.close();
 });

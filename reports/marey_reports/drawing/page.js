@@ -31,7 +31,7 @@ for (const box of document.querySelectorAll("figure > div, .table")) {
   measure();
 }
 const PLACE_OF_MOTION = 'id="motion">';
-const packed = document.getElementById("player");
+const packed = document.querySelector("script#player"); // the empty place of the player is a template
 for (const box of packed === null ? [] : document.querySelectorAll(".player")) {
   const button = document.createElement("button");
   button.type = "button";
