@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from tests.support.evaluation_takes import write_walks
-from tests.support.patience import PATIENCE_S
+from tests.support.patience import PATIENCE_S, wait_until
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 from tests.support.tiers import is_soak
 
@@ -72,13 +71,6 @@ def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
     return project
 
 
-def wait_until(condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.05)
-
-
 def tasks_of(lab: ProjectHandle, job: Job) -> list[Job]:
     return list(lab.jobs(filters={"parent": job.id}))
 
@@ -109,7 +101,7 @@ def test_a_worker_killed_at_four_fifths_costs_only_the_tasks_it_was_at(
 ) -> None:
     first = start_worker("first")
     job = lab.evaluate("walks", **LONG)
-    wait_until(lambda: marey.jobs.get(job.id).children.get("succeeded", 0) >= 8)
+    wait_until(lambda: marey.jobs.get(job.id).children.get("succeeded", 0) >= 8, pause_s=0.1)
     first.kill()
     at_death = {task.id for task in tasks_of(lab, job) if task.state is JobState.SUCCEEDED}
     assert len(at_death) < 10, "the worker was killed too late to lose anything"
@@ -134,7 +126,7 @@ def test_one_worker_and_two_make_the_same_bytes(
     start_worker("one")
     alone = digests(lab.evaluation(lab.evaluate("walks", **options)))
     start_worker("two")
-    wait_until(lambda: "two" in workers_of(marey, lab, warm_up(marey, lab)))
+    wait_until(lambda: "two" in workers_of(marey, lab, warm_up(marey, lab)), pause_s=0.1)
     job = lab.evaluate("walks", cache="off", **options)
     assert digests(lab.evaluation(job)) == alone
     assert workers_of(marey, lab, job) == {"one", "two"}
@@ -145,7 +137,7 @@ def test_a_cancelled_evaluation_leaves_nothing_and_is_done_again_from_where_it_w
 ) -> None:
     start_worker("one")
     job = lab.evaluate("walks", **LONG)
-    wait_until(lambda: marey.jobs.get(job.id).children.get("succeeded", 0) >= 3)
+    wait_until(lambda: marey.jobs.get(job.id).children.get("succeeded", 0) >= 3, pause_s=0.1)
     marey.jobs.cancel(job.id)
     ended = marey.jobs.wait(job.id, timeout_s=PATIENCE_S, require_success=False)
     assert ended.state is JobState.CANCELLED

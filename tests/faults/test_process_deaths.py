@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 import pytest
 import sqlalchemy
-from tests.support.patience import PATIENCE_S
+from tests.support.patience import PATIENCE_S, wait_until
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 from tests.support.short_walks import write_short_walks
 from tests.support.tcp_proxy import TcpProxy
@@ -133,13 +133,6 @@ def assert_made_from_their_clips(marey: Marey, jobs: list[Job]) -> None:
         [output] = marey.jobs.outputs(job.id)
         [clip] = job.inputs["clips"]
         assert clip["item"] in {edge.item for edge in marey.project("lab").clips.get(output.item).lineage().inputs}
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.1)
 
 
 def ended(marey: Marey, jobs: list[Job], seconds: float = PATIENCE_S) -> list[Job]:
@@ -413,7 +406,7 @@ def test_a_worker_cut_off_from_the_server_loses_its_job_to_another(
         skeleton = import_game_skeleton(lab, tmp_path)
         start_worker("cut-off", port=proxy.port)
         jobs = submit_retargets(lab, entries, skeleton, into="game")
-        wait_until(lambda: any(marey.jobs.get(job.id).state is not JobState.QUEUED for job in jobs))
+        wait_until(lambda: any(marey.jobs.get(job.id).state is not JobState.QUEUED for job in jobs), pause_s=0.1)
         proxy.drop_answers.set()
         start_worker("connected")
         finished = ended(marey, jobs)

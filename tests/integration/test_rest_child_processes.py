@@ -4,8 +4,6 @@ import http.client
 import json
 import os
 import signal
-import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +14,7 @@ import psutil
 import pytest
 from tests.support.api_document import api_document
 from tests.support.edited_takes import make_walk
-from tests.support.patience import PATIENCE_S
+from tests.support.patience import PATIENCE_S, wait_until
 from tests.support.rest_server import Server
 
 from marey_motion.documents import clip_to_document, skeleton_to_document
@@ -31,14 +29,6 @@ from marey_server.process.memory import UNKNOWN_CLIENTS
 
 WAITING = "tests.support.child_functions:wait_for"
 TRIM = {"commands": [{"command": "trim", "stop": 20}]}
-
-
-def until(condition: Callable[[], Any]) -> None:
-    """Wait until a condition is true; fail after `PATIENCE_S`."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def made(owner: httpx.Client, kind: str, **parts: object) -> str:
@@ -72,7 +62,7 @@ def test_a_request_whose_child_is_killed_is_refused_and_the_next_one_is_answered
 ) -> None:
     with ThreadPoolExecutor(1) as threads:
         asked = threads.submit(owner.post, preview, json=TRIM)
-        until(noted.exists)
+        wait_until(noted.exists)
         os.kill(int(noted.read_text()), signal.SIGKILL)
         refused = asked.result()
     assert (refused.status_code, refused.json()["code"]) == (422, "child-died")
@@ -88,11 +78,11 @@ def test_the_child_of_a_client_that_leaves_is_stopped(
     connection = http.client.HTTPConnection(server.address.removeprefix("http://"), timeout=PATIENCE_S)
     headers = {"Authorization": owner.headers["Authorization"], "Content-Type": "application/json"}
     connection.request("POST", f"/api/v1{preview}", json.dumps(TRIM), headers)
-    until(noted.exists)
+    wait_until(noted.exists)
     connection.close()
-    until(lambda: not psutil.pid_exists(int(noted.read_text())))
-    until(lambda: stopped(server, "client-gone") == 1)
-    until(lambda: not server.app.services.in_flight)
+    wait_until(lambda: not psutil.pid_exists(int(noted.read_text())))
+    wait_until(lambda: stopped(server, "client-gone") == 1)
+    wait_until(lambda: not server.app.services.in_flight)
 
 
 def test_all_clients_without_a_user_together_have_the_share_of_one_user(
@@ -139,7 +129,7 @@ def test_the_description_of_the_api_is_computed_again_after_its_child_was_killed
     monkeypatch.setattr(documentation, "bytes", lambda: str(noted).encode(), raising=False)
     with ThreadPoolExecutor(1) as threads:
         asked = threads.submit(server.client().get, "/docs")
-        until(noted.exists)
+        wait_until(noted.exists)
         os.kill(int(noted.read_text()), signal.SIGKILL)
         assert (asked.result().status_code, asked.result().json()["code"]) == (422, "child-died")
     monkeypatch.undo()

@@ -6,8 +6,7 @@ import hashlib
 import json
 import logging
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Event
@@ -15,7 +14,7 @@ from threading import Event
 import httpx
 import numpy as np
 import pytest
-from tests.support.patience import PATIENCE_S
+from tests.support.patience import PATIENCE_S, wait_until
 from tests.support.rest_server import Server, running
 
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
@@ -53,13 +52,6 @@ def add_long_document(server: Server, token: str) -> str:
     made = server.client(token).post("/projects/lab/characters", content=body, headers={"Content-Type": MSGPACK})
     assert made.status_code == 201, made.text
     return f"/projects/lab/characters/{made.json()['id']}/parts/character"
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def test_a_reader_that_takes_nothing_is_cut_off_and_holds_nothing_any_more(

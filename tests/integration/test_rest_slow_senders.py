@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from tests.support.patience import PATIENCE_S
+from tests.support.patience import PATIENCE_S, wait_until
 from tests.support.rest_server import Server, running
 
 from marey_schemas.encoding.digests import digest_of
@@ -39,13 +39,6 @@ def sending(
     with socket.create_connection((host, int(port)), PATIENCE_S) as client:
         client.sendall(f"{head}Content-Type: {content_type}\r\n{size}\r\n\r\n".encode())
         yield client
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,8 @@ import bz2
 import http.client
 import io
 import struct
-import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import httpx
 import numpy as np
 import psutil
 import pytest
-from tests.support.patience import PATIENCE_S
+from tests.support.patience import PATIENCE_S, wait_until
 from tests.support.rest_server import Server, running
 
 from marey_motion.formats import write_bvh
@@ -52,14 +51,6 @@ def small(database: Database, tmp_path: Path) -> Iterator[Server]:
     """A server that allows little memory for reading a file: too little to load kernels for the file as well."""
     with running(database, tmp_path, child_memory_mb=MEMORY_MB, warm_up=True) as server:
         yield server
-
-
-def until(condition: Callable[[], Any]) -> None:
-    """Wait until a condition is true; fail after `PATIENCE_S` seconds."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def upload(client: httpx.Client, files: dict[str, bytes]) -> list[dict[str, Any]]:
@@ -108,7 +99,7 @@ def test_a_second_request_of_a_user_is_refused_while_the_first_uses_the_share(
         True,
     )
     leaving.close()
-    until(lambda: not server.app.services.in_flight)
+    wait_until(lambda: not server.app.services.in_flight)
 
 
 def test_a_client_that_leaves_ends_the_work_for_it(
@@ -120,8 +111,8 @@ def test_a_client_that_leaves_ends_the_work_for_it(
     process = int((tmp_path / "walk").read_text())
     assert psutil.pid_exists(process)
     leaving.close()
-    until(lambda: not psutil.pid_exists(process))
-    until(lambda: not server.app.services.in_flight)
+    wait_until(lambda: not psutil.pid_exists(process))
+    wait_until(lambda: not server.app.services.in_flight)
 
 
 def begin_import(server: Server, token: str, noted: Path) -> http.client.HTTPConnection:
@@ -130,5 +121,5 @@ def begin_import(server: Server, token: str, noted: Path) -> http.client.HTTPCon
     body = f'--b\r\nContent-Disposition: form-data; name="files"; filename="a.bvh"\r\n\r\n{noted}\r\n--b--\r\n'
     headers = {"Authorization": f"Bearer {token}", "Content-Type": "multipart/form-data; boundary=b"}
     connection.request("POST", "/api/v1/projects/lab/imports", body, headers)
-    until(noted.exists)
+    wait_until(noted.exists)
     return connection

@@ -3,12 +3,12 @@
 import os
 import signal
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
+from tests.support.patience import wait_until
 
 from marey_schemas.processes.child_process import ChildBroken, ConnectedChild
 from marey_schemas.processes.forking import FORKS, LOST, ForkServer
@@ -32,13 +32,6 @@ def ids_from(child: ConnectedChild) -> list[int]:
     answer = child.receive(WAIT_S)
     assert answer is not None
     return [int(number) for number in answer.split()]
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def test_children_have_the_modules_of_the_fork_server_and_a_session_of_their_own(server: ForkServer) -> None:

@@ -2,15 +2,13 @@
 
 import os
 import signal
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
-from tests.support.patience import PATIENCE_S
+from tests.support.patience import PATIENCE_S, wait_until
 
 from marey_schemas.processes.forking import FORKS
 from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem, UnavailableProblem
@@ -42,18 +40,10 @@ def start(pool: Children, function: str, payload: bytes = b"", *, caller: str = 
     return pool.submit(caller, f"{FUNCTIONS}:{function}", lambda: payload, bytes, lambda reason, work: None)
 
 
-def until(condition: Callable[[], Any]) -> None:
-    """Wait until a condition is true; fail after `PATIENCE_S` seconds."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def wait_for(pool: Children, folder: Path, name: str, *, caller: str) -> ChildTask[bytes]:
     """Start a function that waits for a file, wait until a child runs it, and return its task."""
     task = start(pool, "wait_for", str(folder / name).encode(), caller=caller)
-    until(lambda: (folder / name).exists() or task.future.done())
+    wait_until(lambda: (folder / name).exists() or task.future.done())
     assert not task.future.done(), task.future.exception()
     return task
 
@@ -71,7 +61,7 @@ def note(ended: list[str], caller: str, _future: object) -> None:
 def process_id(pool: Children) -> int:
     """Run a short function in a child process, and return the id of this process, which is idle afterwards."""
     found = int(run(pool, "echo").split()[-1])
-    until(lambda: pool.sizes == (0, 0))  # otherwise, the next order would get another process
+    wait_until(lambda: pool.sizes == (0, 0))  # otherwise, the next order would get another process
     return found
 
 
@@ -87,7 +77,7 @@ def test_of_idle_children_the_first_one_gets_the_next_order(children: Children, 
     assert [task.future.result(PATIENCE_S) for task in tasks] == [b"waited", b"waited"]
     used = set()
     for _ in range(10):
-        until(lambda: children.sizes == (0, 0))
+        wait_until(lambda: children.sizes == (0, 0))
         used.add(process_id(children))
     assert len(used) == 1
     assert used < processes
@@ -116,7 +106,7 @@ def test_each_end_of_an_order_has_its_reason_and_the_next_order_is_carried_out(
         run(children, "note_and_call", f"{tmp_path / 'process'} {function}".encode())
     assert caught.value.error_code == code
     used = int((tmp_path / "process").read_text())
-    until(lambda: psutil.pid_exists(used) is survives)
+    wait_until(lambda: psutil.pid_exists(used) is survives)
     process_id(children)
 
 
@@ -125,7 +115,7 @@ def test_a_child_that_hangs_is_killed(tmp_path: Path) -> None:
     try:
         with pytest.raises(TooLargeProblem, match=r"0.5 s .*child_wall_s"):
             run(pool, "stop", str(tmp_path / "stopped").encode())
-        until(lambda: not psutil.pid_exists(int((tmp_path / "stopped").read_text() or 0)))
+        wait_until(lambda: not psutil.pid_exists(int((tmp_path / "stopped").read_text() or 0)))
     finally:
         pool.close()
 
@@ -154,7 +144,7 @@ def test_callers_take_turns(children: Children, tmp_path: Path) -> None:
     for caller in ("mallory", "mallory", "mallory", "rita"):
         start(children, "echo", caller=caller).future.add_done_callback(partial(note, ended, caller))
     let_go(tmp_path, "otto")
-    until(lambda: len(ended) == 4)
+    wait_until(lambda: len(ended) == 4)
     assert ended.index("rita") <= 1
     let_go(tmp_path, "olga")
     assert [task.future.result(PATIENCE_S) for task in blocked] == [b"waited", b"waited"]
@@ -166,7 +156,7 @@ def test_work_for_a_client_that_left_is_stopped(children: Children, tmp_path: Pa
     waiting.abandon()
     task.abandon()
     process = int((tmp_path / "walk").read_text())
-    until(lambda: not psutil.pid_exists(process))
+    wait_until(lambda: not psutil.pid_exists(process))
     assert run(children, "echo", b"next").startswith(b"next ")
     assert not (tmp_path / "never").exists()
 
@@ -199,6 +189,6 @@ def test_a_pool_that_closes_kills_its_children_and_fails_what_waits(tmp_path: Pa
     for task in (running, waiting):
         with pytest.raises(UnavailableProblem, match="stopping"):
             task.future.result(PATIENCE_S)
-    until(lambda: not psutil.pid_exists(int((tmp_path / "walk").read_text())))
+    wait_until(lambda: not psutil.pid_exists(int((tmp_path / "walk").read_text())))
     with pytest.raises(UnavailableProblem):
         start(pool, "echo")
