@@ -6,14 +6,16 @@ import os
 import socket
 import ssl
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, partial
+from threading import Thread
 from typing import Any, TypeVar
 
 import httpcore
 import httpx
 
-from marey_client.asynchronous.interruption import current_call
+from marey_client.asynchronous.interruption import Interrupted, RunningCall, current_call
 from marey_client.credentials import trusted_authorities
 
 T = TypeVar("T")
@@ -82,7 +84,42 @@ class _Network(httpcore.SyncBackend):
         local_address: str | None = None,
         socket_options: Iterable[Any] | None = None,
     ) -> httpcore.NetworkStream:
-        return _Stream(super().connect_tcp(host, port, timeout, local_address, socket_options))
+        connect = partial(super().connect_tcp, host, port, timeout, local_address, socket_options)
+        call = current_call()
+        return _Stream(connect() if call is None else _connected(connect, call))
+
+
+def _connected(connect: Callable[[], httpcore.NetworkStream], call: RunningCall) -> httpcore.NetworkStream:
+    """Connect in another thread. If the call is interrupted, the thread ends later, and closes its connection.
+
+    Neither the look-up of a name nor the wait for a server can be interrupted.
+    """
+    made: Future[httpcore.NetworkStream] = Future()
+
+    def run() -> None:
+        try:
+            stream = connect()
+        except BaseException as error:  # noqa: BLE001 - the thread that waits raises it
+            with suppress(InvalidStateError):  # nobody waits any more
+                made.set_exception(error)
+            return
+        try:
+            made.set_result(stream)
+        except InvalidStateError:
+            stream.close()
+
+    Thread(target=run, name="marey-connect", daemon=True).start()
+    try:
+        with call.ending_by(made.cancel):
+            return made.result()
+    except Interrupted:
+        made.add_done_callback(_close)
+        raise
+
+
+def _close(made: Future[httpcore.NetworkStream]) -> None:
+    if not made.cancelled() and made.exception() is None:
+        made.result().close()
 
 
 class _Stream(httpcore.NetworkStream):

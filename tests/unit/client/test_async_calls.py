@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
+import httpcore
 import httpx
 import pytest
 from tests.support.scripted_server import ScriptedServer
@@ -290,6 +291,33 @@ def test_a_function_of_the_user_may_be_called_in_threads_that_the_user_starts(sc
             assert await server.call(work, double) == [0, 2, 4]
 
     asyncio.run(main())
+
+
+def test_a_call_that_connects_ends_when_it_is_cancelled_and_its_connection_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    go_on, closed = threading.Event(), threading.Event()
+
+    class Connected(httpcore.NetworkStream):
+        def close(self) -> None:
+            closed.set()
+
+    def connect(*_args: Any) -> httpcore.NetworkStream:
+        go_on.wait(LONG_S)
+        return Connected()
+
+    async def main() -> None:
+        monkeypatch.setattr(httpcore.SyncBackend, "connect_tcp", connect)
+        async with AsyncMarey("http://server.test", "t") as server:
+            asking = asyncio.create_task(server.me())
+            await asyncio.sleep(0.2)
+            assert await cancelled(asking) < GRACE_S / 2
+
+    started = time.monotonic()
+    asyncio.run(main())
+    assert time.monotonic() - started < SOON_S  # closing does not wait for the connection either
+    go_on.set()
+    assert closed.wait(SOON_S)
 
 
 def test_a_forked_process_has_threads_and_connections_of_its_own() -> None:
