@@ -220,6 +220,8 @@ def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[Limit
         regimes = [(trial.speed_m_s, base), (trial.switch_speed_m_s, switched)]
     fastest = max(wanted for wanted, _ in regimes)
     for wanted, own in regimes:
+        if own.get("settled_se_v", 0.0) is None:
+            continue  # the trial ends so soon after the switch that no step at this speed is settled
         # The limit at a stop is the share of the speed before the stop.
         limit = limits.speed_share * (wanted or fastest)
         yield _check("speed", own, "settled_se_v" if "settled_se_v" in own else "se_v", limit)

@@ -89,6 +89,12 @@ def test_a_character_that_does_what_is_asked_has_no_error_and_follows(trial: Tri
     assert judge_trial(found, VerdictLimits()).followed
 
 
+def test_a_trial_that_ends_soon_after_a_switch_is_judged_without_the_new_speed() -> None:
+    found = measured(replace(STOPS, duration_s=2.3))
+    assert found.regimes["switched"]["settled_se_v"] is None
+    assert judge_trial(found, VerdictLimits()).followed
+
+
 def late(asked: Reference, ticks: int) -> TrialRecord:
     """Return the record of a character that does everything later, and stands at the origin until then."""
     moments = np.maximum(np.arange(asked.tick_count) - ticks, 0)
