@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 from tests.support.every_report import ORIGIN, evaluation_page, write_every_report
-from tests.support.rest_server import Server
+from tests.support.rest_server import Server, stored_file
 from tests.support.tiers import chromium
 from tests.support.vitest_runs import run_vitest
 
@@ -26,13 +25,10 @@ MOST_PAGE_BYTES = 4_000_000
 
 def stored_evaluation(owner: httpx.Client, page: str) -> str:
     """Store an evaluation with a report as a worker does, and return its path."""
-    data = page.encode()
-    digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
-    assert owner.put(f"/blobs/{digest}", content=data).is_success
     report: dict[str, Any] = {
         "schema": "marey/evaluation-report@1",
         "title": "walks",
-        "html": {"blob": digest, "size_bytes": len(data)},
+        "html": stored_file(owner, page.encode()),
         "scripts": scripts_of(page),
         "figures": [],
     }

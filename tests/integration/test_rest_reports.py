@@ -13,7 +13,7 @@ import httpx
 import pytest
 from tests.support.evaluation_results import synthetic_result
 from tests.support.present import present
-from tests.support.rest_server import Server
+from tests.support.rest_server import Server, stored_file
 
 from marey_motion.evaluation.result_documents import records_to_tree, result_to_tree
 from marey_schemas.documents.report_pages import ORIGIN_PLACE, PLAYER_PLACE
@@ -29,21 +29,15 @@ FILES = {"png": b"\x89PNG drawn", "svg": b"<svg/>", "json": b'{"tables": {}}', "
 TYPES = {"png": "image/png", "svg": "image/svg+xml", "json": "application/json", "csv": "text/csv; charset=utf-8"}
 
 
-def stored(client: httpx.Client, data: bytes) -> dict[str, Any]:
-    digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
-    assert client.put(f"/blobs/{digest}", content=data).is_success
-    return {"blob": digest, "size_bytes": len(data)}
-
-
 @pytest.fixture
 def evaluation(owner: httpx.Client) -> str:
     """The path of an evaluation with a report of two figures."""
-    forms = {form: stored(owner, data) for form, data in FILES.items()}
+    forms = {form: stored_file(owner, data) for form, data in FILES.items()}
     figure = {"title": "Offsets", "caption": "How far off.", **forms, "csv": {"cells": forms["csv"]}}
     report = {
         "schema": "marey/evaluation-report@1",
         "title": "walks",
-        "html": stored(owner, PAGE),
+        "html": stored_file(owner, PAGE),
         "scripts": [SCRIPT],
         "figures": [{"name": "offsets", **figure}, {"name": "errors", "trial": "circle v=1 w=0", **figure}],
     }

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from tests.support.rest_server import stored_file
 from tests.support.studying import make_study
 
 from marey_motion.documents import clip_to_tree, skeleton_to_document
@@ -28,12 +28,6 @@ from marey_server.motions.similar import FoundWindows, ShardFiles, SimilarOrder,
 ONE = {"items": ["clip_a"], "revisions": [1], "rows": [60], "joints": [1], "frames": [60], "rates_hz": [30.0]}
 
 
-def stored(owner: httpx.Client, content: bytes) -> dict[str, Any]:
-    digest = f"sha256:{hashlib.sha256(content).hexdigest()}"
-    assert owner.put(f"/blobs/{digest}", content=content).is_success
-    return {"blob": digest, "size_bytes": len(content)}
-
-
 def searched(owner: httpx.Client, clip: str, **shard: Any) -> tuple[int, str]:
     """Store an index of one shard without the fields that may be absent, and search it."""
     index = {"schema": "marey/motion-index@1", "clips": 1, "rows": 60, "shards": [{"rows": 60, **shard}]}
@@ -51,7 +45,7 @@ def test_a_search_refuses_an_index_whose_files_have_other_sizes(owner: httpx.Cli
     listed = owner.get("/projects/lab/clips")
     assert listed.headers["Cache-Control"] == "private, no-cache", "no cache may keep what a cookie has shown"
     clip = listed.json()["items"][0]["id"]
-    poses, clips = stored(owner, b"no poses"), stored(owner, json.dumps(ONE).encode())
+    poses, clips = stored_file(owner, b"no poses"), stored_file(owner, json.dumps(ONE).encode())
     wrong = {**poses, "size_bytes": 0}
     assert searched(owner, clip, clips=clips, poses=wrong) == (404, "no-index"), "a stated size is no promise"
 

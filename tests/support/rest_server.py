@@ -15,6 +15,7 @@ import pytest
 from tests.support.patience import PATIENCE_S
 
 from marey_schemas.access import MemberChange, ProjectCreate, Role, TokenCreate, UserCreate
+from marey_schemas.encoding.digests import digest_of
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.app import Application, create_app, listening
 from marey_server.process.children import Children
@@ -27,6 +28,13 @@ ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 USER_SCOPES = ("read", "write", "jobs")
 SCRIPTS_AT = "https://git.invalid/"
 """Address below which the servers of tests allow the repositories of scripts."""
+
+
+def stored_file(client: httpx.Client, content: bytes) -> dict[str, Any]:
+    """Store a blob; return the reference with which documents and results name it."""
+    digest = digest_of(content)
+    assert client.put(f"/blobs/{digest}", content=content).is_success
+    return {"blob": digest, "size_bytes": len(content)}
 
 
 @dataclass
