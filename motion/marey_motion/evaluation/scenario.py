@@ -267,8 +267,9 @@ def _pieces(trial: Trial, end_s: float) -> tuple[Floats, Floats, Floats, Floats]
     if every_s is not None:
         count += max(0, int((end_s - trial.approach_s) / every_s))
     starts = np.concatenate(([0.0], trial.approach_s + (every_s or 0.0) * np.arange(count)))
-    speeds = np.full(len(starts), trial.speed_m_s)
-    turn_rates = np.full(len(starts), trial.turn_rate_rad_s)
+    # Documents write 2.0 as 2, so the members of a stored trial can be integers.
+    speeds = np.full(len(starts), trial.speed_m_s, np.float64)
+    turn_rates = np.full(len(starts), trial.turn_rate_rad_s, np.float64)
     turn_rates[0] = 0.0
     corners = np.zeros(len(starts))
     if trial.changes_speed:

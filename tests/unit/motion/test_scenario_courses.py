@@ -1,6 +1,7 @@
 """Courses with stops, corners, figures of eight and motion sideways: their paths, and what trials on them measure."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,6 +57,20 @@ def test_four_corners_of_ninety_degrees_make_a_square() -> None:
     assert at(SQUARE, 5.0) == pytest.approx((4.0, 6.0, np.pi))
     assert at(SQUARE, 7.0) == pytest.approx((4.0, 2.0, 1.5 * np.pi))
     assert at(SQUARE, 9.0) == pytest.approx((0.0, 2.0, 2.0 * np.pi), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("trial", "stored"),
+    [
+        (SQUARE, {"turn_rate_rad_s": 0, "speed_m_s": 2}),
+        (Trial("switching", 2.0, 0.0, 1.0, 8.0, 2.5, 2.0), {"turn_rate_rad_s": 0, "speed_m_s": 2}),
+    ],
+)
+def test_stored_trials_with_integers_ask_for_the_same(trial: Trial, stored: dict[str, Any]) -> None:
+    found, wanted = reference(replace(trial, **stored)), reference(trial)
+    np.testing.assert_array_equal(found.positions, wanted.positions)
+    np.testing.assert_array_equal(found.speeds_m_s, wanted.speeds_m_s)
+    np.testing.assert_array_equal(found.turn_rates_rad_s, wanted.turn_rates_rad_s)
 
 
 def test_a_character_that_stops_neither_moves_nor_turns() -> None:
