@@ -152,3 +152,34 @@ def test_the_normaliser_of_another_evaluation_can_be_used(lab: ProjectHandle) ->
     scales = [found.document()["provenance"]["normaliser"] for found in (first, own, pinned)]
     assert scales[0] == scales[2] != scales[1]
     assert first.id in {edge.item for edge in pinned.lineage().inputs}
+
+
+def test_courses_and_takes_are_simulated_drawn_and_compared(
+    lab: ProjectHandle, run: CommandLine, tmp_path: Path
+) -> None:
+    options = ("--duration", 6, "--switch-every-s", 2, "--approach", 1, "--replicates", 3, "--no-baseline")
+    grid = ("--speeds", 1, "--turns", 50, "--corner-angles-deg", 90, "--strafe-angles-deg", 180)
+    courses = ("--families", "stopping,corners,eights,strafing", *grid, *options)
+    told = run(
+        "evaluate", "lab/walks", "--name", "all", *courses, "--trial-figure", "corners v=1 a=90", "--out", "all.html"
+    ).stdout
+    regions = ("Stops", "Corners", "Figures of eight", "Backwards")
+    assert all(f"\n{region}: " in told for region in regions), told
+    (found,) = lab.evaluations.list()
+    assert [one["trial"] for one in found.trials()] == [
+        "stopping v=1 w=50", "corners v=1 a=90", "eights v=1 w=50", "strafing v=1 a=180",
+    ]  # fmt: skip
+    drawn = {figure["name"] for figure in found.part("report")["figures"] if figure["trial"] == "corners v=1 a=90"}
+    assert {"scenario-course", "clip-graph"} <= drawn
+    fewer = [f"lab/{clip.path}" for clip in sorted(lab.clips.list(), key=lambda clip: clip.path)[:6]]
+    run("evaluate", *fewer, "--name", "fewer", *courses, "--normaliser", "lab/all", "--no-report")
+    run("compare", "lab/all", "lab/walks/fewer", "--out", "compared.html")
+    assert "corners of 90 degrees" in (tmp_path / "compared.html").read_text(encoding="utf-8")
+
+    # Six clips have at most six takes, although the options allow for so many that there are seven tasks.
+    told = run("evaluate", *fewer, "--name", "takes", "--families", "takes", "--most-takes", 56, *options).stdout
+    assert re.search(r"^Real paths: \d of 6 trajectories followed", told, re.MULTILINE), told
+    takes = next(one for one in lab.evaluations.list() if one.path == "walks/takes")
+    assert sorted(f"lab/{one['trial'].removeprefix('takes ')}" for one in takes.trials()) == fewer
+    refused = run("compare", "lab/walks/takes", "lab/all", status=1).stderr
+    assert "evaluate both sets without the family `takes`" in refused

@@ -67,6 +67,11 @@ def _compared(pins: Sequence[PinnedInput], results: Sequence[EvaluationResult]) 
                 f"`marey evaluate … --normaliser PROJECT/{pins[0].path}` with the options of that evaluation makes an "
                 f"evaluation of the clips of {pin.path} that can be compared"
             )
+            if "takes" in results[0].options.families:
+                again = (
+                    "trials along takes depend on the clips of each set, so evaluate both sets without the family "
+                    f"`takes`, and with `--normaliser PROJECT/{pins[0].path}`"
+                )
             raise JobRefused(error.code, f"{pins[0].path} and {pin.path}: {error}; {again}") from error
     with refusing_motion_errors():
         return compare_several(results[0], results[1:])
