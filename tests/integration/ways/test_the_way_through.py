@@ -161,7 +161,7 @@ def test_a_job_of_any_kind_is_handed_in_from_the_shell(run: CommandLine, takes: 
     assert [clip.path for clip in marey.project("jobs").clips.list(collection="out")] == ["out/raw/walk-x"]
     assert "their inputs are clips, skeleton" in run(*retarget, "--input", "nose=raw", status=2).stderr
     assert "no skeleton at jobs/absent" in run(*retarget, "--input", "skeleton=absent", status=2).stderr
-    assert "its job kinds are import" in run("job", "submit", "jobs", "nothing", status=2).stderr
+    assert "the job kinds are import" in run("job", "submit", "jobs", "nothing", status=2).stderr
 
 
 def test_the_original_comes_back_byte_for_byte(run: CommandLine, takes: Path, tmp_path: Path) -> None:
