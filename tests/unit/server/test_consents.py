@@ -232,6 +232,6 @@ def skeleton_of(desk: Desk, clip: str) -> dict[str, Any]:
 def test_a_kind_that_exports_takes_the_permission_among_its_parameters() -> None:
     with pytest.raises(ValueError, match="must extend ConsentOverride"):
         replace(RETARGET, exports="clips")
-    with pytest.raises(ValueError, match="exports must name inputs"):
+    with pytest.raises(ValueError, match="must name inputs of the kind"):
         replace(EXPORT, exports="takes")
     assert [kind.name for kind in KINDS.values() if kind.exports] == ["export", "script"]
