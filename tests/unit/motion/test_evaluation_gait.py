@@ -10,13 +10,13 @@ from tests.support.present import present
 
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
-from marey_motion.evaluation import replicates
 from marey_motion.evaluation import suite as suites
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate, evaluate_baseline, run_suite
 from marey_motion.gait import GaitStyle, generate_gait
+from marey_motion.matching import copies
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.controller import run_trial
@@ -225,8 +225,7 @@ def test_an_evaluation_tells_its_progress_over_all_runs_and_builds_one_index(mon
         built.append(len(arguments[0]))
         return build_index(*arguments)
 
-    for module in (suites, replicates):
-        monkeypatch.setattr(module, "build_index", build)
+    monkeypatch.setattr(copies, "build_index", build)
     monkeypatch.setattr(suites, "_baselines", {})
 
     evaluate(database, options, with_baseline=False, progress=lambda *news: told.append(news[:2]))
