@@ -226,7 +226,8 @@ def main() -> list[str]:
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
                 for to, source in enumerate(streams):
                     os.dup2(source, to)
-                sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", buffering=1)  # may be pipes from now on
+                # They may be pipes from now on. As in a new process, no character makes a message of an error fail.
+                sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", buffering=1, errors="backslashreplace")
                 for unused in (orders, woken, wake):
                     unused.close()
                 for descriptor in (*descriptors, *running.values()):
