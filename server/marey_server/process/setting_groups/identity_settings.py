@@ -19,8 +19,8 @@ class IdentitySettings(BaseSettings):
     public_url: str | None = Field(
         None,
         max_length=512,
-        description="Address at which browsers reach the server, such as https://marey.lab.example; needed for "
-        "oidc_issuer.",
+        description="Address at which browsers reach the server, such as https://marey.lab.example. Reports show "
+        "it in their heads, and oidc_issuer needs it.",
     )
     oidc_issuer: str | None = Field(
         None,
