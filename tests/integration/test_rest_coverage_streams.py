@@ -219,12 +219,12 @@ def test_a_skeleton_that_tells_no_direction_is_refused(owner: httpx.Client) -> N
 
 
 SENSELESS: list[Any] = [
-    ({"frame_rate_hz": 5}, "greater than or equal to 10"),
+    ({"frame_rate_hz": 5}, "must be at least 10"),
     ({"frame_rate_hz": 1000}, "at most 240"),
     ({"frame_rate_hz": 60, "speeds_m_s": [1, 1]}, "contains a value twice"),
     ({"frame_rate_hz": 60, "speeds_m_s": list(range(1, 21)), "turn_rates_deg_s": list(range(150))}, "3000 cells"),
     ({"frame_rate_hz": 60, "target_count": 17}, "at most 16"),
-    ({}, "required"),
+    ({}, "this field is missing"),
 ]
 
 

@@ -127,14 +127,14 @@ SENSELESS: list[Any] = [
     ({"commands": MIRROR, "edit": {"item": "edit_x"}}, "", "either commands or an edit"),
     ({"commands": []}, "", "either commands or an edit"),
     ({"commands": [{"command": "wobble"}]}, "/commands/0", "wobble"),
-    ({"commands": [{"command": "trim", "upto": 5}]}, "/commands/0/upto", "not permitted"),
+    ({"commands": [{"command": "trim", "upto": 5}]}, "/commands/0/upto", "no field of this name"),
     ({"commands": [{"command": "trim", "start": 9, "stop": 3}]}, "/commands/0", "must be after"),
     ({"commands": [{"command": "retime", "speed": 0}]}, "/commands/0/speed", "0.01"),
-    ({"commands": [{"command": "rotate", "angle_deg": "left"}]}, "/commands/0/angle_deg", "valid number"),
+    ({"commands": [{"command": "rotate", "angle_deg": "left"}]}, "/commands/0/angle_deg", "number"),
     ({"commands": [{"command": "rotate", "angle_deg": 5, "axis": [0, 0, 0]}]}, "/commands/0/axis", "axis"),
     ({"commands": MIRROR * 300}, "/commands", "256"),
     ({"commands": MIRROR, "frames": [5, 5]}, "/frames", "must be after"),
-    ({"commands": MIRROR, "frames": [-1, 5]}, "/frames/0", "greater than or equal to 0"),
+    ({"commands": MIRROR, "frames": [-1, 5]}, "/frames/0", "must be at least 0"),
     ({"commands": MIRROR, "fields": ["mesh"]}, "/fields/0", "motion"),
 ]
 
