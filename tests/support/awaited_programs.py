@@ -15,8 +15,6 @@ class Forked(Protocol):
 
     pid: int
 
-    def poll(self) -> int | None: ...
-
     def wait(self) -> int: ...
 
     def fileno(self) -> int:
@@ -39,8 +37,11 @@ class AwaitedProgram:
 
     @property
     def returncode(self) -> int | None:
-        """The exit status, or None if the process still runs; a negative number is a signal."""
-        return self._program.poll()
+        """The exit status, or None if the event loop has not seen the end yet; a negative number is a signal.
+
+        The program is not asked: to give its status, it closes the descriptor on which the event loop waits.
+        """
+        return self._ended.result() if self._ended.done() and not self._ended.cancelled() else None
 
     async def wait(self) -> int:
         """Return the exit status when the process has ended."""
