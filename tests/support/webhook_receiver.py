@@ -58,7 +58,7 @@ class Received:
 
 @dataclass
 class Receiver:
-    """HTTP server that records requests, and answers with `status`; if it is `silent`, only when the test ends."""
+    """HTTP server that records requests, and answers with `status`; if it is `silent`, it never answers."""
 
     status: int = 204
     silent: bool = False
@@ -89,7 +89,6 @@ Open = Callable[..., Receiver]
 def open_receiver() -> Iterator[Open]:
     """Function that starts a receiver on this machine."""
     servers: list[ThreadingHTTPServer] = []
-    ended = threading.Event()
 
     def start(**kwargs: Any) -> Receiver:
         receiver = Receiver(**kwargs)
@@ -98,7 +97,7 @@ def open_receiver() -> Iterator[Open]:
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers["Content-Length"]))
                 if receiver.silent:
-                    ended.wait()
+                    threading.Event().wait()  # until the test process ends
                 status = receiver.status
                 with receiver.changed:
                     receiver.received.append(Received({k.lower(): v for k, v in self.headers.items()}, body))
@@ -125,7 +124,6 @@ def open_receiver() -> Iterator[Open]:
         return receiver
 
     yield start
-    ended.set()
     for server in servers:
         server.shutdown()
         server.server_close()
