@@ -16,7 +16,7 @@ from tests.support.server_process import ServerProcess
 
 from marey_client import Marey
 from marey_client.project import ProjectHandle
-from marey_schemas.access import Role, UserCreate
+from marey_schemas.access import Role, UserChange, UserCreate
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -38,7 +38,8 @@ def project(new_lab: Callable[[], ProjectHandle], marey: Marey) -> ProjectHandle
     known = {user.name for user in marey.users.list()}
     for name in ("ada", "ben"):
         if name not in known:
-            marey.users.create(UserCreate.model_validate({"name": name, "password": PASSWORD}))
+            marey.users.create(UserCreate(name=name))
+        marey.users.change(name, UserChange.model_validate({"password": PASSWORD}))
         lab.members.put(name, Role.READER)
     for path in ("mocap/team-b", "delivered"):
         lab.collections.create(path)
