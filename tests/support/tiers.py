@@ -312,8 +312,8 @@ def _group(item: pytest.Item) -> str:
 def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
     """Return the tests in the order in which processes start them: large groups first, with fault cases in between.
 
-    Large groups that start late would run alone at the end; a workflow counts as twenty tests. Fault cases mostly wait,
-    so they are spread among tests that compute.
+    Large groups that start late would run alone at the end, so a workflow and a test in a browser count as many tests.
+    Fault cases mostly wait, so they are spread among tests that compute.
     """
     groups: defaultdict[str, list[pytest.Item]] = defaultdict(list)
     for item in items:
@@ -330,7 +330,7 @@ def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
 
 
 def _size(group: Sequence[pytest.Item]) -> int:
-    return sum(20 if _whole_way(item) else 1 for item in group)
+    return sum(400 if _needs_chromium(item) else 20 if _whole_way(item) else 1 for item in group)
 
 
 def _group_of(item: pytest.Item) -> str:

@@ -9,18 +9,27 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from tests.support.compared_runs import a_curve, a_run, compared_of
-from tests.support.drawn_evaluations import DRAWN_EVALUATIONS, LITTLE, changed, little, usual
+from tests.support.drawn_evaluations import (
+    DRAWN_EVALUATIONS,
+    LITTLE,
+    NAMING,
+    changed,
+    drawn_both,
+    drawn_of_little,
+    usual,
+)
 from tests.support.drawn_figures import covered_by_legends, cut_off
 from tests.support.drawn_models import figures_of_walks
 from tests.support.evaluation_results import synthetic_result
 from tests.support.present import present
 from tests.support.studying import analysis_of
+from tests.support.tiers import is_soak
 
 from marey_reports.comparisons import page as runs_page
 from marey_reports.comparisons.subjects import ComparedSubject
 from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.drawing.paper import COLOURS, add_keys, new_figure
-from marey_reports.evaluation.figures import draw_figure, draw_figures, draw_shared_figures
+from marey_reports.evaluation.figures import draw_figure, draw_shared_figures, drawable
 from marey_reports.perception.study_page import draw_groups
 
 pytestmark = DRAWN_EVALUATIONS
@@ -46,19 +55,19 @@ def test_the_check_finds_a_legend_over_a_line() -> None:
 
 @pytest.mark.parametrize("name", LITTLE)
 def test_no_legend_of_an_odd_evaluation_covers_data(name: str) -> None:
-    assert_free(draw_figures(little(name)))
+    assert_free(drawn_of_little(name))
 
 
 @pytest.mark.parametrize("count", [1, 6, 7, MANY])
 def test_no_legend_covers_data_with_any_number_of_clips(count: int) -> None:
     result = synthetic_result(clips=count, unused=0, frames=120)
-    figures = draw_figures(result)
+    figures = {name: draw_figure(name, result) for name in (drawable(result) if is_soak() else NAMING)}
     assert_free(figures)
     assert cut_off(figures["points"].sketch.figure) == []
 
 
 def test_no_legend_covers_data_in_a_comparison() -> None:
-    assert_free(draw_figures(usual(), other=changed()))
+    assert_free(drawn_both())
     assert_free(draw_shared_figures([usual(), changed(), usual()], ["a", "b", "c"]))
 
 

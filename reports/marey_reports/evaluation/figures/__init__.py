@@ -37,6 +37,7 @@ __all__ = [
     "draw_figure",
     "draw_figures",
     "draw_shared_figures",
+    "drawable",
 ]
 
 
@@ -129,7 +130,15 @@ def draw_figures(
     labels: tuple[str, str] = ("before", "after"),
     options: FigureOptions | None = None,
 ) -> dict[str, DrawnFigure]:
-    """Draw all figures of one result, or of two results in comparison; return them by name.
+    """Draw the figures that `drawable` lists, of one result or of two results in comparison; return them by name."""
+    return {
+        name: draw_figure(name, result, other=other, labels=labels, options=options)
+        for name in drawable(result, other=other)
+    }
+
+
+def drawable(result: EvaluationResult, *, other: EvaluationResult | None = None) -> list[str]:
+    """Return the names of the figures that one result, or a comparison of two results, can have.
 
     Figures are left out if their trials are missing, or if they need records that were not stored.
     """
@@ -138,12 +147,12 @@ def draw_figures(
     families = {each.trial.family for each in result.trials if each.trial.name in names}
     asked = set(result.options.families)
     with_records = all(one.records for one in results)
-    return {
-        name: draw_figure(name, result, other=other, labels=labels, options=options)
+    return [
+        name
         for name, kind in FIGURES.items()
         if (families if kind.trials == "one" else asked).intersection(kind.families)
         if kind.trials != "one" or with_records
-    }
+    ]
 
 
 def draw_shared_figures(results: Sequence[EvaluationResult], labels: Sequence[str]) -> dict[str, DrawnFigure]:
