@@ -56,9 +56,13 @@ export async function picture(where: Page, name: string, fullPage = false): Prom
   await where.screenshot({ path: join(PICTURES, `${name}.png`), fullPage });
 }
 
-export async function faults(where: Page): Promise<string[]> {
+/** Rules of axe whose result depends on the colours of the page. */
+export const COLOUR_RULES = ["color-contrast", "link-in-text-block"];
+
+/** Return the faults that axe finds in a page, by all its rules or by the given ones. */
+export async function faults(where: Page, rules: string[] | null = null): Promise<string[]> {
   await where.evaluate(axe.source); // not as a script of the page, which the content security policy refuses
-  const found = await where.evaluate(() => window.axe.run());
+  const found = await where.evaluate((some) => window.axe.run(some === null ? {} : { runOnly: some }), rules);
   return found.violations.map((one) => `${one.id}: ${one.nodes.map((node) => node.target.join(" ")).join(", ")}`);
 }
 

@@ -2,7 +2,7 @@
 import { readFileSync } from "node:fs";
 import { type Browser, type BrowserContextOptions, chromium, type Page } from "playwright-core";
 import { afterAll, beforeAll, expect, it } from "vitest";
-import { faults, FINGER_PX, launch, PATIENCE_MS, picture, shownColours } from "./looking";
+import { COLOUR_RULES, faults, FINGER_PX, launch, PATIENCE_MS, picture, shownColours } from "./looking";
 
 interface Given {
   chromium: string;
@@ -48,64 +48,63 @@ const tooWide = (page: Page) =>
     return { beyond: Math.max(root.scrollWidth - innerWidth, 0), cut: cut.map((one) => one.outerHTML.slice(0, 80)) };
   });
 
-it.each(GIVEN.names)("shows the report %s on a phone and on a desk", async (name) => {
-  for (const width of WIDTHS) {
-    const page = await opened(name, width);
-    for (const colorScheme of ["light", "dark"] as const) {
-      await page.emulateMedia({ colorScheme });
-      expect(await tooWide(page), `${name} at ${width}`).toEqual({ beyond: 0, cut: [] });
-      await picture(page, `report-${name}-${width}-${colorScheme}`, true);
-    }
-    await page.context().close();
+/** Check that the report fits the window in light and in dark colours. */
+async function fitsInEveryColour(page: Page, name: string): Promise<void> {
+  for (const colorScheme of ["light", "dark"] as const) {
+    await page.emulateMedia({ colorScheme });
+    expect(await tooWide(page), `${name} in ${colorScheme}`).toEqual({ beyond: 0, cut: [] });
+    await picture(page, `report-${name}-${page.viewportSize()!.width}-${colorScheme}`, true);
   }
-});
+}
 
-it.each(GIVEN.names)("gives a hint for each box of the report %s that scrolls, and for no other", async (name) => {
-  const page = await opened(name, 390);
-  const boxes = await page.evaluate(() =>
-    [...document.querySelectorAll("figure > div, .table")]
-      .filter((one) => one.checkVisibility())
-      .map((one) => [one.scrollWidth > one.clientWidth + 1, getComputedStyle(one, "::before").content !== "none"]),
-  );
-  expect(boxes.length).toBeGreaterThan(0);
-  expect(boxes.filter(([scrolls, hint]) => scrolls !== hint)).toEqual([]);
-  expect(await page.evaluate(() => getComputedStyle(document.querySelector(".scrolls")!, "::before").content)).toContain(HINT);
+it.each([...GIVEN.names, "played"])("shows the report %s on a phone, without a fault and for fingers", async (name) => {
+  const page = await opened(name, 390, { hasTouch: true, isMobile: true });
+  expect(await hints(page)).toEqual([]);
+  const small = await page.evaluate((least) =>
+    [...document.querySelectorAll<HTMLElement>("nav a, summary, button")]
+      .filter((one) => one.checkVisibility() && Math.min(one.offsetHeight, one.offsetWidth) < least)
+      .map((one) => `${one.innerText}: ${one.offsetWidth} x ${one.offsetHeight}`), FINGER_PX);
+  expect(small).toEqual([]);
+  await fitsInEveryColour(page, name); // and is dark now
+  expect(await faults(page, COLOUR_RULES)).toEqual([]);
+  await page.emulateMedia({ colorScheme: "light" });
+  expect(await faults(page)).toEqual([]);
   await page.context().close();
 });
 
-it.each(GIVEN.names)("shows the report %s without its script, and on paper", async (name) => {
+/** Return the boxes that scroll and have no hint, and those that have one and do not scroll. */
+async function hints(page: Page): Promise<string[]> {
+  const boxes = await page.evaluate(() =>
+    [...document.querySelectorAll("figure > div, .table")]
+      .filter((one) => one.checkVisibility())
+      .map((one) => ({
+        scrolls: one.scrollWidth > one.clientWidth + 1,
+        hint: getComputedStyle(one, "::before").content,
+        html: one.outerHTML.slice(0, 80),
+      })),
+  );
+  expect(boxes.length).toBeGreaterThan(0);
+  expect(boxes.find(({ scrolls }) => scrolls)!.hint).toContain(HINT);
+  return boxes.filter(({ scrolls, hint }) => scrolls !== (hint !== "none")).map(({ html }) => html);
+}
+
+it.each(GIVEN.names)("shows the report %s on a desk and on paper", async (name) => {
+  const page = await opened(name, 1280);
+  await fitsInEveryColour(page, name);
+  await page.setViewportSize({ width: 794, height: 844 });
+  await page.emulateMedia({ media: "print", colorScheme: "light" });
+  expect(await tooWide(page)).toEqual({ beyond: 0, cut: [] });
+  await picture(page, `report-${name}-print`, true);
+  await page.context().close();
+});
+
+it.each(GIVEN.names)("shows the report %s without its script", async (name) => {
   const page = await opened(name, 390, { javaScriptEnabled: false });
   for (const text of ["lab on https://marey.example", "rita", "2026-11-29 14:05 UTC"]) {
     expect(await page.locator("header").innerText()).toContain(text);
   }
   expect(await page.locator("figure svg").first().isVisible()).toBe(true);
   expect(await page.locator(".player button").count()).toBe(0);
-  await page.context().close();
-  const printed = await opened(name, 794);
-  await printed.emulateMedia({ media: "print" });
-  expect(await tooWide(printed)).toEqual({ beyond: 0, cut: [] });
-  await picture(printed, `report-${name}-print`, true);
-  await printed.context().close();
-});
-
-it.each([...GIVEN.names, "played"])("finds no fault in the report %s by axe, in light and in dark colours", async (name) => {
-  const page = await opened(name, 390);
-  for (const colorScheme of ["light", "dark"] as const) {
-    await page.emulateMedia({ colorScheme });
-    expect(await faults(page)).toEqual([]);
-  }
-  await page.context().close();
-});
-
-it.each([...GIVEN.names, "played"])("has links, lists and heads of tables in the report %s that are large enough for fingers", async (name) => {
-  const page = await opened(name, 390, { hasTouch: true, isMobile: true });
-  const small = await page.evaluate((least) =>
-    [...document.querySelectorAll<HTMLElement>("nav a, summary, button")]
-      .filter((one) => one.checkVisibility() && Math.min(one.offsetHeight, one.offsetWidth) < least)
-      .map((one) => `${one.innerText}: ${one.offsetWidth} x ${one.offsetHeight}`), FINGER_PX);
-  expect(small).toEqual([]);
-  expect(await tooWide(page)).toEqual({ beyond: 0, cut: [] });
-  await picture(page, `report-${name}-fingers`, true);
   await page.context().close();
 });
 
