@@ -143,19 +143,21 @@ def _needs_cluster(item: pytest.Item) -> bool:
     return item.get_closest_marker("cluster") is not None
 
 
-def _rest(item: pytest.Item) -> bool:
-    return _folder(item).startswith("integration/")
+def _on_one_database(item: pytest.Item) -> bool:
+    """Return whether a test is a fault case, a REST test or a test of the server's parts."""
+    return _folder(item).startswith(("faults/", "integration/", "unit/server/"))
 
 
 def _on_other_database(item: pytest.Item) -> bool:
     """Return whether the tier `test` runs this test only on the other database.
 
-    This concerns fault cases, REST tests and workflows; tests of the store itself run on both databases. A hash of the
-    name of the test, or of the workflow's module, chooses the database, so about half of these tests run on each. Tests
-    that exist for only one database always run.
+    This concerns fault cases, REST tests, workflows and tests of the server's parts, but not those of SQL that differs
+    between databases, nor those of claims, completions and publications, which have the mark `every_database`. A hash
+    of the name of the test, or of the workflow's module, chooses the database, so about half of these tests run on
+    each. Tests that exist for only one database always run.
     """
     backend = backend_of(item)
-    if backend is None or item.get_closest_marker("every_database") or not (_fault(item) or _rest(item)):
+    if backend is None or item.get_closest_marker("every_database") or not _on_one_database(item):
         return False
     if item.config.stash[ON_DATABASES][_without_backend(item)] < len(BACKENDS):
         return False
@@ -178,7 +180,7 @@ TIERS = {
         1,
         {
             "for the tier soak": _soak_only,
-            "fault cases, REST tests and whole ways on the other database": _on_other_database,
+            "on the other database": _on_other_database,
         },
     ),
     "soak": Tier(SOAK_EFFORT, {}),

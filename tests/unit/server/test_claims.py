@@ -14,6 +14,8 @@ from marey_server.store.jobs import logs
 from marey_server.store.jobs.policy import DEFAULT_POLICY
 from marey_server.store.tables import attempt
 
+pytestmark = pytest.mark.every_database
+
 CLAIM = "a claim of this test"
 
 

@@ -20,6 +20,8 @@ from marey_server.store.database.lanes import Client
 from marey_server.store.tables import server_state, user
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 on_sqlite = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 on_postgres = pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
 

@@ -21,6 +21,8 @@ from marey_server.store.database.connections import Database
 from marey_server.store.tables import event, metadata
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 
 @contextmanager
 def open_transaction(database: Database) -> Iterator[Transaction]:

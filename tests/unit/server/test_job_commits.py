@@ -30,6 +30,8 @@ from marey_server.store.jobs import commits, completion, reading, retrying, stag
 from marey_server.store.retention import Retention, retire
 from marey_server.store.tables import tree_chunk
 
+pytestmark = pytest.mark.every_database
+
 
 def test_a_job_commits_its_outputs_when_it_completes(gaits: CommittingDesk) -> None:
     made = gaits.submit(into="made")

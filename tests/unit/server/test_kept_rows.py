@@ -10,6 +10,8 @@ from tests.support.store_fixtures import Lab
 
 from marey_server.store.database.connections import Database
 
+pytestmark = pytest.mark.every_database
+
 
 @pytest.fixture
 def emptied(request: pytest.FixtureRequest, database: Database, tmp_path: Path) -> Callable[[], Database]:

@@ -20,6 +20,8 @@ from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 CLIPS = (  # name, collection, tags, frames
     ("walk 1", "raw/a", ("walk",), 10),
     ("walk 2", "raw/b", ("walk", "slow"), 20),

@@ -20,6 +20,8 @@ from marey_server.store.database.prepared import Prepared, run_text
 from marey_server.store.tables import event, user
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 on_postgres = pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
 
 ADD = Prepared(insert(event))

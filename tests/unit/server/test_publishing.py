@@ -22,6 +22,8 @@ from marey_server.store.items import Draft, StoredDocument, publishing, referenc
 from marey_server.store.items.drafts import Published
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 
 def publish(lab: Lab, *drafts: Any, **kwargs: Any) -> list[Published]:
     def run(tx: Transaction) -> list[Published]:

@@ -30,6 +30,8 @@ from marey_server.store.tables import INDEXED_FACTS
 from marey_server.store.tables import item as item_table
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 LONG = "walks " * 20  # more than an index stores
 INFOS: tuple[dict[str, Any], ...] = (
     {"subject": "02", "action": "Walk, slow", "licence": "CC-BY 4.0", "select": "best", "shoot_day": "2025-02-28"},

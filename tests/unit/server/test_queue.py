@@ -18,6 +18,8 @@ from marey_server.store.jobs.endings import Ended
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 
 def test_a_job_is_claimed_once_and_completed(desk: Desk) -> None:
     job = desk.submit()

@@ -22,6 +22,8 @@ from marey_server.store.jobs import layout, retrying
 from marey_server.store.jobs.reaper import share_waiting
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 ERRANDS = ("errand",)
 CHAINED = ("sum", "square", "survey")
 

@@ -27,6 +27,8 @@ from marey_server.store.tables import metadata
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord
 
+pytestmark = pytest.mark.every_database
+
 AT = "2026-01-01T00:00:00.000000Z"
 
 

@@ -26,6 +26,8 @@ from marey_server.store.jobs.claiming.turns import Turn
 from marey_server.store.tables import event
 from marey_server.store.wakeups import work_topic
 
+pytestmark = pytest.mark.every_database
+
 _NUMBERS = itertools.count()
 
 
@@ -122,7 +124,6 @@ STEPS = st.lists(
 )
 
 
-@pytest.mark.every_database
 def test_claims_take_the_jobs_that_the_model_takes(desk: Desk) -> None:
     @settings(max_examples=examples(30), deadline=None, suppress_health_check=list(HealthCheck))
     @given(steps=STEPS)
