@@ -172,7 +172,7 @@ it("says what to do without a session, and for a link that was used", async () =
   expect(await faults(other)).toEqual([]);
   await picture(other, "view-without-link");
   await other.goto(new URL("/s/", page.url()).href);
-  await other.getByText("no study begins at this address alone").waitFor();
+  await other.getByText("This address names no study").waitFor();
   expect(await faults(other)).toEqual([]);
   await stranger.close();
 });
