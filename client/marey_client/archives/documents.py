@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 OF_UNKNOWN_FIELDS = "invalid-body"
 """Code of the error by which servers of earlier versions refuse requests for differences between arrays."""
 CheckContents = Callable[[Sequence[str]], object]
-"""Function called with content digests of revisions before their documents are read."""
+"""Function that may refuse an archive: called with content digests of revisions before their documents are read."""
 
 
 class EarlierDocument(NamedTuple):
@@ -55,14 +55,14 @@ class DocumentWriter:
     differences: bool
     """Whether arrays may be replaced by their differences from arrays that the reader of the archive has."""
     known: set[str] = field(default_factory=set)
-    """Content digests of the revisions that the archive has, or will have."""
+    """Content digests of the revisions that are in the archive or are about to be added."""
     documents: dict[str, PartOfContent] = field(default_factory=dict)
     """Address on the server of each document of an entry, by the digest of the document."""
     earlier: dict[str, EarlierDocument] = field(default_factory=dict)
-    """The replaced document, by the digest of the document that replaced it."""
+    """For each document that replaced another one in a commit, by its digest: the replaced document."""
 
     def run(self) -> None:
-        """Add all documents, and the facets of all revisions."""
+        """Add all documents, and the facets (published numbers) of all revisions."""
         self.check(sorted(self.known))
         self._add_documents(self.documents)
         self._add_facets()
@@ -106,7 +106,7 @@ class DocumentWriter:
             self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
 
     def _files(self, digest: str, body: Any) -> set[str]:
-        """Return the digests of the files that a document names, without the files that the replaced document named."""
+        """Return the digests of the files that a document names and the document that it replaced did not name."""
         named = _files_in(body)
         if named and digest in self.earlier:
             place = self.earlier[digest].place
@@ -132,7 +132,7 @@ class DocumentWriter:
                 self.writer.add(ArchiveMember(MemberKind.REVISION, content), canonical_json(one))
 
     def _add_facets(self) -> None:
-        """Add the facets of all revisions, which jobs may have published after the revisions were committed.
+        """Add the facets (published numbers) of all revisions; jobs may have published them after the commits.
 
         Each member of the archive contains the facets of a few revisions, because readers refuse members of more than
         `MOST_BYTES`.

@@ -55,7 +55,7 @@ class DatasetReader(Protocol):
         """The name of the dataset."""
 
     def at(self, version: str) -> Commit:
-        """Return the commit that a version names."""
+        """Return the commit that a version (a branch, a tag or a digest) names."""
 
     def log(self, version: str) -> Iterator[Commit]:
         """List a version and the versions before it; of the parents of a merge, only the first is followed."""
@@ -64,7 +64,7 @@ class DatasetReader(Protocol):
         """List the entries of a version."""
 
     def difference(self, before: str, after: str, *, limit: int) -> DatasetDifference:
-        """Return the entries that differ in two versions."""
+        """Return the entries that differ between two versions."""
 
 
 def write_archive(
@@ -80,8 +80,8 @@ def write_archive(
 
     Before the documents of revisions are read, `check` is called with the content digests of these revisions, and may
     raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call with the same arguments
-    continues it. Raises `ArchiveInUse` if another process is writing the file, `NotReplaced` if another file than an
-    archive has the name, and `NothingToArchive` if no version is left.
+    continues it. Raises `ArchiveInUse` if another process is writing the file, `NotReplaced` if a file of this name
+    exists and is not an archive, and `NothingToArchive` if no version is left.
     """
     if path.is_file() and path.stat().st_size and not is_tarfile(path):
         raise NotReplaced(f"{path} exists and is not an archive, so it is not replaced; choose another name")
@@ -121,7 +121,7 @@ def write_transfer(
 
 
 def _accept(_contents: Sequence[str]) -> None:
-    """Accept all revisions, without a check of consents."""
+    """Do nothing: accept revisions without a check of the consents."""
 
 
 def _documents(
@@ -154,7 +154,7 @@ def _write(part: Path, path: Path, fill: Callable[[ArchiveWriter], None], on_pro
 
 
 def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequence[str]) -> frozenset[str]:
-    """Check that revisions, given by content digest, may be exported.
+    """Ask the server whether revisions, given by content digest, may be exported.
 
     Returns the ids of the items whose consent has ended. Raises `Conflict` if there are such items and `reason` is
     None. A `reason` permits the export of these items; the server records the reason.
