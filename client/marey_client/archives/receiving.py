@@ -121,7 +121,7 @@ class _Import:
     """Function that returns whether the dataset has the commit with the given digest."""
     revisions: dict[str, _Revision] = field(default_factory=dict)
     """Revisions of entries, by content digest."""
-    held: set[str] = field(default_factory=set)
+    present: set[str] = field(default_factory=set)
     """Content digests of the revisions that the project has."""
     sent: set[str] = field(default_factory=set)
     """Content digests of the revisions that were sent."""
@@ -187,12 +187,12 @@ class _Import:
 
     def _ensure(self, contents: Iterable[str]) -> None:
         """Send the revisions that the project lacks; a revision is sent after the revisions to which it refers."""
-        missing = self._missing(sorted(set(contents) - self.held))
+        missing = self._missing(sorted(set(contents) - self.present))
         referred = {content: self._references(content) for content in missing}
-        if further := set[str]().union(*referred.values()) - self.held - referred.keys():
+        if further := set[str]().union(*referred.values()) - self.present - referred.keys():
             self._ensure(further)
-        while waiting := [content for content in missing if content not in self.held]:
-            ready = [content for content in waiting if referred[content] <= self.held]
+        while waiting := [content for content in missing if content not in self.present]:
+            ready = [content for content in waiting if referred[content] <= self.present]
             for together in self._batches(ready or waiting):
                 self._send(together)
 
@@ -213,7 +213,7 @@ class _Import:
 
     def _note(self, contents: Iterable[str]) -> None:
         for content in contents:
-            self.held.add(content)
+            self.present.add(content)
             self.homes.update(dict.fromkeys(self._revision(content).parts.values(), content))
 
     def _revision(self, content: str) -> _Revision:
@@ -230,7 +230,7 @@ class _Import:
         versions in the archive, and the dataset has all of these earlier versions.
         """
         member = ArchiveMember(MemberKind.DOCUMENT, document)
-        return document in self.homes and (self.homes[document] in self.held or member not in self.archive.members)
+        return document in self.homes and (self.homes[document] in self.present or member not in self.archive.members)
 
     def _document(self, digest: str) -> Any:
         return self.archive.tree(MemberKind.DOCUMENT, digest)
@@ -291,7 +291,7 @@ class _Import:
 
     def _add_facets(self) -> None:
         """Send the facets (published numbers) of revisions that the project already had, without their documents."""
-        for some in batched(sorted(self.facets.keys() & self.held - self.sent), MOST_CONTENTS):
+        for some in batched(sorted(self.facets.keys() & self.present - self.sent), MOST_CONTENTS):
             self._send(some)
 
     def _bases(self, contents: list[str]) -> dict[tuple[str, str], ArrayBases]:
