@@ -15,7 +15,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def checked(model: type[Model], values: Mapping[str, Any] | None = None, /, **more: Any) -> Model:
-    """Return an instance of `model` with the given values. Raises `BadArgument`, which names the first invalid field."""
+    """Return an instance of `model` with these values. Raises `BadArgument`, which names the first invalid field."""
     given = {**(values or {}), **more}
     try:
         return model.model_validate(given)

@@ -27,7 +27,7 @@ ONLY_AS_JSON = frozenset({"clips"})
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.command()(audit)
 
 

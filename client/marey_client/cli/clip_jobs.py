@@ -38,7 +38,7 @@ SQUARE_CM = 1e4  # in a square metre
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, retarget, params=RETARGET, job=JOB)
     add_command(app, align, params=ALIGN, job=JOB)
     add_command(app, cut, params=CUT, job=JOB)

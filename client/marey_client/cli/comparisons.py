@@ -31,7 +31,7 @@ PRINTED_METRICS = (
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     add_command(app, compare, params=COMPARE, job=FINDINGS_JOB)
 
 

@@ -24,7 +24,7 @@ Finding = tuple[str, str, str]
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(doctor)
 
 

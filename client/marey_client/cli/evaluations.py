@@ -53,7 +53,7 @@ Normaliser = Annotated[
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, evaluate, params=EVALUATE, job=JOB)
     app.command()(report)
 

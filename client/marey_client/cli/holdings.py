@@ -26,7 +26,7 @@ FEW = 50
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     for command in (df, stale):
         app.command()(command)
 

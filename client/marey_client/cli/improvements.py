@@ -43,7 +43,7 @@ From = Annotated[
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, suggest, params=SUGGEST, job=FINDINGS_JOB)
     add_command(app, optimise, params=OPTIMISE, job=FINDINGS_JOB)
     add_command(app, sweep, params=SWEEP, job=FINDINGS_JOB)

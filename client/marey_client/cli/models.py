@@ -33,7 +33,7 @@ MODEL = OptionsOf(
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, model, params=MODEL, job=SEEDED_JOB)
     app.command()(sample)
 

@@ -59,7 +59,7 @@ Preview = Annotated[bool, typer.Option("--preview", help="List what the command 
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     for command in (mv, rm, restore, revert, tag):
         app.command()(command)
 

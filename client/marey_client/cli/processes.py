@@ -35,7 +35,7 @@ READY_TIMEOUT_S = 10.0
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.command()(serve)
     app.add_typer(workers, name="worker")
     app.command()(ready)

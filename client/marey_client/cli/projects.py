@@ -37,7 +37,7 @@ DefaultLimits = Annotated[
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(project, name="project")
     app.add_typer(member, name="member")
 

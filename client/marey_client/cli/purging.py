@@ -24,7 +24,7 @@ MOST_SHOWN = 100
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(purge)
 
 

@@ -44,7 +44,7 @@ Many = list[str] | None
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, tree, params=TREE, job=SEEDED_JOB)
     add_command(app, search, params=SEARCH)
     add_command(app, index, params=INDEX, job=FINDINGS_JOB)

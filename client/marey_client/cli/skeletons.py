@@ -21,7 +21,7 @@ skeleton = typer.Typer(
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(skeleton, name="skeleton")
 
 

@@ -38,7 +38,7 @@ _REDIRECT = '<!doctype html><meta charset="utf-8"><title>Marey</title><meta http
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(view)
 
 

@@ -35,7 +35,7 @@ Description = Annotated[str | None, typer.Option(help="Purpose of the webhook.")
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(webhook, name="webhook")
 
 

@@ -23,7 +23,7 @@ user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage use
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.command()(login)
     app.command()(logout)
     app.add_typer(user, name="user")

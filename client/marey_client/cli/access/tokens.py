@@ -28,7 +28,7 @@ SOON_DAYS = 14
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(token, name="token")
 
 

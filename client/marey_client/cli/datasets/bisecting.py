@@ -33,7 +33,7 @@ Each evaluation is named after its version, and no report is made.
 
 
 def add_to(dataset: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the group `marey dataset`."""
     add_command(dataset, bisect, params=OPTIONS, job=FINDINGS_JOB)
 
 

@@ -22,7 +22,7 @@ MOST_DETAILED = 20
 
 
 def add_to(dataset: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the group `marey dataset`."""
     dataset.command()(diff)
 
 

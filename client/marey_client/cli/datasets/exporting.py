@@ -26,7 +26,7 @@ RENAMED_SHOWN = 5
 
 
 def add_to(dataset: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the group `marey dataset`."""
     dataset.command()(export)
 
 

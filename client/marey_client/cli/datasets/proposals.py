@@ -43,12 +43,12 @@ Number = Annotated[int, typer.Argument(min=1, help="Number of the proposal; `mar
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(proposal, name="proposal")
 
 
 def add_protection_to(dataset: typer.Typer) -> None:
-    """Register the commands that protect branches."""
+    """Add the commands that protect branches to the group `marey dataset`."""
     dataset.command()(protect)
     dataset.command()(unprotect)
 

@@ -26,7 +26,7 @@ dataset = typer.Typer(
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register all commands of datasets."""
+    """Add the commands of datasets to the application `app`."""
     bisecting.add_to(dataset)
     combining.add_to(dataset)
     comparing.add_to(dataset)

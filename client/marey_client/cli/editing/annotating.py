@@ -37,7 +37,7 @@ Label = Annotated[str, typer.Argument(help="Label of the segment or keyframe.")]
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(annotation, name="annotation")
     add_command(annotation, merge, params=MERGE)
     add_command(annotation, propose, params=ANNOTATE, job=JOB)

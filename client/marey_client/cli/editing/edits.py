@@ -41,7 +41,7 @@ With = Annotated[str | None, typer.Option("--with", help="Saved edit whose comma
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(edit, name="edit")
     add_command(edit, apply_edit, "apply", params=EDIT, job=JOB)
 

@@ -30,7 +30,7 @@ DOWNLOADS_AT_ONCE = 4
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(download)
 
 

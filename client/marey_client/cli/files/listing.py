@@ -54,7 +54,7 @@ FIGURES = ("revision", "joints", "frames", "Hz", "seconds")
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     for command in (ls, show):
         app.command()(command)
 

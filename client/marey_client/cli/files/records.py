@@ -35,7 +35,7 @@ class _RecordChange(NamedTuple):
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(record)
 
 

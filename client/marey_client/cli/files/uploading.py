@@ -28,7 +28,7 @@ WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     add_command(app, upload, options=UPLOAD)
 
 

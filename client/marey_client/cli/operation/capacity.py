@@ -15,7 +15,7 @@ MOST = 10**15
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(capacity)
 
 

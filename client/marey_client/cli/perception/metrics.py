@@ -46,7 +46,7 @@ Shown = Annotated[
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(metric, name="metric")
 
 

@@ -26,7 +26,7 @@ CLIPS_SHOWN = 10
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     add_command(app, quality, params=QUALITY, job=JOB)
 
 

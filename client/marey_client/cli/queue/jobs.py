@@ -26,7 +26,7 @@ job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Submit, wat
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(job, name="job")
     add_command(job, submit_job, "submit", job=SEEDED_JOB)
     app.command()(why)

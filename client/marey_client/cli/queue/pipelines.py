@@ -38,7 +38,7 @@ Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until every j
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.command()(pipeline)
     add_command(app, build_model, propose=PROPOSE, job=SEEDED_JOB)
 

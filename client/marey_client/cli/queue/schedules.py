@@ -35,7 +35,7 @@ Description = Annotated[str, typer.Option(help="Purpose of the schedule.")]
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(schedule, name="schedule")
 
 

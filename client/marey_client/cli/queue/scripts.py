@@ -27,7 +27,7 @@ OWN_COLUMNS = ("job", "state", "commit", "seed", "author", "created_at", "finish
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(script, run, job=SCRIPT_RUN)
     app.add_typer(script, name="script")
 

@@ -28,7 +28,7 @@ StudyPlace = Annotated[str, typer.Argument(metavar="STUDY", help="The study: pro
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(study, name="study")
 
 
