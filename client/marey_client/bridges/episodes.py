@@ -86,8 +86,9 @@ class EpisodeTable:
         place: FilePlace,
         statistics: Mapping[str, ColumnStatistics],
     ) -> None:
-        """Add a row for an episode whose frames are in the data file `place` and begin at the index `start` of the
-        dataset.
+        """Add a row for an episode.
+
+        The frames of the episode are in the data file `place` and begin at the index `start` of the dataset.
         """
         row: dict[str, Any] = {
             "episode_index": number, "tasks": [task], "length": length,
@@ -122,7 +123,7 @@ class EpisodeTable:
 
 
 def episode_of(motion: Mapping[str, Any], fps: float, number: int, start: int, task: int) -> Episode:
-    """Return a clip as the episode `number`; `start` is the index of its first frame among all frames of the dataset."""
+    """Return a clip as the episode `number`; its first frame has the index `start` among all frames of the dataset."""
     poses = np.asarray(motion["poses"], dtype=np.float32)
     length = len(poses)
     moved = motion.get("translations")

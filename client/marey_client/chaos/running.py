@@ -106,7 +106,7 @@ def _attempt(scratch: Scratch, job: str, name: str, draw: random.Random) -> Chao
 def _await_results(
     scratch: Scratch, processes: WorkerProcesses, jobs: Sequence[str], on_step: OnStep
 ) -> Iterator[ChaosFinding]:
-    """Let healthy workers run the jobs, and wait for their end; yield a finding for each job that does not end in time."""
+    """Let healthy workers run the jobs, and wait for their end; yield a finding for each job that has not ended."""
     for _ in range(HEALTHY_WORKERS):
         processes.start()
     deadline = time.monotonic() + END_S
