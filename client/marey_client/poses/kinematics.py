@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from marey_client.arguments import several
 from marey_client.errors import NoSuchJoint
-from marey_client.extras import room
+from marey_client.extras import import_optional
 from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.items import ItemHandle
 from marey_client.poses.arrays import Joints, PosedItem, frames_text
@@ -99,14 +99,14 @@ def read_rig(clip: ItemHandle, reference: RevisionRef) -> PosedSkeleton:
 
 def read_positions(clip: PosedItem, joints: Joints, frames: slice | None) -> NDArray[np.float32]:
     """Return the positions of joints in the world, (frames, joints, 3) in metres."""
-    motion = room("marey_motion", MOTION_EXTRA)
+    motion = import_optional("marey_motion", MOTION_EXTRA)
     rig = rig_of(clip)
     names = tuple(joint.name for joint in rig.hierarchy.joints) if joints is None else several(joints)
     places = rig.chains(names)
     chain = [rig.hierarchy.joints[place].name for place in places]
     whole = len(chain) == len(rig.hierarchy.joints)
     poses = clip.motion(frames=frames, joints=None if whole else chain, revision=clip.item.revision)
-    skeleton = room("marey_motion.documents", MOTION_EXTRA).skeleton_from_document(rig.part_with(places))
+    skeleton = import_optional("marey_motion.documents", MOTION_EXTRA).skeleton_from_document(rig.part_with(places))
     ordered = _in_order(poses.poses, poses.joints, chain)
     found: NDArray[np.float32] = motion.forward_kinematics(
         skeleton,
@@ -127,7 +127,7 @@ def _in_order(poses: NDArray[np.float32], given: tuple[str, ...], wanted: list[s
 def read_velocities(clip: PosedItem, joints: Joints, frames: slice | None) -> NDArray[np.float32]:
     """Return the velocities of joints in the world, (frames, joints, 3) in metres per second."""
     wider, kept = _widened(clip, frames, DIFFERENCE_FRAMES)
-    found: NDArray[np.float32] = room("marey_motion", MOTION_EXTRA).velocities(
+    found: NDArray[np.float32] = import_optional("marey_motion", MOTION_EXTRA).velocities(
         read_positions(clip, joints, wider), clip.frame_rate_hz
     )
     return found[kept]
@@ -135,7 +135,7 @@ def read_velocities(clip: PosedItem, joints: Joints, frames: slice | None) -> ND
 
 def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
     """Return whether each foot touches the ground, (frames, 2)."""
-    motion: Any = room("marey_motion.kinematics", MOTION_EXTRA)
+    motion: Any = import_optional("marey_motion.kinematics", MOTION_EXTRA)
     mapped = rig_of(clip).handle.mapping().joints
     feet = [next((mapped[name] for name in names if name in mapped), None) for names in FEET]
     if None in feet:
