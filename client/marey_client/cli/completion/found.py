@@ -8,7 +8,7 @@ from functools import cached_property
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from marey_client.cli.completion.asking import MOST_ENTRIES, Desk, Question
+from marey_client.cli.completion.asking import MOST_ENTRIES, ListClient, ListRequest
 from marey_schemas.kinds import Kind
 
 MOST_LISTED = 1000
@@ -33,9 +33,9 @@ class Typed:
     token_file: str | None = None
 
     @cached_property
-    def desk(self) -> Desk:
+    def lists(self) -> ListClient:
         """The connection to the server."""
-        return Desk.opened(self.server, self.token_file)
+        return ListClient.opened(self.server, self.token_file)
 
     def value(self, *names: str) -> str:
         """Return the value of the first of these parameters that has one, or the empty text."""
@@ -97,7 +97,7 @@ def any_of(*hows: How) -> How:
 
 def projects(typed: Typed) -> Iterator[Suggestion]:
     """Complete the name of a project."""
-    for one in typed.desk.entries("projects", sort="name", limit=MOST_LISTED):
+    for one in typed.lists.entries("projects", sort="name", limit=MOST_LISTED):
         yield Suggestion(one["name"], one.get("title") or "")
 
 
@@ -108,7 +108,7 @@ def places(*kinds: Kind) -> How:
         project, slash, path = typed.start.partition("/")
         if not slash:
             return (Suggestion(f"{one.text}/", one.remark) for one in projects(typed))
-        return (Suggestion(f"{project}/{one.text}", one.remark) for one in _paths(typed.desk, project, path, kinds))
+        return (Suggestion(f"{project}/{one.text}", one.remark) for one in _paths(typed.lists, project, path, kinds))
 
     return how
 
@@ -118,19 +118,19 @@ def paths(*kinds: Kind) -> How:
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         project = _project_of(typed)
-        return _paths(typed.desk, project, typed.start, kinds) if project else iter(())
+        return _paths(typed.lists, project, typed.start, kinds) if project else iter(())
 
     return how
 
 
-def _paths(desk: Desk, project: str, path: str, kinds: Sequence[Kind]) -> Iterator[Suggestion]:
+def _paths(lists: ListClient, project: str, path: str, kinds: Sequence[Kind]) -> Iterator[Suggestion]:
     """Yield folders, then items: those in the parent folder of `path` whose names begin with the path's last name."""
     folder, slash, name = path.rpartition("/")
     among: dict[str, str | None] = {"directly_in": folder, "name": f"{name}*" if name else None}
-    below, *items = desk.ask(
+    below, *items = lists.ask(
         [
-            Question.of("projects", project, "collections", **among),
-            *(Question.of("projects", project, kind.plural, **among, sort="name", fields="name") for kind in kinds),
+            ListRequest.of("projects", project, "collections", **among),
+            *(ListRequest.of("projects", project, kind.plural, **among, sort="name", fields="name") for kind in kinds),
         ]
     )
     yield from (Suggestion(f"{one['path']}/") for one in below)
@@ -155,7 +155,7 @@ def datasets(typed: Typed) -> Iterator[Suggestion]:
     project, slash, _ = typed.start.partition("/")
     if not slash:
         return (Suggestion(f"{one.text}/", one.remark) for one in projects(typed))
-    found = typed.desk.entries("projects", project, "datasets")
+    found = typed.lists.entries("projects", project, "datasets")
     return (Suggestion(f"{project}/{one['name']}", "dataset") for one in found)
 
 
@@ -164,12 +164,12 @@ def versions(typed: Typed) -> Iterator[Suggestion]:
     dataset, at, _ = typed.start.partition("@")
     if not at:
         return datasets(typed)
-    return (Suggestion(f"{dataset}@{one.text}", one.remark) for one in _refs(typed.desk, dataset))
+    return (Suggestion(f"{dataset}@{one.text}", one.remark) for one in _refs(typed.lists, dataset))
 
 
 def refs(typed: Typed) -> Iterator[Suggestion]:
     """Complete a branch or a tag of the dataset of the command."""
-    return _refs(typed.desk, typed.value("place").partition("@")[0])
+    return _refs(typed.lists, typed.value("place").partition("@")[0])
 
 
 def branches(typed: Typed) -> Iterator[Suggestion]:
@@ -186,7 +186,7 @@ def entries(typed: Typed) -> Iterator[Suggestion]:
         return
     asked = {"version": version or None, "path": folder or None, "limit": MOST_LISTED}
     seen: dict[str, Suggestion] = {}
-    for one in typed.desk.entries("projects", project, "datasets", name, "entries", **asked):
+    for one in typed.lists.entries("projects", project, "datasets", name, "entries", **asked):
         step, below, _ = one["path"].removeprefix(f"{folder}{slash}").partition("/")
         text = f"{folder}{slash}{step}{below}"
         seen.setdefault(text, Suggestion(text, "" if below else one["kind"]))
@@ -197,7 +197,7 @@ def proposals(typed: Typed) -> Iterator[Suggestion]:
     """Complete the number of a proposal to the dataset of the command."""
     project, _, name = typed.value("place").strip("/").partition("/")
     if project and name:
-        for one in typed.desk.entries("projects", project, "datasets", name, "proposals"):
+        for one in typed.lists.entries("projects", project, "datasets", name, "proposals"):
             yield Suggestion(str(one["number"]), f"{one['state']}: {one['title']}")
 
 
@@ -206,15 +206,15 @@ def commit_targets(typed: Typed) -> Iterator[Suggestion]:
     project = _project_of(typed)
     dataset, at, _ = typed.start.partition("@")
     if at:
-        found = _refs(typed.desk, f"{project}/{dataset}")
+        found = _refs(typed.lists, f"{project}/{dataset}")
         return (Suggestion(f"{dataset}@{one.text}", one.remark) for one in found if one.remark == "branch")
     return iter(in_project("datasets")(typed))
 
 
-def _refs(desk: Desk, dataset: str) -> Iterator[Suggestion]:
+def _refs(lists: ListClient, dataset: str) -> Iterator[Suggestion]:
     project, _, name = dataset.strip("/").partition("/")
     if project and name and "/" not in name:
-        for one in desk.entries("projects", project, "datasets", name, "refs"):
+        for one in lists.entries("projects", project, "datasets", name, "refs"):
             yield Suggestion(one["name"], one["kind"])
 
 
@@ -240,13 +240,13 @@ def jobs(*states: str) -> How:
     """Complete the id of a recent job of the project, or of all projects; with `states`, only jobs in these states."""
 
     def how(typed: Typed) -> Iterator[Suggestion]:
-        desk = typed.desk
+        lists = typed.lists
         project = typed.value("project")
-        of_projects = Question.of("projects", sort="-updated_at")
-        names = [project] if project else [one["name"] for one in desk.ask([of_projects])[0]]
+        of_projects = ListRequest.of("projects", sort="-updated_at")
+        names = [project] if project else [one["name"] for one in lists.ask([of_projects])[0]]
         most = MOST_ENTRIES if typed.start else JOBS_OF_PROJECT
         wanted = {"state": ",".join(states) or None, "limit": most}
-        found = desk.ask([Question.of("projects", one, "jobs", **wanted) for one in names[:MOST_PROJECTS_OF_JOBS]])
+        found = lists.ask([ListRequest.of("projects", one, "jobs", **wanted) for one in names[:MOST_PROJECTS_OF_JOBS]])
         newest = sorted((job for some in found for job in some), key=lambda job: job["created_at"], reverse=True)
         yield from (Suggestion(job["id"], f"{job['kind']}, {job['state']}") for job in newest)
 
@@ -257,19 +257,19 @@ def job_kinds(typed: Typed) -> Iterator[Suggestion]:
     """Complete the kind of a job."""
     return (
         Suggestion(one["name"], one["description"].partition(".")[0])
-        for one in typed.desk.entries("job-kinds", limit=None)
+        for one in typed.lists.entries("job-kinds", limit=None)
     )
 
 
 def users(typed: Typed) -> Iterator[Suggestion]:
     """Complete the name of a user; the server lists users for administrators only."""
-    return (Suggestion(one["name"], one.get("display_name") or "") for one in typed.desk.entries("users"))
+    return (Suggestion(one["name"], one.get("display_name") or "") for one in typed.lists.entries("users"))
 
 
 def members(typed: Typed) -> Iterator[Suggestion]:
     """Complete the name of a member of the project of the command."""
     if project := _project_of(typed):
-        yield from (Suggestion(one["user"]) for one in typed.desk.entries("projects", project, "members", limit=None))
+        yield from (Suggestion(one["user"]) for one in typed.lists.entries("projects", project, "members", limit=None))
 
 
 def in_project(plural: str, field: str = "name", remark: str = "") -> How:
@@ -277,7 +277,7 @@ def in_project(plural: str, field: str = "name", remark: str = "") -> How:
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         if project := _project_of(typed):
-            for one in typed.desk.entries("projects", project, plural):
+            for one in typed.lists.entries("projects", project, plural):
                 yield Suggestion(str(one[field]), str(one.get(remark) or ""))
 
     return how
