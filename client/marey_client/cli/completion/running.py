@@ -37,7 +37,7 @@ def complete(app: typer.Typer, line: Line) -> list[Suggestion] | None:
     from typer.completion import completion_init  # pyrefly: ignore[implicit-reexport]  # of a private module
 
     completion_init()
-    asked = _Asked(line)
+    asked = _ShellRequest(line)
     output = contextlib.redirect_stdout(io.StringIO())
     with _environment(typed_by_typer(line)), output as written, contextlib.suppress(SystemExit):
         asked.prepared(app)(prog_name="marey")
@@ -71,7 +71,7 @@ def answer_shell(
     return 0
 
 
-class _Asked:
+class _ShellRequest:
     """Request of a shell, and the suggestions in `found`; None if `SUBJECTS` has no entry for the parameter."""
 
     def __init__(self, line: Line) -> None:
