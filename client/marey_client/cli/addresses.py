@@ -1,4 +1,4 @@
-"""Addresses of projects, folders and items, such as `lab/raw/walk`, and lookup of their targets."""
+"""Addresses such as `lab/raw/walk`, and lookup of the folders and items at these addresses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ID = re.compile(r"([a-z]+)_[0-9a-hjkmnp-tv-z]{26}")
 
 @dataclass(frozen=True)
 class Address:
-    """Project and a path in it; the path may name a folder or an item, and names a folder if a `/` follows it."""
+    """Address of a folder or an item: a project, and a path in it. With a `/` at the end, it means a folder."""
 
     project: str
     path: str
@@ -104,7 +104,7 @@ def _missing(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -
 
 
 def advice(project: ProjectHandle, path: str, kinds: Iterable[Kind]) -> str:
-    """Return advice about a path at which there is neither a folder nor an item of these kinds."""
+    """Return advice for an error about a path without a folder or an item of these kinds, such as the nearest path."""
     from marey_client.listing.paths import nearest_path
 
     near = nearest_path(project.transport, project.name, path, kinds) if path and not Address("", path).has_id else None
@@ -172,7 +172,7 @@ class Thing(Protocol):
 
 @dataclass(frozen=True)
 class Folder:
-    """Folder with its contents."""
+    """A folder with its contents, as the target of a command that moves, deletes or restores items or folders."""
 
     project: ProjectHandle
     collection: Collection
@@ -230,7 +230,7 @@ class SingleItem:
         return f"{self.handle.project}/{self.handle.path}"
 
     def count(self) -> int:
-        """Return 1, the number of items that `delete` removes."""
+        """Return 1: `delete` removes one item."""
         return 1
 
     def move(self, folder: str, name: str) -> Item:

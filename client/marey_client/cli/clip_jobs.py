@@ -90,7 +90,7 @@ def align(
 ) -> None:
     """Align clips of one action with each other, as a job.
 
-    `--reference` also accepts the address or the path of the clip with which all other clips are aligned.
+    `--reference` also accepts the address (project/folder/name) or the path (folder/name) of a clip.
     """
     from marey_schemas.kinds import Kind
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from marey_schemas.items import Staleness
 
 FEW = 50
-"""Greatest number of items that are examined by one request each; for more, whole folders are examined."""
+"""Greatest number of items that are examined one by one; for more items, one request examines a whole folder."""
 
 
 def add_to(app: typer.Typer) -> None:

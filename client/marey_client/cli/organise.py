@@ -171,9 +171,9 @@ def restore(
 
 
 def _last_at_each_path(things: Sequence[Thing]) -> list[Thing]:
-    """Return, for each path, the item or folder that was removed last; print how many others are left out.
+    """Return the item or folder that was removed last at each path; print how many earlier ones are left out.
 
-    In `things`, the one that was removed last must come before all others with the same path.
+    Among the `things` with the same path, the one that was removed last must be the first.
     """
     chosen: dict[str, Thing] = {}
     for one in things:
@@ -330,9 +330,9 @@ def _do_each(
 ) -> None:
     """Apply `do` to each folder or item, and print refusals. Raises `Refused` at the end if there was a refusal.
 
-    `done` is the past participle for messages, such as "moved". `selected` says that a query selected the items. There
-    may be many, and they do not depend on each other, so several requests are sent at a time, and the number of items
-    is printed.
+    `done` is the past participle for messages, such as "moved". With `selected`, a query selected the items: several
+    requests are then sent at a time, because the items do not depend on each other, and the number of changed items is
+    printed.
     """
     from marey_client.errors import RequestFailed
 

@@ -1,4 +1,4 @@
-"""Commands `project` and `member`."""
+"""Commands of the groups `project` and `member`: projects, quotas, members and roles."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ DefaultLimits = Annotated[
     bool,
     typer.Option(
         "--defaults",
-        help="Use the limits in the server's settings, and no limit of running jobs, except for limits that other "
-        "options give.",
+        help="Remove the limits set for this project or user: the limits in the server's settings apply, and "
+        "jobs have no limit. Other options of the same command still set their limits.",
     ),
 ]
 
@@ -94,7 +94,13 @@ def change_project(
     name: ProjectName,
     title: Annotated[str | None, typer.Option(help="Title of the project.")] = None,
     description: Annotated[str | None, typer.Option(help="Purpose of the project.")] = None,
-    visibility: Annotated[str | None, typer.Option(help="Visibility: private or public.")] = None,
+    visibility: Annotated[
+        str | None,
+        typer.Option(
+            help="New visibility. private: only members may read the "
+            "project; public: everybody who can reach the server may."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Change the title, the description and the visibility of a project."""
@@ -134,7 +140,7 @@ def project_quota(
 
 
 def changed_limits(defaults: bool, **given: int | None) -> dict[str, int | None]:
-    """Return the limits that the options change; None stands for the limit of the settings, or for no limit."""
+    """Return the limits that options change, by name; None means the limit in the server's settings, or no limit."""
     return {name: limit for name, limit in given.items() if defaults or limit is not None}
 
 

@@ -136,7 +136,7 @@ def _named(project: str, items: Sequence[PurgedItem]) -> str:
 def _request(
     project: ProjectHandle, place: str, kind: str | None, query: str | None, older_than: int | None
 ) -> PurgeRequest:
-    """Return the request for the items at an address: an id, a folder, or a path that removed items had."""
+    """Return the request to purge the removed items at an address: an item's id, a folder, or their former path."""
     from marey_schemas.purges import PurgeRequest
 
     address = Address.parse(place)

@@ -113,9 +113,9 @@ def merge(
 ) -> None:
     """Merge skeletons of one rig, for example if an earlier version created a skeleton for each take.
 
-    Skeletons are of one rig if they differ only in the offset of the root, in offsets that the motions replace, or by
-    rounding. Clips and models get a new revision with the remaining skeleton and the same motion; the other skeletons
-    are deleted.
+    Skeletons are of one rig if they differ only in the offset of the root, in offsets that motions replace by
+    translations, or by rounding. Clips and models get a new revision with the remaining skeleton and the same motion;
+    the other skeletons are deleted.
     """
     from marey_schemas.kinds import Kind
 
@@ -145,7 +145,7 @@ def merge(
 
 
 def _assigned(assignments: list[str], known: set[str], mapped: Mapping[str, str]) -> dict[str, str]:
-    """Parse texts such as `hips=Pelvis`; return the joint by standard joint, empty to clear the mapping.
+    """Parse texts such as `hips=Pelvis`; return the joint by standard joint, an empty text to clear the mapping.
 
     A name in `mapped` can be cleared even if it is not a standard joint.
     """

@@ -1,4 +1,4 @@
-"""Commands `webhook`, which notify other programs of events in a project."""
+"""Commands of the group `webhook`: addresses to which a server sends the events of a project."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from marey_schemas.event_kinds import ProjectEventKind
     from marey_schemas.webhooks import DeliveryState, Webhook, WebhookDelivery
 
-webhook = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Notify other programs of events in a project.")
+webhook = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Send the events of a project to the addresses of other programs."
+)
 
 WebhookId = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook; `marey webhook ls` lists the ids.")]
 Url = Annotated[str, typer.Argument(help="Address to which requests are sent, such as https://ci.example.org/marey.")]

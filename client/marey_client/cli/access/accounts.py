@@ -1,4 +1,4 @@
-"""Commands `login`, `logout` and `user`."""
+"""Commands `login` and `logout`, and the group `user` for accounts."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _sign_up(marey: Marey, name: str | None, days: int) -> str:
 
 
 def logout(context: typer.Context) -> None:
-    """Delete the stored token for a server."""
+    """Delete the stored token for a server from this machine. The token stays valid until it ends or is revoked."""
     from marey_client.credentials import forget_login, logins_path
 
     with connect(context, anonymous=True) as marey:
@@ -162,7 +162,7 @@ def create_user(
 
 @user.command("ls")
 def list_users(context: typer.Context, as_json: AsJson = False) -> None:
-    """Show every user."""
+    """List the users of the server (for administrators)."""
     with connect(context) as marey:
         users = list(marey.users.list())
     if as_json:

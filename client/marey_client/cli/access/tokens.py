@@ -1,4 +1,4 @@
-"""Commands of the group `token`."""
+"""Commands of the group `token`: creating, listing, rotating and revoking tokens."""
 
 from __future__ import annotations
 
@@ -181,11 +181,11 @@ def rotate_token(
 
 
 def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedelta) -> NewToken:
-    """Replace the token of the client `marey` by a successor, on the server and in the file that contains the token.
+    """Replace the token that `marey` uses by a new token, on the server and in the file that contains the token.
 
-    The id of the rotation is stored next to the token's file before the request is sent. So if the program ends before
-    the successor is stored, the next call gets the same successor. Raises `BadCredentialFile` if no file contains the
-    token.
+    A random id of this replacement is stored next to the token's file before the request is sent. If the program ends
+    before the new token is stored, the next call sends the same id and gets the same new token. Raises
+    `BadCredentialFile` if no file contains the token.
     """
     from marey_client.access import Tokens
     from marey_client.credentials import replace_token
@@ -206,7 +206,7 @@ def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedel
 
 
 def _rotation_id(begun: Path, token: str) -> str:
-    """Return the id of this token's rotation from the file `begun`; if the file has no id, store a new one there."""
+    """Return the id for the replacement of this token from the file `begun`; store a new id there if it has none."""
     from marey_client.credentials import write_private
 
     prefix = token.split("_")[1] if token.count("_") > 1 else ""

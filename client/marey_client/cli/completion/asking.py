@@ -33,16 +33,16 @@ MOST_ANSWER_BYTES = 1 << 22
 
 @dataclass(frozen=True)
 class ListRequest:
-    """Request for a list: the list's path below the API's root, and query parameters."""
+    """Request for a list of the server: its path below the root of the REST API, and its query parameters."""
 
     path: str
     query: Mapping[str, str | int] = field(default_factory=dict)
     whole: bool = False
-    """Whether all pages of the list are requested, as long as time is left."""
+    """Whether all pages of the list are read until the deadline; otherwise, only the first page is read."""
 
     @classmethod
     def of(cls, *names: str, **query: str | int | None) -> ListRequest:
-        """Return the request for the path made of `names`, percent-encoded; parameters of None are left out."""
+        """Return the request for a path, given by its names; query parameters that are None are left out."""
         path = "/".join(quote(name, safe="") for name in names)
         asked = {"limit": MOST_ENTRIES, **query}
         return cls(f"/{path}", {key: value for key, value in asked.items() if value is not None})
@@ -50,7 +50,7 @@ class ListRequest:
 
 @dataclass(frozen=True)
 class ListClient:
-    """Connection to the server for the requests of one completion."""
+    """Reader of lists of the server during one completion, until a deadline."""
 
     credential: Credential
     until: float
@@ -58,7 +58,7 @@ class ListClient:
 
     @classmethod
     def opened(cls, server: str | None, token_file: str | None) -> ListClient:
-        """Return a connection with the server and the token that commands would use. Raises errors of credentials.
+        """Return a reader with the server and the token that commands would use. Raises the errors of `resolve`.
 
         The user has not confirmed the command line yet. So a token is sent to the address `server` only if the token
         was saved for this address, or if commands without the option `--server` would use this address, too.
@@ -74,7 +74,7 @@ class ListClient:
         return cls(found, time.monotonic() + PATIENCE_S)
 
     def ask(self, requests: Sequence[ListRequest]) -> list[list[dict[str, Any]]]:
-        """Return the entries of each requested list, in the order of `requests`; no entries without an answer."""
+        """Return the entries of each requested list, in the order of `requests`; a list without an answer is empty."""
         answers: list[list[dict[str, Any]]] = [[] for _ in requests]
         left = iter(list(enumerate(requests)))
         lock = threading.Lock()
@@ -96,7 +96,7 @@ class ListClient:
         return [list(one) for one in answers]
 
     def entries(self, *names: str, **query: str | int | None) -> list[dict[str, Any]]:
-        """Return the entries of a list: at most `MOST_PAGES` pages, until the deadline; arguments as `ListRequest.of`."""
+        """Return the entries of a list, at most `MOST_PAGES` pages; the arguments are those of `ListRequest.of`."""
         return self.ask([replace(ListRequest.of(*names, **query), whole=True)])[0]
 
     @property
@@ -104,7 +104,7 @@ class ListClient:
         return self.until - time.monotonic()
 
     def _pages(self, request: ListRequest) -> Iterator[list[dict[str, Any]]]:
-        """Yield the entries of each page of a list."""
+        """Yield the entries of each page of a list, page by page; only the first page unless `request.whole`."""
         query = dict(request.query)
         for _ in range(MOST_PAGES if request.whole else 1):
             answer = self._answer(request.path, query)
@@ -150,7 +150,7 @@ class ListClient:
 
 
 def _entries(answer: object) -> Iterable[dict[str, Any]]:
-    """Yield the objects of a list, whether it has pages or not."""
+    """Yield the objects in an answer: a JSON list, or a page with the member `items`; nothing for any other answer."""
     items = answer.get("items") if isinstance(answer, dict) else answer
     for one in items if isinstance(items, list) else ():
         if isinstance(one, dict):

@@ -17,7 +17,7 @@ MOST_PROJECTS_OF_JOBS = 20
 
 
 class Suggestion(NamedTuple):
-    """Text that replaces the typed word, and a remark that some shells show beside the text."""
+    """Suggestion to the user: the text that replaces the typed word, and a remark that some shells show beside it."""
 
     text: str
     remark: str = ""
@@ -25,7 +25,7 @@ class Suggestion(NamedTuple):
 
 @dataclass(frozen=True)
 class Typed:
-    """Typed beginning of a word, the values of the parameters before this word, and the global options."""
+    """Part of the command line to complete: the beginning of a word, the parameters before it, and global options."""
 
     start: str
     values: Mapping[str, Any]
@@ -34,11 +34,11 @@ class Typed:
 
     @cached_property
     def lists(self) -> ListClient:
-        """The connection to the server."""
+        """The reader of lists of the server, opened when it is first needed."""
         return ListClient.opened(self.server, self.token_file)
 
     def value(self, *names: str) -> str:
-        """Return the value of the first of these parameters that has one, or the empty text."""
+        """Return the value of the first of the named parameters that has a value; the empty text if none has."""
         for name in names:
             value = self.values.get(name)
             if isinstance(value, (list, tuple)):
@@ -53,20 +53,21 @@ How = Callable[[Typed], Iterable[Suggestion]]
 
 
 def one_of(*words: str) -> How:
-    """Complete with fixed words."""
+    """Return a function that suggests the given words."""
     return lambda _: map(Suggestion, words)
 
 
 def listed_in(declared: str, *more: str) -> How:
-    """Complete with the words of a list, an enumeration or a function without parameters, declared as `module:name`.
+    """Return a function that suggests words: those of a list, an enumeration or a function, declared as `module:name`.
 
-    The module is imported only if the words are needed. `more` are further words.
+    A function is called without arguments. The module is imported only if the words are needed. `more` are further
+    words.
     """
     return lambda _: map(Suggestion, (*_words(declared), *more))
 
 
 def several_listed_in(declared: str) -> How:
-    """Complete the last of several words that commas separate; the words are declared as for `listed_in`."""
+    """Return a function that completes the last word of a comma-separated list; `declared` is that of `listed_in`."""
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         before, comma, _ = typed.start.rpartition(",")
@@ -83,12 +84,12 @@ def _words(declared: str) -> tuple[str, ...]:
 
 
 def nothing(_: Typed) -> tuple[Suggestion, ...]:
-    """Complete nothing, because the parameter is a new name."""
+    """Suggest nothing, because the parameter is a name that the user makes up."""
     return ()
 
 
 def any_of(*hows: How) -> How:
-    """Complete with the suggestions of several functions."""
+    """Return a function that returns the suggestions of several functions."""
     return lambda typed: (one for how in hows for one in how(typed))
 
 
@@ -102,7 +103,10 @@ def projects(typed: Typed) -> Iterator[Suggestion]:
 
 
 def places(*kinds: Kind) -> How:
-    """Complete an address, one name at a time: project, folders, item of one of the kinds. Folders end with `/`."""
+    """Return a function that completes an address such as `lab/raw/walk`, one name at a time; folders end with `/`.
+
+    Only items of the given kinds are suggested.
+    """
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         project, slash, path = typed.start.partition("/")
@@ -114,7 +118,10 @@ def places(*kinds: Kind) -> How:
 
 
 def paths(*kinds: Kind) -> How:
-    """Complete a path in the project of the command, one name at a time; without kinds, the path of a folder."""
+    """Return a function that completes a path in the project of the command, one name at a time.
+
+    Only items of the given kinds are suggested; without kinds, only folders.
+    """
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         project = _project_of(typed)
@@ -124,7 +131,7 @@ def paths(*kinds: Kind) -> How:
 
 
 def _paths(lists: ListClient, project: str, path: str, kinds: Sequence[Kind]) -> Iterator[Suggestion]:
-    """Yield folders, then items: those in the parent folder of `path` whose names begin with the path's last name."""
+    """Yield folders, then items, in the parent folder of `path` whose names begin with the last name of `path`."""
     folder, slash, name = path.rpartition("/")
     among: dict[str, str | None] = {"directly_in": folder, "name": f"{name}*" if name else None}
     below, *items = lists.ask(
@@ -143,7 +150,7 @@ _PLACES = ("place", "places", "sources", "takes", "evaluation", "address", "clip
 
 
 def _project_of(typed: Typed) -> str:
-    """Return the project of the earlier parameters: a project's name, or the beginning of an address; or empty text."""
+    """Return the project that an earlier parameter names, alone or as the start of an address; empty if none does."""
     return typed.value(*_PROJECTS) or typed.value(*_PLACES).strip("/").partition("/")[0]
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from marey_schemas.datasets.differences import ChangeKind, DatasetDifference, EntryDifference
 
 MOST_DETAILED = 20
-"""Greatest number of entries whose content is compared; each comparison needs a request of its own."""
+"""Greatest number of entries that `--details` describes; each needs a request of its own."""
 
 
 def add_to(dataset: typer.Typer) -> None:

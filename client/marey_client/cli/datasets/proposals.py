@@ -192,8 +192,10 @@ def review(
     context: typer.Context,
     place: DatasetPlace,
     number: Number,
-    verdict: Annotated[Verdict, typer.Argument(help="Verdict on the newest commit.")],
-    text: Annotated[str, typer.Option("--message", "-m", help="Reasons.")] = "",
+    verdict: Annotated[Verdict, typer.Argument(help="Verdict of your review of the newest commit.")],
+    text: Annotated[
+        str, typer.Option("--message", "-m", help="Reasons for the verdict, which the proposal shows.")
+    ] = "",
     commit: CommitSeen = None,
     as_json: AsJson = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Command `annotation`: segments and keyframes of clips."""
+"""Commands `annotation`: show, edit, propose, import and export segments and keyframes of clips."""
 
 from __future__ import annotations
 
@@ -222,7 +222,8 @@ def import_annotation(
         typer.Argument(
             exists=True,
             dir_okay=False,
-            help="A file of Marey's predecessor, the older programs that Marey replaces (JSON, BSON or bz2).",
+            help="File in the format of Marey's predecessor, the older programs that Marey replaces: JSON, BSON "
+            "or compressed BSON.",
         ),
     ],
     layer: Annotated[str, typer.Option(help="Name of the annotation layer, such as steps.")] = "imported",
@@ -237,7 +238,9 @@ def import_annotation(
             "predecessor. exclusive: the frame after the last frame."
         ),
     ] = DEFAULT_END_INDEX,
-    label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
+    label: Annotated[
+        list[str] | None, typer.Option(help="Import only this label; may be repeated. Default: all labels.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Import an annotation of a clip from a file of Marey's predecessor.
@@ -261,15 +264,17 @@ def export_annotation(
     form: Annotated[
         AnnotationForm | None,
         typer.Option(
-            help="Layout of the file. labels: the segments of each label. list: one list of all segments, without "
-            f"labels. frames: the frames of each label. Default: {DEFAULT_FORM}."
+            help="Layout of the file. labels: the segments of each label. list: one list of all segments, "
+            "without labels. frames: the frames of each label. Default: the imported file, if the "
+            f"annotation is unchanged, else {DEFAULT_FORM}."
         ),
     ] = None,
     end_index: Annotated[
         EndIndex | None,
         typer.Option(
-            help="Meaning of end_idx in the file. inclusive: the last frame of a segment, as in the editor of Marey's "
-            f"predecessor. exclusive: the frame after the last frame. Default: {DEFAULT_END_INDEX}."
+            help="Meaning of end_idx in the file. inclusive: the last frame of a segment, as in the editor of "
+            "Marey's predecessor. exclusive: the frame after the last frame. Default: the imported file, if "
+            f"the annotation is unchanged, else {DEFAULT_END_INDEX}."
         ),
     ] = None,
 ) -> None:

@@ -210,7 +210,7 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
 
 
 def _with_ids(marey: Marey, project: str, command: Any) -> Any:
-    """Return a command; if it names a source clip by address, the address is replaced by the clip's id."""
+    """Return a command in which the address of a source clip, if there is one, is replaced by the clip's id."""
     from marey_schemas.kinds import Kind
 
     source = command.get("source") if isinstance(command, dict) else None
@@ -264,7 +264,7 @@ def _print_preview(shown: EditPreview, piece: int) -> None:
 
 
 def _finding(finding: dict[str, Any]) -> str:
-    """Return one line of text with what a command reported about a clip; segments appear as ranges of frames."""
+    """Return the measurements that a command reported about a clip, in one line; segments are ranges of frames."""
     figures = []
     for name, value in finding.items():
         if name == "segments":

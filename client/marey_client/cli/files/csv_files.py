@@ -9,7 +9,7 @@ from pathlib import Path
 from marey_client.cli.terminal.failures import WrongUsage
 
 _BEYOND = "\0"
-"""Key under which the CSV reader stores cells that have no column name."""
+"""Key of a row under which the CSV reader stores the cells beyond the last column."""
 
 
 def rows_of(table: Path) -> dict[int, dict[str, str | None]]:

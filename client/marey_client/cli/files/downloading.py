@@ -1,4 +1,4 @@
-"""Command `download`."""
+"""Command `download`, which writes clips and other items to files."""
 
 from __future__ import annotations
 
@@ -48,19 +48,20 @@ def download(
     ] = "original",
     revision: RevisionNumber = None,
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
-    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m. Default: cm.")] = None,
     part: Annotated[
         str | None,
         typer.Option(
-            help="Part to write in the predecessor's format: tree (of a model), alignment (of an aligned clip), or "
-            "skeleton_model (of a skeleton)."
+            help="With --format predecessor: part of the item to write instead of the item, which is tree (of a "
+            "model), alignment (of an aligned clip), or skeleton_model (of a skeleton)."
         ),
     ] = None,
     layout: Annotated[
         str | None,
         typer.Option(
-            help="Layout in the predecessor's format: 2 or 3 for models, database or file for skeletons. Default: the "
-            "imported file, if the item is unchanged."
+            help="With --format predecessor: layout of the file, which is 2 or 3 for models, database or file "
+            "for skeletons. Default: the imported file, if the item is unchanged; otherwise, the server "
+            "chooses."
         ),
     ] = None,
     fold_positions: Annotated[
@@ -81,7 +82,7 @@ def download(
 
     Aligned clips in a folder are written only if there are no other clips in it. After `@`, name a revision of the
     clip, or a version of the dataset. Other items, such as edits and evaluations, are written with `--format json`. For
-    models, graphs, skeletons and annotations, there is also `--format predecessor`.
+    models, graphs, skeletons and annotations, there is also `--format predecessor`, the format of Marey's predecessor.
 
     An existing file is replaced; if several clips would have the same file name, later clips get a number.
     """

@@ -1,4 +1,4 @@
-"""Command `upload`."""
+"""Command `upload`, which imports motion files."""
 
 from __future__ import annotations
 

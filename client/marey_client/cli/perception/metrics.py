@@ -1,4 +1,4 @@
-"""Commands `metric ls`, `metric show`, `metric store` and `metric compare`."""
+"""Commands of the group `metric`: perceptual metrics, and comparisons of clips by them."""
 
 from __future__ import annotations
 
@@ -51,7 +51,10 @@ def add_to(app: typer.Typer) -> None:
 
 
 def metric_at(marey: Marey, name: str | None) -> str | None:
-    """Return the name of a built-in metric or the id of a stored one. Raises `WrongUsage` if there is none."""
+    """Return the name of a built-in metric, or the id of the metric at an address.
+
+    Raises `WrongUsage` if there is none.
+    """
     from marey_schemas.documents.metrics import is_built_in
     from marey_schemas.kinds import Kind
 
@@ -138,9 +141,13 @@ def compare(
     params: Chosen,
     job: Chosen,
     metric: MetricName = None,
-    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "--output", "-o", help="Write the report of the comparison, an HTML page, to this file."),
+    ] = None,
     figures: Annotated[
-        Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
+        Path | None,
+        typer.Option(help="Write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
     ] = None,
     maps: Annotated[
         Path | None,
@@ -189,7 +196,10 @@ add_command(metric, compare, params=DISTANCES, job=FINDINGS_JOB)
 
 
 def _document(context: typer.Context, name: str) -> MetricDocument:
-    """Return the document of a metric, given by name, by file or by address; only an address needs the server."""
+    """Return the document of a metric that is given as the name of a built-in one, as a JSON file, or as an address.
+
+    Only an address needs the server.
+    """
     from marey_schemas.documents.metrics import MetricDocument, built_in_metric, is_built_in
 
     if name.endswith(".json"):

@@ -1,4 +1,4 @@
-"""Commands `job` and `why`."""
+"""Commands of the group `job`, and `why`, which explains the state of a job."""
 
 from __future__ import annotations
 
@@ -83,7 +83,11 @@ def submit_job(
     ] = None,
     params: Annotated[
         list[str] | None,
-        typer.Option("--param", help="Parameter as name=value; the value is JSON or plain text; may be repeated."),
+        typer.Option(
+            "--param",
+            help="Parameter as name=value, where the value is JSON or plain text; may be "
+            "repeated. Default: the defaults of the kind.",
+        ),
     ] = None,
     into: Into = "",
     wait: Wait = True,
@@ -211,7 +215,7 @@ def show_log(
 
 @job.command("cancel")
 def cancel_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
-    """Ask a job to stop; a queued job is cancelled at once."""
+    """Ask a job to stop; a job that does not run yet is cancelled at once."""
     with connect(context) as marey:
         found = marey.jobs.cancel(job_id)
     if as_json:
@@ -303,7 +307,7 @@ def why(
     job_id: Annotated[str, typer.Argument(help="Id of a job that is waiting, slow or failed.")],
     as_json: AsJson = False,
 ) -> None:
-    """Explain the state of a job."""
+    """Explain what a job waits for, which worker runs it, or why it has failed."""
     from marey_client.explanations import explain_job
 
     with connect(context) as marey:

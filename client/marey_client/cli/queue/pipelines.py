@@ -69,7 +69,12 @@ def build_model(
     propose: Chosen,
     job: Chosen,
     project: Annotated[str | None, typer.Option(help="Project to which local files are uploaded.")] = None,
-    to: Annotated[str | None, typer.Option(help="Skeleton to retarget the takes to: project/folder/name.")] = None,
+    to: Annotated[
+        str | None,
+        typer.Option(
+            help="Skeleton to retarget the takes to: project/folder/name. Default: the takes are not retargeted."
+        ),
+    ] = None,
     into: Annotated[str | None, typer.Option(help="Folder of the results; default: the name of the model.")] = None,
     layer: Annotated[
         str | None,
@@ -77,12 +82,19 @@ def build_model(
             help="Layer of the annotations to use. With --propose: name of the layer for the proposed annotations."
         ),
     ] = None,
-    label: Annotated[list[str] | None, typer.Option(help="Use only segments with this label; may be repeated.")] = None,
+    label: Annotated[
+        list[str] | None, typer.Option(help="Use only segments with this label; may be repeated. Default: all labels.")
+    ] = None,
     whole: Annotated[
         bool,
         typer.Option("--whole", help="Do not cut the takes into pieces; use their annotations only to align them."),
     ] = False,
-    rate: Annotated[float | None, typer.Option(help="Frames per second of the aligned clips.")] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Frames per second of the aligned clips. Default: the most common frame rate of the examples."
+        ),
+    ] = None,
     mirror: Annotated[
         bool, typer.Option("--mirror", help="Also train the model on mirrored copies of the examples.")
     ] = False,
@@ -128,7 +140,7 @@ def build_model(
 
 
 def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Return the parameters that `--set step.parameter=value` sets, by step; `step.a.b=value` sets a nested object."""
+    """Return the parameters that `--set step.parameter=value` gives, by step; `step.a.b=value` sets `b` within `a`."""
     chosen: dict[str, dict[str, Any]] = {}
     for text in choices:
         path, equals, value = text.partition("=")
@@ -223,7 +235,7 @@ def _refused(job: Job) -> list[Mapping[str, Any]]:
 
 
 def _print_shortfalls(run: PipelineRun) -> None:
-    """Print, for each step, its refused inputs, the inputs in which it found nothing, its notes, and its commit."""
+    """Print the refused inputs of each step, the inputs in which it found nothing, its notes, and its commit."""
     for step, job in run.steps.items():
         if refused := _refused(job):
             print_message(f"{step} refused {counted(len(refused), 'input')}:")

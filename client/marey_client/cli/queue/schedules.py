@@ -105,10 +105,16 @@ def change(
     name: Name,
     cron: Annotated[str | None, typer.Option(metavar="TIMES", help="New times, as for `create`.")] = None,
     timezone: Annotated[str | None, typer.Option(metavar="ZONE", help="New time zone.")] = None,
-    job: Annotated[Path | None, typer.Option("--job", help="JSON file of the new job.")] = None,
+    job: Annotated[
+        Path | None, typer.Option("--job", help="JSON file of the new job to submit; - reads standard input.")
+    ] = None,
     overlap: Annotated[
         bool | None,
-        typer.Option("--overlap/--no-overlap", help="Whether to submit a job even if the previous job has not ended."),
+        typer.Option(
+            "--overlap/--no-overlap",
+            help="Submit a job even if the previous job has not ended, or "
+            "skip the time in this case. Default: unchanged.",
+        ),
     ] = None,
     pause: Annotated[bool | None, typer.Option("--pause/--resume", help="Pause the schedule, or resume it.")] = None,
     description: Annotated[str | None, typer.Option(help="New purpose of the schedule.")] = None,

@@ -41,7 +41,7 @@ def add_to(_app: typer.Typer) -> None:
 def export(
     context: typer.Context,
     place: StudyPlace,
-    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="File to write.")],
+    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="File that receives the judgements.")],
     form: Annotated[
         ExportForm,
         typer.Option(
@@ -72,12 +72,15 @@ def analyse(
     place: StudyPlace,
     params: Chosen,
     job: Chosen,
-    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "--output", "-o", help="Write the report of the analysis, an HTML page, to this file."),
+    ] = None,
     metric: Annotated[Path | None, typer.Option(help="Write the best fitted metric to this file, as JSON.")] = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Compute differences, order and groups of the motions, and fit metrics. For maintainers and owners."""
+    """Compute perceived differences, order and groups of the motions, and fit metrics. For maintainers and owners."""
     from marey_client.handles.findings import Findings
 
     if (out is not None or metric is not None) and not wait:
