@@ -66,7 +66,7 @@ class ItemHandle:
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the item, relative to the API's root."""
         return f"/projects/{self.project}/{self.item.kind.plural}/{self.item.id}"
 
     @sends_nothing
@@ -264,7 +264,7 @@ class Items(Generic[Handle]):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the items, relative to the API's root."""
         return f"/projects/{self.project}/{self.kind.plural}"
 
     def list(

@@ -91,7 +91,7 @@ class Jobs:
                 pause_s = min(2 * pause_s, 1.0)
 
     def cancel(self, job_id: str) -> Job:
-        """Ask a job to stop; a queued job is cancelled at once."""
+        """Ask a job to stop; a job that does not run yet is cancelled at once."""
         return self.transport.post(Job, f"{_address(job_id)}/cancel")
 
     def retry(self, job_id: str) -> Job:

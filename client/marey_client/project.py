@@ -44,7 +44,7 @@ class ProjectHandle(JobSubmission):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the project, relative to the API's root."""
         return f"/projects/{self.name}"
 
     def read(self) -> Project:

@@ -196,7 +196,7 @@ class Collections:
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the folders, relative to the API's root."""
         return f"/projects/{self.project}/collections"
 
     def list(

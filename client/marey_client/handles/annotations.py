@@ -1,4 +1,4 @@
-"""Annotations of clips: read them, and change them by commands."""
+"""Handles of annotations, which read the segments and keyframes of clips and change them by commands."""
 
 from __future__ import annotations
 
@@ -34,5 +34,8 @@ class AnnotationHandle(ItemHandle):
         return self._renewed(read_model(Item, response))
 
     def put(self, annotation: Annotation, *, message: str | None = None) -> Item:
-        """Replace the segments and keyframes; the item gets a new revision."""
+        """Replace the segments and keyframes; the item gets a new revision.
+
+        Raises `PreconditionFailed` if the annotation was changed since it was read.
+        """
         return self.put_part("annotation", annotation.model_dump(mode="json", by_alias=True), message=message)

@@ -1,4 +1,4 @@
-"""Findings: results of jobs, with numbers and a document; some kinds of jobs also make a report."""
+"""Findings: results of jobs that measure, with numbers and a document; some kinds of jobs also make a report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_schemas.encoding.codecs import JSON, decode_tree
 from marey_schemas.queue.jobs import Job
 
 FILES = ("document", "report", "maps", "figures", "fitted", "table")
-"""Members of a result that refer to files."""
+"""Names of members of a job's result that refer to files, such as a report, instead of numbers."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Findings:
 
     @sends_nothing
     def figures(self) -> tuple[StoredFigure, ...]:
-        """Return the figures of the report; without a report, there are none."""
+        """Return the figures of the report; an empty result without a report."""
         return tuple(StoredFigure.model_validate(figure) for figure in (self.job.result or {}).get("figures", ()))
 
     def save_figures(self, folder: str | Path) -> list[Path]:
@@ -77,11 +77,11 @@ class Quality(Findings):
 
     @property
     def conditions(self) -> QualityConditions:
-        """Conditions that must be equal in two results whose numbers are compared."""
+        """The conditions of the measurement; the numbers of two results can be compared only if these are equal."""
         return QualityConditions.model_validate((self.job.result or {})["conditions"])
 
     def measured(self) -> QualityDocument:
-        """Return all numbers, by clip and in total."""
+        """Return all measurements, for each clip and in total."""
         return QualityDocument.model_validate(self.document())
 
     def changes_since(self, earlier: Quality) -> Mapping[str, tuple[float, float]]:

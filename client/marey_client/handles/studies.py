@@ -1,4 +1,4 @@
-"""Studies: links for participants, progress, judgements, and the analysis."""
+"""Handles of perceptual studies: links for participants, progress, judgements and analysis."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PAIR_COLUMNS = ("participant", "index", "nearer_1", "nearer_2", "farther_1", "fa
 
 
 class StudyHandle(ItemHandle):
-    """Handle of a study."""
+    """Handle of a perceptual study: its design, participants, judgements and analysis."""
 
     def design(self, *, revision: int | None = None) -> StudyDocument:
         """Return the design: motions, trials, seed and consent."""
@@ -61,7 +61,7 @@ class StudyHandle(ItemHandle):
         self.transport.send("DELETE", f"{self.url}/participants/{participant}", repeatable=True)
 
     def progress(self) -> StudyProgress:
-        """Return numbers of participants and trials."""
+        """Return the numbers of participants and answered trials, over all revisions of the study."""
         return self.transport.get(StudyProgress, f"{self.url}/progress")
 
     def judgements(self, *, revision: int | None = None) -> Iterator[JudgingParticipant]:
@@ -87,7 +87,7 @@ class StudyHandle(ItemHandle):
 
 
 class Studies(Items[StudyHandle]):
-    """Studies of a project."""
+    """Perceptual studies of a project."""
 
     def design(
         self,
