@@ -206,8 +206,8 @@ class Imports:
     ) -> list[ImportEntry]:
         """Import files; return one entry for each file, in order. A refused file does not affect the other files."""
         notify = notice or _ignore_notice
-        named = [file for file in files if _may_travel(file.name)]
-        entries = {file.name: _refused_name(file.name) for file in files if not _may_travel(file.name)}
+        named = [file for file in files if _can_be_sent(file.name)]
+        entries = {file.name: _refused_name(file.name) for file in files if not _can_be_sent(file.name)}
         sent = {file.name: file for file in self.send(named, notice=notify)}
         for portion in batches(named):
             for entry in self.run(tuple(sent[file.name] for file in portion), options):
@@ -251,7 +251,7 @@ class Imports:
         Raises `BadFileName` if a name cannot be sent.
         """
         for file in files:
-            if not _may_travel(file.name):
+            if not _can_be_sent(file.name):
                 raise BadFileName(refusal_text(_refused_name(file.name)))
         notify = notice or _ignore_notice
         digests: dict[str, str] = {}
@@ -268,7 +268,7 @@ class Imports:
         return tuple(ImportFile(name=file.name, blob=digests[file.name]) for file in files)
 
 
-def _may_travel(name: str) -> bool:
+def _can_be_sent(name: str) -> bool:
     """Return whether a file name can be sent in a request; some names that file systems allow cannot be sent."""
     try:
         _FILE_NAME.validate_python(name)
