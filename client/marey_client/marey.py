@@ -102,7 +102,7 @@ class Marey:
         return self.transport.post(AcceptedInvitation, "/invitations/accept", request, repeatable=True)
 
     def me(self) -> Me:
-        """Return the user and the scopes of the token."""
+        """Return the user and the scopes of the client's token."""
         return self.transport.get(Me, "/me")
 
     @sends_nothing

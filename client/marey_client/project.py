@@ -1,4 +1,4 @@
-"""Handle of a project: its settings, members and datasets, its items, and its jobs."""
+"""Handle of a project, with access to its settings, members, datasets, items and jobs."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ class ProjectHandle(JobSubmission):
         return f"/projects/{self.name}"
 
     def read(self) -> Project:
-        """Return the project's title, visibility and the caller's role."""
+        """Return the project: its title, its visibility, and the caller's role in it."""
         return self.transport.get(Project, self.url)
 
     def change(self, change: ProjectChange) -> Project:
-        """Change title, description or visibility."""
+        """Change title, description or visibility of the project; absent fields stay as they are."""
         return read_model(
             Project, self.transport.send("PATCH", self.url, content=as_json(change), headers={"If-Match": "*"})
         )
 
     def quotas(self) -> ProjectQuotasInUse:
-        """Return the number of items and bytes in the project, and the limits."""
+        """Return the numbers of items, bytes and running jobs in the project, and their limits."""
         return self.transport.get(ProjectQuotasInUse, f"{self.url}/quotas")
 
     def change_quotas(self, change: ProjectQuotaChange) -> ProjectQuotasInUse:

@@ -1,4 +1,4 @@
-"""Items of a project by kind, and its folders."""
+"""Items of a project by kind, the folders of a project, and purges."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ class Collections:
         return self.transport.post(Collection, self.url, checked(CollectionCreate, path=path))
 
     def move(self, collection: Collection, path: str) -> Collection:
-        """Move or rename a folder with its contents."""
+        """Move or rename a folder with its contents; the items keep their ids and their history."""
         state = {"If-Match": f'"{collection.rev}.json"'}
         body = as_json(checked(CollectionChange, path=path))
         return read_model(

@@ -126,7 +126,7 @@ class Transport:
         return other
 
     def close(self) -> None:
-        """Close every connection."""
+        """Close every connection to the server."""
         self._client.close()
 
     # -- models --------------------------------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ class Transport:
             busy = isinstance(failure, RequestFailed)
             self.retries.report_wait(self.url, tried, time.monotonic() - started, busy=busy)
             self.retries.sleep(delay_s)
-        raise AssertionError("unreachable")
+        raise AssertionError("the loop over the tries ended without a result")
 
     # -- documents with arrays -----------------------------------------------------------------------------------------
 

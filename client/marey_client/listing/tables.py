@@ -9,11 +9,11 @@ from marey_client.extras import import_optional
 from marey_schemas.items import Item
 
 TABLES_EXTRA = "notebook"
-"""Extra of the package that installs pandas, pyarrow and xarray."""
+"""Extra of the package `marey` that installs pandas, pyarrow and xarray."""
 
 
 class HasItem(Protocol):
-    """Handle of an item."""
+    """Object with an item, such as a handle."""
 
     item: Item
 

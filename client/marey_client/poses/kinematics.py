@@ -39,7 +39,7 @@ FEET = tuple((f"{side}_toe", f"{side}_ankle") for side in ("left", "right"))
 
 @dataclass(frozen=True)
 class PosedSkeleton:
-    """Revision of a skeleton: its handle, and the hierarchy that positions are computed from."""
+    """Skeleton at one revision: its handle, and its hierarchy, from which positions are computed."""
 
     handle: SkeletonHandle
     hierarchy: SkeletonHierarchy
@@ -64,7 +64,7 @@ class PosedSkeleton:
         return sorted(needed)
 
     def part_with(self, places: list[int]) -> SkeletonHierarchy:
-        """Return the hierarchy of the joints with the indices `places`, among which are the parents of all of them."""
+        """Return the hierarchy of only the joints with the indices `places`, which must include their parents."""
         new = {old: place for place, old in enumerate(places)} | {-1: -1}
         kept = [self.hierarchy.joints[place] for place in places]
         return SkeletonHierarchy(joints=tuple(Joint(**(dict(joint) | {"parent": new[joint.parent]})) for joint in kept))
@@ -134,7 +134,7 @@ def read_velocities(clip: PosedItem, joints: Joints, frames: slice | None) -> ND
 
 
 def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
-    """Return whether each foot touches the ground, (frames, 2)."""
+    """Return whether the left and the right foot touch the ground, as booleans (frames, 2)."""
     motion: Any = import_optional("marey_motion.kinematics", MOTION_EXTRA)
     mapped = rig_of(clip).handle.mapping().joints
     feet = [next((mapped[name] for name in names if name in mapped), None) for names in FEET]
@@ -151,7 +151,7 @@ def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
 
 
 def _widened(clip: PosedItem, frames: slice | None, more: int) -> tuple[slice | None, slice]:
-    """Return a range extended by `more` frames on both sides, and the slice of the given range in the extended one."""
+    """Return a range of frames extended by `more` on both sides, and the slice of the given range in it."""
     frames_text(frames)  # refuses other steps and negative bounds
     if frames is None:
         return None, slice(None)

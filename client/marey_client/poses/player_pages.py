@@ -28,7 +28,7 @@ _PLACE = b'<script type="application/json" id="motion"></script>'
 
 @dataclass(frozen=True)
 class ShownMotion:
-    """A motion with its skeleton, and the name under which a page shows it."""
+    """A motion with its skeleton, and the name that a page shows beside it."""
 
     name: str
     motion: MotionDocument

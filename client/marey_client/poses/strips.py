@@ -1,4 +1,4 @@
-"""Strips of poses as files: of clips and their revisions, samples of models, and trials of evaluations."""
+"""Pictures of poses in rows: of clips and their revisions, samples of models, and trials of evaluations."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def ranked_trials(evaluation: EvaluationHandle, document: dict[str, Any]) -> lis
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """Frame of a revision of a clip, and whether its mirrored copy was displayed instead of the frame itself."""
+    """Frame of a recorded clip that a character displayed. `mirrored`: the character displayed its mirrored copy."""
 
     clip: ClipHandle
     revision: int
@@ -188,7 +188,7 @@ class RecordedFrame:
 
 
 class DisplayedFrames:
-    """Frames of recorded clips, by their rows in the database of an evaluation."""
+    """Recorded frames behind the rows of an evaluation's database for motion matching."""
 
     def __init__(self, evaluation: EvaluationHandle, document: dict[str, Any]) -> None:
         self.rate_hz = float(document["options"]["database"]["rate_hz"])
@@ -198,7 +198,7 @@ class DisplayedFrames:
         self._handles: dict[str, ClipHandle] = {}
 
     def pose(self, row: int) -> Any:
-        """Return the recorded pose of a row as a clip of one frame, mirrored if the row is part of a mirrored copy."""
+        """Return the recorded pose of a row of the database as a clip of one frame, mirrored if the row is mirrored."""
         found = self.place(row)
         (pose,) = ClipOfStrip(found.clip, found.revision).poses([found.frame])
         return mirrored(pose) if found.mirrored else pose
