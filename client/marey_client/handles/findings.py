@@ -91,11 +91,11 @@ class Quality(Findings):
         under different conditions; the text contains the command that measures under the earlier conditions.
         """
         if different := differing_conditions(earlier.conditions, self.conditions):
-            told = ", ".join(f"{name} is {before} and {now}" for name, (before, now) in different.items())
+            reasons = ", ".join(f"{name} is {before} and {now}" for name, (before, now) in different.items())
             advice = "measure both sets of clips again" if "code" in different else "measure these clips again"
             raise NotComparable(
                 f"the results of {earlier.job.id} and {self.job.id} cannot be compared, because their numbers mean "
-                f"different things: {told}; {advice}, with `{command_with(earlier.conditions)}`"
+                f"different things: {reasons}; {advice}, with `{command_with(earlier.conditions)}`"
             )
         before, now = (one.summary["totals"] for one in (earlier, self))
         return {
