@@ -1,4 +1,4 @@
-"""Users, tokens, projects and members."""
+"""Users, tokens, projects and members in requests and answers."""
 
 from datetime import datetime
 from enum import StrEnum
@@ -41,7 +41,10 @@ class Scope(StrEnum):
 
 
 class EndTokens(StrEnum):
-    """Tokens that a change of a user revokes. The token that authenticates the request always stays valid."""
+    """Tokens that a change of a user revokes: none, `sessions` (the tokens of sign-ins), or all.
+
+    The token that authenticates the request always stays valid.
+    """
 
     NONE = "none"
     SESSIONS = "sessions"
@@ -97,9 +100,9 @@ class User(Answer):
     created_at: datetime
     last_seen_at: datetime | None = Field(
         None,
-        description="Time when a token or an identity of the user was last used, to the hour; only in the list of "
-        "users, which administrators may read. Uses of tokens that were deleted later do not count. Null: there was "
-        "no use, or the answer is not this list.",
+        description="Time, to the hour, when a token or an identity of the user was last used; uses of tokens "
+        "that were deleted later do not count. Only the list of users contains this time, which "
+        "administrators may read. Null: there was no use, or the answer is not this list.",
     )
     rev: int
 
@@ -110,7 +113,8 @@ class Me(Answer):
     user: User | None
     scopes: tuple[str, ...]
     job: str | None = Field(
-        None, description="The id of the job whose attempt uses the token; null for tokens of users."
+        None,
+        description="The id of the job for which the server made the token, for one attempt; null for tokens of users.",
     )
     expires_at: datetime | None = Field(
         None, description="Time at which the token of this request ends; null: it never ends."
@@ -282,13 +286,14 @@ class ProjectQuotasInUse(QuotasInUse):
 
     running_jobs: RunningJobs | None = Field(
         None,
-        description="Number of the project's jobs that workers run, and its limit. A job that is divided into tasks "
-        "does not count, but its tasks do. Null: the server is too old.",
+        description="Number of the project's jobs that workers run, and its limit. A job that is divided into "
+        "tasks does not count, but its tasks do. Null: the server has an earlier version, which does "
+        "not report it.",
     )
 
 
 class MemberChange(Request):
-    """Request to set the role of a user in a project."""
+    """Request to add a user to a project with a role, or to change the role of a member."""
 
     role: Role
 

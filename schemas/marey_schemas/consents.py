@@ -1,4 +1,4 @@
-"""Consent of performers: texts of refusals, and permissions to export clips after the end of the consent."""
+"""Consent of performers: refusals of exports after the end of a consent, and permissions for such exports."""
 
 from __future__ import annotations
 

@@ -78,11 +78,16 @@ class CoverageStreamCreate(Request):
         gt=0,
         le=3600,
         allow_inf_nan=False,
-        description=f"Seconds of data that each cell needs. Absent: those of the evaluation, or {COVERAGE_LEAST_S:g}.",
+        description="Seconds of data that each cell (a speed and a turn rate) needs to count as covered. Absent: "
+        f"those of the evaluation, or {COVERAGE_LEAST_S:g}.",
     )
-    target_count: int = Field(3, ge=0, le=16, description="Number of targets in each answer.")
+    target_count: int = Field(3, ge=0, le=16, description="Number of targets (motions to record next) in each answer.")
     path_s: float = Field(
-        TARGET_PATH_S, ge=0.5, le=20, allow_inf_nan=False, description="Duration of a target's path, in seconds."
+        TARGET_PATH_S,
+        ge=0.5,
+        le=20,
+        allow_inf_nan=False,
+        description="Duration in seconds of the path that a target asks the performer to walk.",
     )
 
     @model_validator(mode="after")
@@ -100,7 +105,8 @@ class CoverageStreamCreate(Request):
             cells = len(self.speeds_m_s) * len(self.turn_rates_deg_s)
             if cells > MOST_CELLS:
                 raise ValueError(
-                    f"these speeds and turn rates make a grid of {cells} cells; at most {MOST_CELLS} are allowed"
+                    f"speeds_m_s and turn_rates_deg_s make a grid of {cells} cells; at most {MOST_CELLS} are "
+                    "allowed, so leave out some values"
                 )
         return self
 
@@ -143,7 +149,7 @@ class CoverageFrames(Request):
         if self.frame_count > MOST_FRAMES:
             raise ValueError(f"the request has {self.frame_count} frames; at most {MOST_FRAMES} are allowed")
         if self.frame_count == 0 and not self.ends_take:
-            raise ValueError("the request is empty; send frames, or set ends_take")
+            raise ValueError("the request has no frames and does not end the take; send frames, or set ends_take")
         return self
 
     @property
@@ -172,7 +178,7 @@ class CoverageTarget(CoverageCell):
 
 
 class Performer(Answer):
-    """Position of the performer in the newest frame, and velocity over the newest measured second."""
+    """Position of the performer in the newest frame, and mean velocity in the newest second that was measured."""
 
     x_m: float
     z_m: float
@@ -211,8 +217,10 @@ class CoverageStream(Answer):
     frame_rate_hz: float
     skeleton: RevisionRef | None
     evaluation: RevisionRef | None
-    speeds_m_s: tuple[float, ...] = Field(description="Speeds of the grid in ascending order.")
-    turn_rates_deg_s: tuple[float, ...] = Field(description="Turn rates of the grid in ascending order.")
+    speeds_m_s: tuple[float, ...] = Field(description="Speeds of the grid in metres per second, in ascending order.")
+    turn_rates_deg_s: tuple[float, ...] = Field(
+        description="Turn rates of the grid in degrees per second, positive to the left, in ascending order."
+    )
     least_s: float
     target_count: int
     path_s: float

@@ -42,7 +42,10 @@ class CheckoutRequest(Request):
     paths: Annotated[tuple[EntryPath, ...], AfterValidator(_not_too_long)] = Field(
         (), max_length=MOST_PATHS, description="Entries, or folders whose entries are selected; empty: all entries."
     )
-    discard: bool = Field(False, description="Discard changes in the folder that no commit has recorded.")
+    discard: bool = Field(
+        False,
+        description="Discard changes in the folder that no commit has recorded; otherwise, such changes are an error.",
+    )
 
     @property
     def partial(self) -> bool:
@@ -55,12 +58,14 @@ class CheckoutAnswer(Answer):
 
     commit: str = Field(description="Digest of the commit that is checked out in the folder now.")
     taken: int | None = Field(
-        None, description="Number of entries that the folder has now. Null: the server is too old."
+        None,
+        description="Number of entries that the folder has now. Null: the server has an earlier version, "
+        "which does not report it.",
     )
     entries: int | None = Field(
         None,
-        description="Number of entries of the whole version, including those that were "
-        "not selected. Null: the server is too old.",
+        description="Number of entries of the whole version, including those that were not selected. Null: the "
+        "server has an earlier version, which does not report it.",
     )
     added: int
     removed: int

@@ -37,13 +37,15 @@ class ListedCommit(Commit):
 
 
 class EntryDifference(Answer):
-    """Difference of one entry between two versions."""
+    """Entry that differs between two versions, with the kind of its change."""
 
     path: str
     kind: Kind
     change: ChangeKind
-    was: str | None = Field(None, description="Path before the entry was moved.")
-    parts: dict[str, ChangeKind] = Field(default_factory=dict, description="Parts that differ.")
+    was: str | None = Field(None, description="Path of the entry in the earlier version, if it was moved.")
+    parts: dict[str, ChangeKind] = Field(
+        default_factory=dict, description="Kind of change of each part that differs, by the name of the part."
+    )
     tags_added: tuple[str, ...] = ()
     tags_removed: tuple[str, ...] = ()
     before: Entry | None = None

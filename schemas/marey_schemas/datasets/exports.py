@@ -39,7 +39,7 @@ class ExportedInput(Answer):
 
 
 class ExportedJob(Answer):
-    """Job that made a clip."""
+    """Job that made an exported clip, with its inputs."""
 
     id: str
     kind: str
@@ -50,7 +50,7 @@ class ExportedJob(Answer):
 
 
 class ExportedClip(Answer):
-    """Clip of an exported version."""
+    """Clip of an exported version, with its file, its take record and its origin."""
 
     path: str = Field(description="Path of the entry in the version.")
     content: str = Field(
@@ -90,5 +90,5 @@ class ExportedFolder(ExportedIdentity):
     layout: Layout
     format: str | None = Field(None, description="Format of the motion files.")
     unit: str | None = Field(None, description="Unit of length in the motion files.")
-    licences: tuple[str, ...] = Field((), description="Licences in the take records.")
+    licences: tuple[str, ...] = Field((), description="Different licences in the take records of the clips.")
     clips: tuple[ExportedClip, ...] = ()

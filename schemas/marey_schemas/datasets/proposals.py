@@ -195,14 +195,14 @@ class ProposalCheck(Answer):
 
 
 class Missing(Answer):
-    """Reason why a proposal cannot be merged yet."""
+    """Requirement for the merge of a proposal that is not met yet."""
 
     code: str
     detail: str
 
 
 class Mergeability(Answer):
-    """Result of a merge of the proposal, if it were merged now."""
+    """Whether a proposal could be merged now, and what the merge would change."""
 
     missing: tuple[Missing, ...] = Field(
         description="Reasons why the proposal cannot be merged yet; empty: it can be merged."
@@ -216,9 +216,13 @@ class Mergeability(Answer):
 
 
 class ProposalDetail(Proposal):
-    """A proposal with its reviews and checks, and with the expected result of a merge."""
+    """A proposal with its reviews and checks, and with what a merge now would do."""
 
     comments: int = Field(description="Number of comments.")
     reviews: tuple[Review, ...] = Field(description="The newest approval or request for changes of each reviewer.")
     checks: tuple[ProposalCheck, ...] = Field(description="Checks of the newest proposed commit, by name.")
-    mergeability: Mergeability | None = Field(description="Result of a merge now; null after the end of the proposal.")
+    mergeability: Mergeability | None = Field(
+        description="Whether the proposal could be merged now, and what "
+        "the merge would change; null after the end of the "
+        "proposal."
+    )
