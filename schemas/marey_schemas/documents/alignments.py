@@ -19,7 +19,7 @@ Metres = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ExampleRef(Request):
-    """Reference to an example: a revision of a clip, used as it is or mirrored."""
+    """Reference to an example of an action: a revision of a clip, used as it is or mirrored."""
 
     item: str
     revision: int = Field(ge=1)

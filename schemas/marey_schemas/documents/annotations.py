@@ -14,7 +14,7 @@ from marey_schemas.documents.references import RevisionRef as RevisionRef
 
 
 class SegmentDocument(Request):
-    """A labelled half-open range of frames."""
+    """Segment: a half-open range of frames with a label."""
 
     label: Annotated[str, StringConstraints(min_length=1, max_length=255)]
     start: int = Field(ge=0)
@@ -30,7 +30,7 @@ class SegmentDocument(Request):
 
 
 class KeyframeDocument(Request):
-    """A labelled frame."""
+    """Keyframe: a frame with a label."""
 
     label: Annotated[str, StringConstraints(min_length=1, max_length=255)]
     frame: int = Field(ge=0)

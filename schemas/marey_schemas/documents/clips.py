@@ -43,7 +43,9 @@ class MotionDocument(Request):
         description="[frames, 3 + 4*joints]: root translation (m), then local quaternions."
     )
     translations: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=3, columns=3)] | None = Field(
-        None, description="[frames, k, 3] local translations (m) that replace offsets."
+        None,
+        description="[frames, k, 3]: local translations (m) of the joints `translated_joints`, which "
+        "replace their offsets.",
     )
     translated_joints: tuple[JointName, ...] = ()
 
@@ -79,7 +81,7 @@ class MotionDocument(Request):
 
 
 class Check(Request):
-    """Finding of the importer about a motion: a stable code, a message, and the joints and frames concerned."""
+    """Warning of an import about a motion: a stable code, a message, and the joints and frames concerned."""
 
     code: Annotated[
         str, StringConstraints(pattern=form(r"^[a-z0-9-]{1,64}$", "have 1 to 64 lower-case letters, digits and -"))
@@ -125,7 +127,7 @@ def _require_day(value: object) -> object:
     is_day = _DAY.fullmatch(value) if isinstance(value, str) else type(value) is date
     if is_day:
         return value
-    raise ValueError("write the day as in 2026-11-23")
+    raise ValueError("a day must be written as in 2026-11-23")
 
 
 Day = Annotated[date, BeforeValidator(_require_day)]

@@ -28,7 +28,7 @@ class GraphPlace(Request):
 
 
 class GraphPrimitive(Request):
-    """A node of the graph: a model, its type, and the primitives that may follow it."""
+    """A node of the graph, the motion primitive: its model, its type, and the primitives that may follow it."""
 
     model: RevisionRef | OutputRef
     type: Literal["start", "standard", "end", "idle", "single", "cycle_end"] = "standard"

@@ -28,7 +28,7 @@ Stack = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=3)]
 
 
 class FunctionalComponentsDocument(Request):
-    """Functions of canonical time with D channels: a mean and k principal components, as n B-spline coefficients."""
+    """Functions of canonical time with D channels: a mean and k principal components, as splines of n coefficients."""
 
     degree: int = Field(3, ge=0, le=9)
     knots: Vector = Field(description="[n + degree + 1] knots of the splines, in canonical frames.")
@@ -91,7 +91,7 @@ class MixtureDocument(Request):
 
 
 class Noted(Request):
-    """Base class of records about the origin and training of a model; undeclared members are allowed."""
+    """Base of documents about the origin and the training of a model; they may also have undeclared members."""
 
     model_config = ConfigDict(extra="allow")
 

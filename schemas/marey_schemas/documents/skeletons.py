@@ -21,7 +21,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 class Joint(Request):
-    """Joint of a hierarchy."""
+    """Joint of a skeleton: its name, its parent, and its rest pose."""
 
     name: JointName
     parent: int = Field(ge=-1, description="Index of the parent, smaller than the joint's own; -1 for the root.")
@@ -33,7 +33,7 @@ class Joint(Request):
 
 
 class EndSiteDocument(Request):
-    """Point at the end of a chain, without a rotation of its own."""
+    """End site of a joint, such as a fingertip: a point without a rotation of its own."""
 
     joint: int = Field(ge=0)
     offset: Vector3

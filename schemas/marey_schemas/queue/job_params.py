@@ -97,7 +97,9 @@ class CutParams(TaggedResults):
         description="Pattern of the pieces' names; {number:2} counts the segments of a label in a clip from "
         "1, with two digits.",
     )
-    by_label: bool = Field(False, description="Put the pieces of each label into a folder of their own.")
+    by_label: bool = Field(
+        False, description="Put the pieces of each label into a separate subfolder, which has the name of the label."
+    )
 
     @field_validator("name")
     @classmethod
@@ -149,10 +151,16 @@ class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
         (), max_length=100_000, description="Clips that are loops, in addition to those tagged `loop`."
     )
     trims: dict[ItemId, tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(gt=0)]]] = Field(
-        default_factory=dict, max_length=100_000, description="Half-open range of frames to use, by the id of the clip."
+        default_factory=dict,
+        max_length=100_000,
+        description="Range of frames to use, as first frame and the "
+        "frame after the last, by the id of the clip; "
+        "other clips are used whole.",
     )
     baseline: bool = Field(
-        True, description="For comparison, also measure a set of generated clips that covers every cell."
+        True,
+        description="For comparison, also run the trials with a baseline: generated clips that contain "
+        "every speed and turn rate.",
     )
     report: bool = Field(True, description="Write the report and its figures.")
     trial_figures: tuple[TrialName, ...] = Field(
@@ -217,7 +225,8 @@ class AnalyseStudyParams(Request):
         1000,
         ge=0,
         le=10_000,
-        description="Number of times that participants are drawn with replacement, for intervals of the weights.",
+        description="Number of bootstrap samples of the participants, from which the intervals of the weights "
+        "are computed.",
     )
 
 
@@ -249,7 +258,10 @@ class QualityParams(QualityOptions):
     """Parameters of jobs of the kind `quality`."""
 
     draws: int = Field(
-        1000, ge=0, le=10_000, description="Number of times that takes are drawn with replacement, for intervals."
+        1000,
+        ge=0,
+        le=10_000,
+        description="Number of bootstrap samples of the takes, from which the confidence intervals are computed.",
     )
     title: str = Field("", max_length=200, description="Title of the report; default: the number of clips.")
     report: bool = Field(True, description="Write the report, a self-contained HTML page, and its figures.")
