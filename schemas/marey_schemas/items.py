@@ -70,7 +70,7 @@ class ItemRevert(Request):
 
 
 class HidingCondition(Answer):
-    """Condition of a query, with the numbers of items that the condition excludes."""
+    """Condition of a query, with the numbers of items that this condition excludes."""
 
     condition: str
     hides: int = Field(description="Number of items that do not meet this condition.")
@@ -80,7 +80,7 @@ class HidingCondition(Answer):
 class QueryExplanation(Answer):
     """Number of items that a query selects, and the numbers of items that its conditions exclude."""
 
-    items: int = Field(description="Number of items that the query was applied to.")
+    items: int = Field(description="Number of items to which the query was applied.")
     selected: int
     conditions: tuple[HidingCondition, ...] = Field(description="Conditions that every selected item meets.")
 
@@ -94,7 +94,7 @@ class PartSummary(Answer):
 
 
 class PartPlace(Request):
-    """Address of a document to read: a part of a revision of an item."""
+    """Address of a document to read: an item, a revision, and the name of a part."""
 
     kind: Kind
     item: str = Field(max_length=64)
@@ -109,7 +109,7 @@ class PartsRequest(Request):
 
 
 class Item(Answer):
-    """Named object of one kind in a project, at its newest revision."""
+    """Item: a named object of one kind in a project, such as a clip, at its newest revision."""
 
     id: str
     kind: Kind
@@ -140,7 +140,7 @@ class Item(Answer):
 
 
 class Revision(Answer):
-    """One immutable state of an item."""
+    """Revision: one immutable state of an item, with its author, time and message."""
 
     item: str
     revision: int
@@ -191,7 +191,7 @@ class Staleness(Answer):
 
 
 class Page(Answer):
-    """One page of a list."""
+    """One page of a list, with the cursor of the next page."""
 
     items: tuple[Any, ...]
     next_cursor: str | None = None

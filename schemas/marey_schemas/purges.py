@@ -43,7 +43,10 @@ class PurgeRequest(Request):
     )
     preview: bool = Field(False, description="Report what a purge would do, but change nothing.")
     after: str | None = Field(
-        None, max_length=64, description="Value of `next` in the last answer, to continue a purge of many items."
+        None,
+        max_length=64,
+        description="Value of `next` in the previous answer, to continue a purge of many "
+        "items; absent: the purge begins.",
     )
 
     @model_validator(mode="after")
@@ -107,7 +110,7 @@ class HeldItem(Answer):
     kind: Kind
     path: str
     holders: tuple[Holder, ...] = Field(description=f"Objects that still need the item, at most {MOST_HOLDERS}.")
-    others: int = Field(0, description="Number of further holders that are not listed.")
+    others: int = Field(0, description="Number of further objects that need the item and are not listed.")
 
 
 class PurgeAnswer(Answer):
@@ -154,7 +157,7 @@ class DatasetPurgeAnswer(Answer):
         f"{MOST_HOLDERS}: items that "
         "jobs made from a version, and jobs that have not ended."
     )
-    others: int = Field(0, description="Number of further holders that are not listed.")
+    others: int = Field(0, description="Number of further such objects, which are not listed.")
     freed_bytes: int = Field(
         description="Bytes of the trees of entries, without the chunks that other datasets also have."
     )

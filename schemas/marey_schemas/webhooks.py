@@ -69,7 +69,8 @@ class WebhookChange(Request):
     description: Message | None = None
     paused: bool | None = Field(
         None,
-        description="Whether the webhook is paused: nothing is sent, and the events of the pause are sent after it.",
+        description="Whether the webhook is paused: nothing is sent, and events during the pause are sent when "
+        "it ends.",
     )
 
 
@@ -91,7 +92,9 @@ class Webhook(Answer):
     description: str
     creator: str | None
     paused: bool
-    paused_reason: str | None = Field(None, description="Reason, if the server has paused the webhook.")
+    paused_reason: str | None = Field(
+        None, description="Reason why the server has paused the webhook; absent if it has not."
+    )
     created_at: datetime
     updated_at: datetime
     delivered_at: datetime | None = Field(None, description="Time of the last successful delivery.")
@@ -100,7 +103,11 @@ class Webhook(Answer):
     next_attempt_at: datetime | None = Field(None, description="Time of the next attempt after a failure.")
     last_status: int | None = Field(None, description="HTTP status of the last answer.")
     last_error: str | None = Field(None, description="Reason why the last attempt has failed.")
-    missed: int = Field(0, description="Number of events that were deleted before delivery and not yet reported.")
+    missed: int = Field(
+        0,
+        description="Number of events that were deleted before their delivery, and of which "
+        "the webhook has not been informed yet.",
+    )
     dead: int = Field(0, description="Number of deliveries that failed and will not be sent again.")
 
 

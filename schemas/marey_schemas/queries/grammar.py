@@ -110,7 +110,7 @@ class Negation:
 
 @dataclass(frozen=True, slots=True)
 class Junction:
-    """Queries joined by one word: with `and`, all must be true; with `or`, at least one."""
+    """Queries joined by `and` or by `or`: with `and`, all of them must be true; with `or`, at least one."""
 
     word: Literal["and", "or"]
     queries: tuple[Query, ...]

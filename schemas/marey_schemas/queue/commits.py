@@ -38,8 +38,8 @@ class OutputsCommit(Request):
     message: Message = Field("", description="Message of the commit; empty: the kind and the id of the job.")
     replace: bool = Field(
         False,
-        description="Also remove earlier entries of the folder that the job did not produce this time. Only entries "
-        "of the kinds that the job makes are removed.",
+        description="Also remove entries of the folder that are not among the outputs of this job, for example "
+        "results of an earlier job. Only entries of the kinds that the job makes are removed.",
     )
 
     @classmethod
@@ -58,7 +58,7 @@ class OutputsCommit(Request):
 
 
 class CommitOptions(Options):
-    """Options of commands that submit jobs: the commit of the outputs."""
+    """Options of commands that submit jobs, for the commit of the results to a branch of a dataset."""
 
     commit_to: str | None = Field(
         None, description="Commit the results to a branch when the job ends: dataset[@branch][/folder]."
@@ -67,7 +67,8 @@ class CommitOptions(Options):
         None, description="Message of the commit; absent: the kind and the id of the job."
     )
     commit_replace: bool = Field(
-        False, description="In the same commit, remove entries of the folder that the job did not produce this time."
+        False,
+        description="In the same commit, remove entries of the folder that are not among the results of this job.",
     )
 
     def commit(self) -> OutputsCommit | None:

@@ -215,7 +215,7 @@ TREE = KindDeclaration(
 
 
 def _reads_answers(_params: Mapping[str, Any]) -> bool:
-    """Return True: the job reads answers of participants while it runs, and these may change between two jobs."""
+    """Return True, because the job reads answers of participants while it runs, which may change between two jobs."""
     return True
 
 
@@ -241,7 +241,7 @@ INDEX = KindDeclaration(
     version=1,
     inputs={
         "clips": InputSpec(
-            kind=Kind.CLIP, many=True, parts=("motion",), description="The clips that the index shall contain."
+            kind=Kind.CLIP, many=True, parts=("motion",), description="The clips that the index will contain."
         ),
         "index": InputSpec(
             kind=Kind.INDEX,
@@ -268,7 +268,7 @@ RUN_SCRIPT = KindDeclaration(
 
 
 def script_kind(declared: ScriptDeclaration) -> KindDeclaration:
-    """Return the kind `script` with the inputs of one script."""
+    """Return the job kind `script` with the inputs that a script declares."""
     return replace(RUN_SCRIPT, inputs=declared.input_specs())
 
 

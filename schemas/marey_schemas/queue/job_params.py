@@ -44,7 +44,9 @@ class TaggedResults(Request):
 class SuffixedResults(TaggedResults):
     """Base of parameters with a suffix for the names of the results, and tags."""
 
-    suffix: NameSuffix = Field("", description="Text that is appended to the names of the results.")
+    suffix: NameSuffix = Field(
+        "", description="Text that is appended to the name of each input to form the name of its result."
+    )
 
 
 class AlignParams(AlignOptions, MetricChoice, SuffixedResults):
@@ -198,7 +200,7 @@ class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
 
 
 def count_evaluation_tasks(params: EvaluateParams) -> int:
-    """Return the number of tasks for the trials. A task runs few trials, so that a failure loses little work."""
+    """Return the number of tasks of an evaluation; a task has few trials, so that a failure loses little work."""
     per_task = max(TRIALS_PER_TASK, -(-params.trial_count // MOST_EVALUATION_TASKS))
     return -(-params.trial_count // per_task)
 

@@ -48,7 +48,7 @@ NOTHING_DONE = "nothing-done"
 
 
 def nothing_done(result: Mapping[str, Any]) -> bool:
-    """Return whether a job has refused inputs and made nothing: it has no outputs, and lists no inputs as `empty`.
+    """Return whether a job refused inputs and produced nothing: no outputs, and no inputs that it lists as `empty`.
 
     In `result`, `outputs` is the number of outputs, and `empty` lists inputs that the job could use, but in which it
     found nothing.
@@ -80,12 +80,15 @@ class JobKind(Answer):
         default_factory=dict,
         description="Numbers that the job publishes about its inputs, and their meanings, by name.",
     )
-    fan_out: str | None = Field(None, description="The input whose items are distributed over many tasks.")
-    batch_size: int = Field(1, description="Number of items that each task of a fan-out takes.")
+    fan_out: str | None = Field(
+        None,
+        description="The input whose items are distributed over the tasks of a "
+        "job; null: the items are not distributed.",
+    )
+    batch_size: int = Field(1, description="Number of items of the input `fan_out` that each task gets.")
     gathers: bool = Field(
         False,
-        description="Whether the parameters determine the number of tasks, and a worker gathers the results of the "
-        "tasks.",
+        description="Whether the parameters determine the number of tasks, whose results a worker combines at the end.",
     )
     deterministic: bool = Field(
         True,
@@ -136,7 +139,7 @@ JobInput = ExistingInput | JobOutputsInput
 
 
 class Resources(Request):
-    """Limits of time and memory of one attempt to run a job, and other resources that the attempt needs."""
+    """Time and memory that one attempt to run a job may use, and graphics processors that it needs."""
 
     time_limit_s: int = Field(3600, ge=1, le=7 * 86400)
     memory_limit_mb: int = Field(4096, ge=64, le=1_048_576)
@@ -150,8 +153,8 @@ class Resources(Request):
         None,
         ge=1,
         le=7 * 86400,
-        description="Expected duration of the job. With the setting `own_pods`, the server gives a long job a pod of "
-        "its own.",
+        description="Expected duration of the job in seconds. With the server's setting `own_pods`, a long job "
+        "runs in a separate pod.",
     )
 
 
@@ -166,11 +169,12 @@ class JobCreate(Request):
     inputs: dict[str, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
     params: dict[str, Any] = Field(default_factory=dict)
     into: CollectionPath = Field("", description="The collection that receives the results.")
-    priority: int = Field(0, ge=-100, le=100, description="Jobs of higher priority run first.")
+    priority: int = Field(0, ge=-100, le=100, description="Priority; jobs of higher priority run first.")
     after: tuple[str, ...] = Field((), max_length=1000, description="Jobs that must succeed before this one starts.")
     on_failure: Literal["fail", "skip"] = Field(
         "fail",
-        description="Final state of this job if a job in `after` does not succeed. fail: failed; skip: cancelled.",
+        description="What happens to this job if a job in `after` does not succeed. fail: it fails; skip: it is "
+        "cancelled.",
     )
     concurrency_key: str | None = Field(
         None,
@@ -197,7 +201,7 @@ LONGEST_NOTE = 500
 
 
 class Progress(Request):
-    """Progress of an attempt."""
+    """Progress of an attempt to run a job: amount done, total amount, and a note."""
 
     done: float = Field(ge=0, allow_inf_nan=False)
     total: float | None = Field(None, gt=0, allow_inf_nan=False)
@@ -205,7 +209,7 @@ class Progress(Request):
 
 
 class JobFailure(Answer):
-    """Failure of a job, described for people."""
+    """Failure of a job, with a code for programs and a text for people."""
 
     reason: FailureReason
     code: str
@@ -243,7 +247,7 @@ def commits_of(inputs: Mapping[str, Any]) -> set[str]:
 
 
 class Job(Answer):
-    """Job with its state."""
+    """Job with its inputs, parameters, state and result."""
 
     id: str
     project: str
@@ -301,7 +305,7 @@ class TaskResult(Answer):
 
 
 class Attempt(Answer):
-    """Attempt to run a job."""
+    """Attempt of a worker to run a job; a job may need several attempts."""
 
     job: str
     fence: int

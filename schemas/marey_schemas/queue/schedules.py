@@ -41,8 +41,8 @@ TimeZoneName = Annotated[
 Overlapping = Annotated[
     bool,
     Field(
-        description="Whether a job is submitted even if the previous job of the schedule has not ended. If false, "
-        "the time is skipped in this case."
+        description="Whether a job is submitted even if the previous job of the schedule has not ended. False: "
+        "no job is submitted at this time."
     ),
 ]
 

@@ -96,7 +96,7 @@ class ScriptParameter(Request):
         return self
 
     def fault_of(self, value: Value) -> str | None:
-        """Return why a value is not allowed, or None if it is."""
+        """Return the reason why a value is not allowed for this parameter; None if it is allowed."""
         if self.type == "boolean":
             return None if isinstance(value, bool) else "the value must be true or false"
         if self.type == "text":
@@ -149,7 +149,7 @@ class ScriptOutput(Request):
         description="Format of a clip, such as bvh. For logged fields: jsonl, if each line is a JSON object of values "
         "of one step; absent: the file is one JSON object.",
     )
-    max_bytes: int = Field(64 * MIB, ge=1, le=GIB, description="Greatest size of the file.")
+    max_bytes: int = Field(64 * MIB, ge=1, le=GIB, description="Greatest size of the file, in bytes.")
     required: bool = Field(True, description="Whether a run fails if the script does not write this file.")
     description: Message = ""
 
@@ -165,7 +165,7 @@ class ScriptOutput(Request):
 
     @property
     def ending(self) -> str:
-        """The ending of the file's name."""
+        """The ending of the name of the written file, such as `.bvh`."""
         if self.kind == "clip":
             return _MOTION_ENDINGS[self.format or ""]
         return f".{self.format or 'json'}" if self.kind == "fields" else ""
@@ -174,7 +174,7 @@ class ScriptOutput(Request):
 class ScriptLimits(Request):
     """Limits of one run of a script."""
 
-    seconds: int = Field(3600, ge=1, le=86400, description="Greatest duration.")
+    seconds: int = Field(3600, ge=1, le=86400, description="Greatest duration of a run, in seconds.")
     memory_mb: int = Field(2048, ge=64, le=262_144, description="Greatest memory of all its processes, in MiB.")
     written_mb: int = Field(1024, ge=1, le=65_536, description="Greatest size of all its files, in MiB.")
     processes: int = Field(32, ge=1, le=1024, description="Greatest number of processes at the same time.")
@@ -332,8 +332,9 @@ class ScriptParams(ConsentOverride):
     )
     declaration: ScriptDeclaration | None = Field(
         None,
-        description="The script as it was registered when the job was submitted. The server fills in this field; if "
-        "a request contains the field, its value must equal the registered script.",
+        description="The script in the form in which it was registered at the submission of the job. The server "
+        "sets this field; if a request contains the field, its value must equal the registered "
+        "script.",
     )
 
 

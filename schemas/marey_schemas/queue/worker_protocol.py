@@ -17,7 +17,7 @@ FAULT_VARIABLE = "MAREY_FAULT"
 """Environment variable with which tests make a server or worker fail at a named point."""
 
 INTERRUPTED_STATUS = 143
-"""Exit status of a worker that returned a job to the queue because it was asked to stop."""
+"""Exit status of a worker that ended because it was asked to stop, and returned a job to the queue."""
 
 LONGEST_CODE = 128
 LONGEST_DETAIL = 20_000
@@ -29,7 +29,7 @@ PROTOCOL_VERSION = 1
 
 
 class ClaimRequest(Request):
-    """Request of a worker for jobs."""
+    """Request of a worker to claim jobs."""
 
     worker: ShownText = Field(max_length=255, description="Name of the worker, shown to people.")
     kinds: tuple[ShownText, ...] = Field(min_length=1, max_length=256)
@@ -48,8 +48,9 @@ class ClaimRequest(Request):
         None,
         min_length=16,
         max_length=64,
-        description="Random id of the claim. If a request is repeated with the same id and the same token, it gets "
-        "those leases of the first request that are still held, renewed; it is refused if all of them have ended.",
+        description="Random id of the claim. A repeated request with the same id and the same token renews and "
+        "returns those leases of the first request that have not ended; it is refused if all of them "
+        "have ended.",
     )
 
 
@@ -264,7 +265,7 @@ class CompleteAnswer(Answer):
 
 
 class FailAnswer(Answer):
-    """State of the job after the failed attempt."""
+    """Answer to the report of a failed attempt: the state of the job now, and the wait before the next attempt."""
 
     job: str
     state: JobState
@@ -290,13 +291,13 @@ class BatchCompleteAnswer(Answer):
 
 
 class StageAnswer(Answer):
-    """Number of results that the attempt has staged."""
+    """Answer to a request to stage results: the number of results that the attempt has staged so far."""
 
     staged: int
 
 
 class LogAnswer(Answer):
-    """Length of the attempt's log."""
+    """Answer to a piece of a log: the length of the attempt's log so far."""
 
     offset: int = Field(description="Number of bytes received, which is where the next piece starts.")
     capped: bool = Field(default=False, description="Whether the log is full, so that further output is dropped.")

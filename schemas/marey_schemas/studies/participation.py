@@ -35,7 +35,7 @@ class StudyWelcome(Answer):
     clips: int = Field(description="Number of motions.")
     trials: int = Field(description="Number of trials to answer.")
     shown: int = Field(description="Number of motions in a trial.")
-    seconds: float = Field(description="Time for an answer.")
+    seconds: float = Field(description="Seconds that the participant has to answer a trial.")
 
 
 class ParticipationCreate(Request):
@@ -67,7 +67,7 @@ class Participation(Answer):
     answered: int
     remaining: int
     shown: int = Field(description="Number of motions in a trial.")
-    seconds: float = Field(description="Time for an answer.")
+    seconds: float = Field(description="Seconds that the participant has to answer a trial.")
     finished: bool
 
 
