@@ -95,7 +95,9 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
             _add(files, place.name, place)
             continue
         if not place.is_dir():
-            raise NothingToUpload(f"{place} does not exist")
+            raise NothingToUpload(
+                f"{place} does not exist; give the path of a motion file, or of a folder with motion files"
+            )
         folder = ReturningFolder.at(place)
         returning += [folder] if folder is not None else []
         visible, hidden = _files_below(place)

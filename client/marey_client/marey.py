@@ -112,7 +112,7 @@ class Marey:
         if slash:
             raise BadArgument(f"project: {name!r} is a path; the project is {known!r}, and {path!r} a path in it")
         if name in ("", ".", ".."):
-            raise BadArgument(f"project: {name!r} is not the name of a project")
+            raise BadArgument(f"project: {name!r} is not the name of a project; `marey project ls` lists the names")
         return ProjectHandle(self.transport, name)
 
     def projects(self) -> Iterator[Project]:

@@ -362,7 +362,9 @@ def read_tree(response: httpx.Response) -> Any:
     try:
         return decode_tree(response.content, media_type_of(response), max_bytes=MAX_ANSWER_BYTES)
     except CodecError as error:
-        raise UnexpectedAnswer(f"{response.request.url.path}: {error}") from error
+        raise UnexpectedAnswer(
+            f"{response.request.url.path}: the server's answer cannot be decoded: {error}"
+        ) from error
 
 
 def raise_for_problem(response: httpx.Response) -> None:

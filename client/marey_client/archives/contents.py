@@ -57,7 +57,9 @@ def first_documents(
         if not isinstance(tree, dict):
             raise UnexpectedAnswer(f"the project no longer has the revision with the content digest {place.content}")
     if not found:
-        raise UnexpectedAnswer("the server's answer contains none of the requested documents")
+        raise UnexpectedAnswer(
+            "the server's answer contains none of the requested documents; update the older of client and server"
+        )
     return found
 
 
@@ -108,6 +110,8 @@ def bases_of_arrays(transport: Transport, project_url: str, places: Mapping[K, P
             if of_document:
                 found[key] = ArrayBases(place.content, of_document)
         if not tiles:
-            raise UnexpectedAnswer("the server's answer contains none of the requested tiles")
+            raise UnexpectedAnswer(
+                "the server's answer contains no requested tile; update the older of client and server"
+            )
         waiting = waiting[len(tiles) :]
     return found

@@ -98,7 +98,10 @@ class DocumentWriter:
         for digest, body in bodies.items():
             data = canonical_json(body)
             if digest_of(data) != digest:
-                raise UnexpectedAnswer(f"the server's document {digest} does not match its digest")
+                raise UnexpectedAnswer(
+                    f"the server's document {digest} does not match its digest; `marey db check` on the server finds "
+                    "damaged data"
+                )
             if found := differences[digest]:
                 self.writer.add(ArchiveMember(MemberKind.DIFFERENCES, digest), differences_member(found))
             for file in self._files(digest, body):
@@ -124,7 +127,8 @@ class DocumentWriter:
             for content, one in zip(some, found, strict=True):
                 if one is None:
                     raise UnexpectedAnswer(
-                        f"a document refers to the revision with the content digest {content}, which the project lacks"
+                        f"a document refers to the revision with the content digest {content}, which the project "
+                        "lacks; `marey db check` on the server finds wrong references"
                     )
                 self._add_documents(
                     {digest: PartOfContent(content=content, part=part) for part, digest in one["parts"].items()}

@@ -95,7 +95,10 @@ def write_archive(
             before = _history(dataset, base, before)
         commits = [one for one in _history(dataset, head, before).values() if one.digest not in before]
         if not commits:
-            raise NothingToArchive(f"there is nothing to archive: the versions to leave out include {head.digest}")
+            raise NothingToArchive(
+                f"there is nothing to archive: the versions to leave out include {head.digest}; leave out only "
+                "earlier versions"
+            )
         documents = _documents(dataset, writer, part.parent, on_progress, check, differences=False)
         _Making(dataset, documents, to_send=False).run(head, commits)
 
@@ -242,7 +245,10 @@ class _Making:
         at = commit.at.strftime(TIME_OF_COMMIT)
         record = CommitRecord(commit.tree, commit.parents, commit.author, commit.message, at)
         if record.digest != commit.digest:
-            raise UnexpectedAnswer(f"the server's commit {commit.digest} does not match its digest")
+            raise UnexpectedAnswer(
+                f"the server's commit {commit.digest} does not match its digest; `marey db check` on the server finds "
+                "damaged data"
+            )
         changes = self._changes(commit)
         if self.to_send:
             require_receivable(commit.digest, len(changes))

@@ -91,7 +91,10 @@ def read_sidecar(folder: Path) -> ExportedFolder | None:
     if not path.is_file():
         return None
     if path.stat().st_size > MOST_SIDECAR_BYTES:
-        raise BadSidecar(f"{path} has more than {MOST_SIDECAR_BYTES:,} bytes, so it is not the sidecar of an export")
+        raise BadSidecar(
+            f"{path} has more than {MOST_SIDECAR_BYTES:,} bytes, so it is not the sidecar of an export; rename it to "
+            "import the folder without it"
+        )
     try:
         return ExportedFolder.model_validate_json(path.read_bytes())
     except ValidationError as error:

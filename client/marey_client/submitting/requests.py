@@ -247,7 +247,10 @@ def _of_clips(project: ProjectItems, clips: Clips, layer: str | None) -> dict[st
         return known
     annotations = _annotations_of(project, found, layer)
     if not annotations:
-        raise NoAnnotations(f"none of these clips has an annotation in the layer {layer!r}")
+        raise NoAnnotations(
+            f"none of these clips has an annotation in the layer {layer!r}; name another layer, or annotate the clips "
+            "first"
+        )
     return {**known, "annotations": annotations}
 
 

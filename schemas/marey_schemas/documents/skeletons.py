@@ -51,14 +51,16 @@ class SkeletonHierarchy(Request):
         seen: set[str] = set()
         for index, joint in enumerate(self.joints):
             if joint.name in seen:
-                raise ValueError(f"joints[{index}]: the name {joint.name!r} is used twice")
+                raise ValueError(
+                    f"joints[{index}]: another joint has the name {joint.name!r}, too; give each joint its own name"
+                )
             seen.add(joint.name)
             if (joint.parent == -1) != (index == 0) or joint.parent >= index:
                 place = f"joints[{index}] ({joint.name})"
                 raise ValueError(f"{place}: parent {joint.parent} must come before the joint; only joint 0 is the root")
         for index, site in enumerate(self.end_sites):
             if site.joint >= len(self.joints):
-                raise ValueError(f"end_sites[{index}]: joint {site.joint} does not exist")
+                raise ValueError(f"end_sites[{index}]: the skeleton has no joint with the index {site.joint}")
         return self
 
 

@@ -148,7 +148,7 @@ def changed_blocks(data: bytes, former: bytes) -> Iterator[slice]:
     """
     (layout, starts), (other, others) = _read_head(data), _read_head(former)
     if layout != other:
-        raise BlockError("arrays with different layouts cannot be compared block by block")
+        raise BlockError("the arrays have different layouts, so they cannot be compared block by block")
     for block in range(layout.blocks):
         first, end = block * layout.groups, (block + 1) * layout.groups
         if data[starts[first] : starts[end]] != former[others[first] : others[end]]:

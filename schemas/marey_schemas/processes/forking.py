@@ -115,9 +115,7 @@ class ForkServer:
         return child
 
     def status_of(self, pid: int, timeout_s: float | None = None) -> int | None:
-        """Return the exit status of a child, or None if it still runs after `timeout_s`; without a timeout, wait for
-        its end.
-        """
+        """Return the exit status of a child; None if the child still runs after `timeout_s` (None: without limit)."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or pid in self._statuses, timeout_s)
             return self._statuses.get(pid, LOST if self._ended else None)

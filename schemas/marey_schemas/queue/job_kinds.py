@@ -305,8 +305,8 @@ def job_kinds() -> Mapping[str, KindDeclaration]:
             raise TypeError(f"the entry point {entry.value} in the group {ENTRY_POINT_GROUP} must be a KindDeclaration")
         if kind.name in kinds:
             raise ValueError(
-                f"the entry point {entry.value} declares the job kind {kind.name!r}, but another job kind has this "
-                "name already"
+                f"the entry point {entry.value} declares the job kind {kind.name!r}, but another job kind has "
+                "this name already; rename one of them"
             )
         kinds[kind.name] = kind
     return MappingProxyType(kinds)

@@ -200,7 +200,7 @@ class StageRequest(Request):
     @model_validator(mode="after")
     def _require_content(self) -> Self:
         if not self.outputs and not self.facets:
-            raise ValueError("the request contains neither outputs nor facets")
+            raise ValueError("the request contains neither outputs nor facets; send at least one of them")
         return self
 
 

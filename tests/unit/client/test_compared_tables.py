@@ -93,7 +93,7 @@ WRONG = [
     (["--csv", "--json"], "choose one of --csv and --json"),
     (["--plot", "bars"], "need --chart"),
     (["--chart", "runs.pdf"], "must end in .html, .svg or .png"),
-    (["--highest", "a", "--lowest", "a"], "a can be in only one of --highest and --lowest"),
+    (["--highest", "a", "--lowest", "a"], "a is named by --highest and by --lowest"),
 ]
 
 

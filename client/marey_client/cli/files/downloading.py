@@ -153,7 +153,10 @@ def _entries_of(project: ProjectHandle, version: DatasetInput) -> list[_Exported
         handle = ClipHandle(project.transport, project.name, item)
         found.append(_Exported(handle, entry.revision, folder, name or item.name))
     if not found:
-        raise WrongUsage(f"{version.dataset}@{version.version} has no clip at {version.path or 'any path'}")
+        raise WrongUsage(
+            f"{version.dataset}@{version.version} has no clip at {version.path or 'any path'}; `marey dataset "
+            "entries` lists its entries"
+        )
     return found
 
 

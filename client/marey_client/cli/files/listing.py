@@ -112,7 +112,7 @@ def ls(
     address = Address.parse(place)
     if deleted:
         if explain or stale:
-            raise WrongUsage("--deleted cannot be combined with --explain or --stale")
+            raise WrongUsage("--deleted cannot be combined with --explain or --stale; leave out one of these options")
         return _show_deleted(context, address, kind, tag, find, query, as_json)
     if explain:
         if tag or find or stale:

@@ -89,7 +89,10 @@ def _skeleton_at(marey: Marey, project: str, place: str) -> str:
 
     address = Address.parse(place)
     if address.project != project:
-        raise WrongUsage(f"the skeleton {place} is not in the project {project}, which receives the files")
+        raise WrongUsage(
+            f"the skeleton {place} is not in the project {project}, which receives the files; name a skeleton of this "
+            "project"
+        )
     return str(require_item(marey, address, [Kind.SKELETON]).id)
 
 

@@ -101,10 +101,10 @@ def compare(
     if as_csv and as_json:
         raise WrongUsage("choose one of --csv and --json")
     if chart is None and (plot or parameter or log):
-        raise WrongUsage("--plot, --parameter and --log need --chart")
+        raise WrongUsage("--plot, --parameter and --log have an effect only with --chart; add --chart FILE")
     goals: dict[str, Any] = dict.fromkeys(highest or (), "highest")
     if both := sorted(goals.keys() & set(lowest or ())):
-        raise WrongUsage(f"{both[0]} can be in only one of --highest and --lowest")
+        raise WrongUsage(f"{both[0]} is named by --highest and by --lowest; name it by only one of them")
     goals |= dict.fromkeys(lowest or (), "lowest")
     with connect(context) as marey:
         script = marey.project(project).scripts.at(name)

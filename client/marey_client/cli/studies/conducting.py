@@ -69,7 +69,7 @@ def create(
         project = marey.project(addresses[0].project)
         clips = {clip.id: clip for address in addresses for clip in clips_in(marey, address)}
         if not SHOWN <= len(clips) <= MOST_MOTIONS:
-            raise WrongUsage(f"a study has {SHOWN} to {MOST_MOTIONS} clips, and {len(clips)} are given")
+            raise WrongUsage(f"a study needs {SHOWN} to {MOST_MOTIONS} clips, but {len(clips)} were given")
         made = project.studies.design(
             last, list(clips.values()), consent_text=text, title=title, collection=folder, trials=trials,
             seconds=seconds, seed=seed,
