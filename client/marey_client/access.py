@@ -164,7 +164,7 @@ class Members:
     project: str
 
     def list(self) -> Iterator[Member]:
-        """List the members with their roles."""
+        """List the members of the project with their roles; roles in folders are in `in_folders`."""
         return pages(self.transport, Member, f"/projects/{self.project}/members")
 
     def put(self, user: str, role: Role) -> Member:

@@ -86,7 +86,7 @@ class BearerToken:
 
     @property
     def token(self) -> str:
-        """The current token."""
+        """The token to send now; a `TokenFile` may have read a new one."""
         return self._source.token if isinstance(self._source, TokenFile) else self._source
 
     def __call__(self, request: httpx.Request) -> httpx.Request:
@@ -217,7 +217,7 @@ def _forbidden_rights(path: Path) -> int:
 
 @dataclass(frozen=True)
 class Logins:
-    """Tokens by server, and the default server."""
+    """Stored logins: the token for each server, by its address, and the default server."""
 
     default: str | None = None
     tokens: Mapping[str, str] = field(default_factory=dict, repr=False)

@@ -218,13 +218,13 @@ class RequestFailed(MareyError):
 
 
 class BadRequest(RequestFailed):
-    """The request is malformed."""
+    """The request is malformed, for example a query parameter."""
 
     status = 400
 
 
 class Unauthenticated(RequestFailed):
-    """A valid token is needed."""
+    """The request needs a valid token: it had none, or its token is unknown, revoked or expired."""
 
     status = 401
 
@@ -252,7 +252,7 @@ class LeaseLost(Conflict):
 
 
 class PreconditionFailed(RequestFailed):
-    """The resource has changed since it was read."""
+    """The resource has changed since it was read; read it again, and repeat the change."""
 
     status = 412
 
@@ -264,7 +264,7 @@ class TooLarge(RequestFailed):
 
 
 class Invalid(RequestFailed):
-    """The request is well formed but not valid."""
+    """The request is well formed but not valid; `errors` names the invalid fields."""
 
     status = 422
 

@@ -196,7 +196,7 @@ def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
 
 @dataclass(frozen=True)
 class Imports:
-    """Imports into a project."""
+    """Imports of motion files into a project: search, upload, import, and restoring of exported clips."""
 
     transport: Transport
     project: str

@@ -75,7 +75,7 @@ class ItemHandle:
         return ItemInput(item=self.id, revision=self.item.revision)
 
     def part(self, part: str, *, revision: int | None = None, **query: str | None) -> dict[str, Any]:
-        """Return the document of a part, with numpy arrays."""
+        """Return the document of a part, with numpy arrays: of the given revision, or of the newest one."""
         tree, _ = self.transport.get_tree(f"{self.url}/parts/{part}", {"revision": revision, **query})
         return dict(tree)
 

@@ -30,7 +30,7 @@ def job_request(kind: str, inputs: Mapping[str, JobInput | Sequence[JobInput]], 
 
 @dataclass(frozen=True)
 class Jobs:
-    """Jobs that the caller may read, by id."""
+    """Jobs of a server, which are named by their ids; methods submit, read, await and cancel them."""
 
     transport: Transport
 

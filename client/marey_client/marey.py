@@ -142,12 +142,12 @@ class Marey:
 
     @cached_property
     def jobs(self) -> Jobs:
-        """Jobs by id."""
+        """The jobs of the server, each by its id."""
         return Jobs(self.transport)
 
     @cached_property
     def blobs(self) -> Blobs:
-        """Blobs by digest."""
+        """The blobs (bytes identified by their digest) of the server."""
         return Blobs(self.transport)
 
     @cached_property
@@ -157,7 +157,7 @@ class Marey:
 
     @cached_property
     def tokens(self) -> Tokens:
-        """The caller's tokens."""
+        """The tokens of the caller; administrators also reach tokens of other users."""
         return Tokens(self.transport)
 
 

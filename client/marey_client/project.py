@@ -73,7 +73,10 @@ class ProjectHandle(JobSubmission):
         self.transport.send("DELETE", self.url, headers={"If-Match": "*"})
 
     def restore(self) -> Project:
-        """Restore the deleted project."""
+        """Restore the project of this name that was deleted last.
+
+        Raises `Conflict` if another project has the name now.
+        """
         return self.transport.post(Project, f"{self.url}/restore")
 
     def browser_link(self) -> BrowserLink:

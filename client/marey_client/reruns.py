@@ -26,7 +26,7 @@ its job always has other bytes, because the ids differ.
 
 
 class CannotRerun(ValueError):
-    """The job cannot be repeated."""
+    """A job cannot be repeated; the text gives the reason."""
 
 
 @dataclass(frozen=True)

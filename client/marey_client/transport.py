@@ -138,7 +138,7 @@ class Transport:
         params: Params | None = None,
         headers: Mapping[str, str] | None = None,
     ) -> Model:
-        """Request a JSON document by GET."""
+        """Request a JSON document by GET, and return it as an instance of `answer`."""
         return read_model(answer, self.send("GET", path, params=params, headers=headers))
 
     def post(self, answer: type[Model], path: str, body: BaseModel | None = None, **options: Any) -> Model:

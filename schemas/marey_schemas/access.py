@@ -160,7 +160,7 @@ class TokenRotation(Request):
 
 
 class Token(Answer):
-    """A token without its secret."""
+    """Token of a user: scopes, expiry and use, without its secret."""
 
     id: str
     name: str
@@ -261,7 +261,7 @@ class ProjectQuotaChange(QuotaChange):
 
 
 class QuotaUse(Answer):
-    """Amount used of one quota, and its limit."""
+    """Used amount of one quota, such as the number of items, and its limit."""
 
     used: int
     allowed: int

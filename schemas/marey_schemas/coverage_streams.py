@@ -154,7 +154,7 @@ class CoverageFrames(Request):
 
     @property
     def frame_count(self) -> int:
-        """The number of frames."""
+        """The number of frames in the request."""
         return sum(len(frames) for frames in (self.poses, self.roots) if frames is not None)
 
 
@@ -252,7 +252,7 @@ class MeasuredOptions(Answer):
 
 
 class MeasuredCells(Answer):
-    """The coverage of each cell in an evaluation."""
+    """The coverage of each cell (a speed and a turn rate) in an evaluation."""
 
     seconds: Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=2)]
 
@@ -264,7 +264,7 @@ class MeasuredCells(Answer):
 
 
 class MeasuredCoverage(Answer):
-    """The part of `EvaluationDocument` that contains the coverage."""
+    """The members of an `EvaluationDocument` from which a coverage stream takes its grid and its initial coverage."""
 
     options: MeasuredOptions
     coverage: MeasuredCells

@@ -27,7 +27,7 @@ class CollectionChange(Request):
 
 
 class Collection(Answer):
-    """A folder in a project's tree."""
+    """Folder (collection) of a project, which contains items and folders."""
 
     id: str
     path: str
@@ -86,7 +86,7 @@ class QueryExplanation(Answer):
 
 
 class PartSummary(Answer):
-    """Part of an item: one document."""
+    """Part of an item, without its content: schema, digest and size of the document."""
 
     document: str
     schema_: str = Field(alias="schema")
@@ -103,7 +103,7 @@ class PartPlace(Request):
 
 
 class PartsRequest(Request):
-    """Request for several documents."""
+    """Request to read several documents, each a part of a revision of an item."""
 
     parts: tuple[PartPlace, ...] = Field(min_length=1, max_length=256)
 
@@ -208,7 +208,7 @@ class BlobsQuery(Request):
 
 
 class BlobsMissing(Answer):
-    """Digests of the blobs that must be sent."""
+    """Digests of the requested blobs that are missing, so that they must be sent."""
 
     missing: tuple[str, ...]
 
@@ -221,7 +221,7 @@ class UploadCreate(Request):
 
 
 class Upload(Answer):
-    """Progress of a resumable upload."""
+    """Resumable upload of bytes: the bytes received so far, and the digest at the end."""
 
     id: str
     length: int

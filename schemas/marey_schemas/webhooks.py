@@ -51,7 +51,7 @@ EventKinds = Annotated[
 
 
 class WebhookCreate(Request):
-    """Request to create a webhook."""
+    """Request to create a webhook, which sends events of a project to an address."""
 
     url: WebhookUrl = Field(description="Address to which the server sends requests.")
     kinds: EventKinds = Field(DEFAULT_WEBHOOK_KINDS, description="Kinds of events that are sent.")
@@ -83,7 +83,7 @@ class WebhookRotation(Request):
 
 
 class Webhook(Answer):
-    """Webhook of a project, without its secret."""
+    """Webhook of a project, without its secret: address, kinds of events, and state of the deliveries."""
 
     id: str
     project: str

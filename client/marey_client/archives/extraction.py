@@ -33,7 +33,7 @@ def extract_archive(archive: Archive, folder: Path) -> Iterator[Path]:
 
 @dataclass
 class _Extraction:
-    """Archive that is being extracted into a folder."""
+    """Extraction of the newest version of an archive into a folder, while it runs."""
 
     archive: Archive
     folder: Path

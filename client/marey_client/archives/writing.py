@@ -220,7 +220,7 @@ def _history(dataset: DatasetReader, head: Commit, known: Mapping[str, Commit]) 
 
 @dataclass
 class _Making:
-    """Archive that is being written."""
+    """Archive while it is written: the commits to write, and the documents that are in it already."""
 
     dataset: DatasetReader
     documents: DocumentWriter

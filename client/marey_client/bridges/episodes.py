@@ -102,7 +102,7 @@ class EpisodeTable:
             self.flush()
 
     def flush(self) -> None:
-        """Write the rows that are still in memory."""
+        """Write the collected rows to the table; needed after the last episode."""
         if not self._rows:
             return
         place = self._files.place_for(self._table(FilePlace(0, 0)).nbytes)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class FileExportOptions(ExportOptions, total=False):
-    """Options of exports to motion files."""
+    """Keyword arguments of exports to motion files."""
 
     format: str
     """Name of the format of the files; default: `DEFAULT_FORMAT`."""
@@ -40,7 +40,7 @@ class FileExportOptions(ExportOptions, total=False):
 
 
 class ExportedVersion(NamedTuple):
-    """Result of an export."""
+    """Result of the export of a version: its commit, the new folder, and the number of exported clips."""
 
     commit: Commit
     folder: Path

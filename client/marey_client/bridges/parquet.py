@@ -31,7 +31,7 @@ class FilePlace(NamedTuple):
 
     @property
     def following(self) -> FilePlace:
-        """The numbers of the next file."""
+        """The place of the next file: in the same folder, or in the next folder if this one is full."""
         last = self.file == MOST_FILES_PER_CHUNK - 1
         return FilePlace(self.chunk + 1, 0) if last else FilePlace(self.chunk, self.file + 1)
 

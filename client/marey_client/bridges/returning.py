@@ -54,7 +54,7 @@ class ReturningFolder:
 
     @property
     def unit(self) -> LengthUnit | None:
-        """The unit of length of the motion files."""
+        """The unit of length of the motion files; None if the sidecar does not name one."""
         return self.sidecar.unit
 
     @cached_property

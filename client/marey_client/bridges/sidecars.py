@@ -72,7 +72,7 @@ def begun_table(file: TextIO) -> Any:
 
 
 def write_table(file: TextIO, clips: Iterable[ExportedClip]) -> None:
-    """Write a whole table of take records."""
+    """Write the table of take records of all `clips` to a file, as CSV."""
     begun_table(file).writerows((clip.path, *record_cells(clip)) for clip in clips)
 
 

@@ -46,7 +46,7 @@ class DatasetToExport(DatasetReader, Protocol):
 
 
 class ExportOptions(TypedDict, total=False):
-    """Options of every export of a version."""
+    """Keyword arguments that every export of a version accepts."""
 
     path: str
     """Folder of entries to which the export is limited; default: all entries."""

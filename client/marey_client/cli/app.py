@@ -87,12 +87,12 @@ class CommandGroup(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def make_context(self, *given: Any, **more: Any) -> Any:
-        """Parse the arguments of `marey` itself."""
+        """Parse the global options of `marey`; errors are in plain words."""
         with usage_in_plain_words():
             return super().make_context(*given, **more)
 
     def invoke(self, ctx: Any) -> Any:
-        """Parse the arguments of the command, and run it."""
+        """Parse the arguments of the command, and run it; errors of usage are in plain words."""
         with usage_in_plain_words():
             return super().invoke(ctx)
 

@@ -80,7 +80,7 @@ def list_projects(context: typer.Context, as_json: AsJson = False) -> None:
 
 @project.command("show")
 def show_project(context: typer.Context, name: ProjectName, as_json: AsJson = False) -> None:
-    """Show a project."""
+    """Show a project: its title, purpose and visibility, and your role in it."""
     with connect(context) as marey:
         found = marey.project(name).read()
     if as_json:

@@ -17,7 +17,7 @@ class AnnotationHandle(ItemHandle):
     """Handle of an annotation: one layer of segments and keyframes over a clip."""
 
     def document(self, *, revision: int | None = None) -> Annotation:
-        """Return the annotation's clip, segments and keyframes."""
+        """Return the part `annotation`: the annotated clip, segments and keyframes; default: of the newest revision."""
         return Annotation.model_validate(self.part("annotation", revision=revision))
 
     def apply(self, commands: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, message: str = "") -> Item:

@@ -30,11 +30,11 @@ class Findings:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The main numbers of the result."""
+        """The main numbers of the job's result, by name."""
         return {name: value for name, value in (self.job.result or {}).items() if name not in FILES}
 
     def document(self) -> dict[str, Any]:
-        """Return all results; arrays are numpy arrays."""
+        """Return the document with all results of the job; arrays are numpy arrays."""
         return dict(decode_tree(Blobs(self.transport).fetch(self._blob("document")), JSON))
 
     def report(self) -> bytes:

@@ -81,7 +81,7 @@ class StudyHandle(ItemHandle):
         return Findings(self.transport, Jobs(self.transport).run(self.project, request, on_progress=on_progress))
 
     def analyse_request(self, **options: Unpack[AnalyseStudyKeywords]) -> JobCreate:
-        """Return the job request of `analyse`."""
+        """Return the job request that `analyse` submits; `options` are those of `AnalyseStudyParams`."""
         params = checked(AnalyseStudyParams, options)
         return job_request("analyse_study", {"study": self.as_input()}, params)
 

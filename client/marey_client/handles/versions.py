@@ -73,7 +73,7 @@ class DatasetHandle:
         return self.transport.get(Dataset, self.url)
 
     def delete(self) -> None:
-        """Delete the dataset; its items stay."""
+        """Delete the dataset with its versions; the items of the project stay."""
         self.transport.send("DELETE", self.url, headers=ANY_STATE)
 
     @property
@@ -321,7 +321,7 @@ class DatasetHandle:
             return None
 
     def create_branch(self, name: str, at: str = MAIN) -> Ref:
-        """Create a branch at a version."""
+        """Create a branch that begins at the version `at`. Raises `Conflict` if the name is taken."""
         return self._create(checked(RefCreate, name=name, kind=RefKind.BRANCH, at=at))
 
     def create_tag(self, name: str, at: str = MAIN) -> Ref:

@@ -71,7 +71,7 @@ class ExportCheck(ConsentOverride):
 
 
 class ExportPermission(Answer):
-    """Permission to export revisions."""
+    """Answer to a check of consents: the revisions may be exported."""
 
     ended: tuple[str, ...] = Field(
         description="Ids of the items whose consent has ended, but whose export the request allows."
@@ -79,7 +79,7 @@ class ExportPermission(Answer):
 
 
 class ReceivedRevision(Request):
-    """Revision from an archive or another server."""
+    """Revision that is sent from an archive or another server: kind, documents and facets."""
 
     content: Digest = Field(
         description="Content digest of the revision, which the server compares with the digest of the documents."

@@ -53,7 +53,7 @@ class EntryDifference(Answer):
 
 
 class DatasetDifference(Answer):
-    """Difference of two versions of a dataset."""
+    """Difference between two versions of a dataset: the entries that differ, and their numbers."""
 
     before: Commit
     after: Commit

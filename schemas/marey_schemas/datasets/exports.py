@@ -22,7 +22,7 @@ class ExportedRecord(RecordingFacts):
 
 
 class ExportedSource(Answer):
-    """File from which a clip was imported."""
+    """File from which an exported clip was imported: its name, digest and format."""
 
     name: str | None = None
     digest: str
@@ -84,7 +84,7 @@ class ExportedIdentity(Answer):
 
 
 class ExportedFolder(ExportedIdentity):
-    """The sidecar `marey.json`."""
+    """The sidecar `marey.json` of an exported folder: the version, the files, and the description of each clip."""
 
     schema_: Literal["marey/export@1"] = Field(alias="schema")
     layout: Layout

@@ -98,7 +98,7 @@ class CheckReport(Request):
 
 
 class ProposalMerge(Request):
-    """Request to merge a proposal."""
+    """Request to merge a proposal now, or as soon as all requirements are met."""
 
     message: Message = Field("", description="Message of the commit; empty: the number and title of the proposal.")
     resolutions: tuple[Resolution, ...] = Field((), max_length=10_000)
@@ -182,7 +182,7 @@ class Review(Answer):
 
 
 class ProposalCheck(Answer):
-    """A check of one commit of a proposal."""
+    """Check of one commit of a proposal by a program, such as a job: its state and result."""
 
     name: str
     state: CheckState

@@ -143,7 +143,7 @@ class SkeletonDifference(Answer):
 
 
 class MotionDifference(Answer):
-    """Differences between two motions."""
+    """Differences between two motions: skeleton, timing, joints, and the path of the body."""
 
     frames: tuple[int, int]
     frame_rate_hz: tuple[float, float]
@@ -208,7 +208,7 @@ class MappedJoint(Answer):
 
 
 class MappingDifference(Answer):
-    """Differences between two mappings of joints."""
+    """Differences between the joint mappings of two skeletons."""
 
     joints: tuple[MappedJoint, ...] = ()
     axes: tuple[str, ...] = Field((), description="Joints whose anatomical axes differ.")

@@ -18,7 +18,7 @@ NodeName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 
 
 class GraphPlace(Request):
-    """Reference to a motion primitive of an action."""
+    """Reference to a motion primitive: the names of its action and of the primitive."""
 
     action: NodeName
     primitive: NodeName

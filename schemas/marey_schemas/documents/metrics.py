@@ -214,7 +214,7 @@ class MetricDocument(Request):
         return document_digest(tree)
 
     def stored(self) -> dict[str, Any]:
-        """Return the document as it is stored."""
+        """Return the document as JSON, in the form in which it is stored."""
         return self.model_dump(mode="json", by_alias=True)
 
 
@@ -226,7 +226,7 @@ class MetricIdentity(Request):
 
     @classmethod
     def of(cls, metric: MetricDocument) -> MetricIdentity:
-        """Return the identity of a metric."""
+        """Return the identity (name and digest) of a metric."""
         return cls(name=metric.name, digest=metric.identity_digest())
 
 
@@ -267,7 +267,7 @@ def published_component(measurement: Measurement, shaping: Shaping, share: float
 
 
 def classes_of(measurement: Measurement) -> tuple[str, ...]:
-    """Return the joint classes of a measurement."""
+    """Return the joint classes that a measurement compares; angles leave out `hand` and `toe`."""
     return tuple(name for name in JOINT_CLASS_NAMES if measurement != "angles" or name not in WITHOUT_ANGLES)
 
 

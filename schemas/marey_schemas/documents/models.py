@@ -139,7 +139,7 @@ class ExampleNotes(Noted):
 
 
 class TrainingNotes(Noted):
-    """Quality of a model, in numbers."""
+    """Measured quality of a model: likelihood and error of each training example, and further numbers."""
 
     examples: tuple[ExampleNotes, ...] = Field((), description="One entry for each training example.")
 

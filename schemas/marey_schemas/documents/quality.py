@@ -217,7 +217,7 @@ class QualityChange(Request):
 
 
 class QualityDocument(Request):
-    """Result of a job of the kind `quality`."""
+    """Result of a job of the kind `quality`: the measures of each clip, totals, and a comparison with a reference."""
 
     schema_: Literal["marey/quality@1"] = Field("marey/quality@1", alias="schema")
     code_version: str = Field(description="Version of Marey.")

@@ -32,7 +32,7 @@ class SkeletonMergeRequest(Request):
 
 
 class NamedSkeleton(Answer):
-    """Skeleton, with its path in the project."""
+    """Skeleton in a merge: its id, and its path in the project."""
 
     id: str
     path: str

@@ -71,7 +71,7 @@ class NamedCommand(Tagged):
 
 
 class Trim(NamedCommand):
-    """Keep a range of frames."""
+    """Keep a range of frames, and remove all frames before and after it."""
 
     examples: ClassVar[Examples] = ({"start": 10, "stop": 170}, {"start": 3})
     command: Literal["trim"] = "trim"
@@ -102,7 +102,7 @@ class Split(NamedCommand):
 
 
 class Concatenate(NamedCommand):
-    """Append another clip of the same skeleton."""
+    """Append another clip of the same skeleton, with a blend where the clips meet."""
 
     examples: ClassVar[Examples] = (
         {"source": EXAMPLE_SOURCE},
@@ -182,7 +182,7 @@ class CutLoop(NamedCommand):
 
 
 class Translate(NamedCommand):
-    """Shift the whole motion."""
+    """Shift the whole motion in the world."""
 
     examples: ClassVar[Examples] = ({"shift_m": [1.0, 0.5, -2.0]},)
     command: Literal["translate"] = "translate"
@@ -363,7 +363,7 @@ class Smooth(NamedCommand):
 
 
 class RotateJoint(NamedCommand):
-    """Add a rotation to a joint."""
+    """Turn a joint by the same rotation in all frames of a range, in addition to its motion."""
 
     examples: ClassVar[Examples] = ({"joint": "LeftArm", "angle_deg": 20.0, "axis": [0.0, 1.0, 0.0], "space": "world"},)
     command: Literal["rotate_joint"] = "rotate_joint"

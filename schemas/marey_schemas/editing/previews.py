@@ -44,7 +44,7 @@ class EditPreviewRequest(Request):
 
 
 class EditPreview(Answer):
-    """Frames of the result of an edit."""
+    """Frames of the result of an edit that was computed but not stored."""
 
     pieces: int = Field(description="Number of clips that result from the edit of the clip.")
     frame_count: int = Field(description="Number of frames of the whole result.")

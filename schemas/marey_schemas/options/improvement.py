@@ -32,7 +32,7 @@ class ObjectiveOptions(Options):
 
 
 class ObjectiveChoice(Options):
-    """Objective that a computation minimises."""
+    """Base of options with the objective that suggestions, optimisations and sweeps minimise."""
 
     objective: ObjectiveOptions = Field(
         ObjectiveOptions(), description="Weights of the objective: the cost of a set of clips."
@@ -79,7 +79,7 @@ class ConfirmedEffects(ObjectiveChoice):
 
 
 class SuggestionOptions(ConfirmedEffects):
-    """Options that select the suggestions to compute."""
+    """Options of `suggest`: how many suggestions are computed, and when clips count as duplicates."""
 
     removals: int = Field(
         10,
@@ -133,7 +133,7 @@ class SuggestionOptions(ConfirmedEffects):
 
 
 class OptimisationOptions(ConfirmedEffects):
-    """Limits of an optimisation."""
+    """Limits of an optimisation of a set of clips: gain, steps, tries, and duration."""
 
     least_gain: float = Field(
         0.0,

@@ -87,7 +87,7 @@ class ForkServer:
 
     @property
     def alive(self) -> bool:
-        """Whether children can be forked."""
+        """Whether the fork server runs, so that children can be forked."""
         return not self._ended and self._process is not None and self._process.alive
 
     def fork(self) -> ForkedChild:
@@ -296,7 +296,7 @@ def _carry_out(
 def _run_child(
     serve: Callable[[Connection], None], connected: socket.socket, others: Sequence[Connection | socket.socket]
 ) -> None:
-    """Run the forked child; does not return."""
+    """Run `serve` in the forked child, then end the process; never returns."""
     status = 1
     try:
         signal.set_wakeup_fd(-1)

@@ -93,7 +93,7 @@ class CommitConflict(Answer):
 
 
 class JobCommit(Answer):
-    """Commit that a job makes of its outputs."""
+    """Commit of the outputs of a job to a branch: the plan until the job ends, then the result."""
 
     dataset: str
     branch: str

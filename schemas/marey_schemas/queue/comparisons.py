@@ -57,7 +57,7 @@ class Curve(Answer):
 
 
 class Curves(Answer):
-    """Curves of a run by field."""
+    """Curves (values over steps) of a run, by the name of the logged field."""
 
     curves: dict[Annotated[str, StringConstraints(max_length=LONGEST_NAME)], Curve] = Field(max_length=MOST_CURVES)
 
@@ -127,7 +127,7 @@ class ComparedSetting(Answer):
 
 
 class RunComparison(Answer):
-    """Comparison of the succeeded runs of a script."""
+    """Comparison of the succeeded runs of a script: columns, runs, and settings with means over replicates."""
 
     subject: str = Field(description="Name of the script.")
     columns: tuple[ComparedColumn, ...]

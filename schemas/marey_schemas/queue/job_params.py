@@ -50,7 +50,7 @@ class SuffixedResults(TaggedResults):
 
 
 class AlignParams(AlignOptions, MetricChoice, SuffixedResults):
-    """Parameters of jobs of the kind `align`."""
+    """Parameters of jobs of the kind `align`, which align examples of one action with each other."""
 
     layer: LayerName | None = Field(
         None, description="Layer of the annotations to use; required if a clip has annotations of several layers."
@@ -69,14 +69,14 @@ _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
 
 
 class AnnotateParams(TaggedResults):
-    """Parameters of jobs of the kind `annotate`."""
+    """Parameters of jobs of the kind `annotate`, which propose segments and keyframes of clips."""
 
     proposal: Proposal = Field(description="Method that proposes segments and keyframes, with its options.")
     layer: LayerName | None = Field(None, description="Name of the layer; default: the name of the method.")
 
 
 class CutParams(TaggedResults):
-    """Parameters of jobs of the kind `cut`."""
+    """Parameters of jobs of the kind `cut`, which cut clips along segments of annotations."""
 
     layer: LayerName | None = Field(None, description="Layer of the annotations to use; absent: all layers.")
     labels: tuple[Label, ...] = Field(
@@ -146,7 +146,7 @@ MOST_EVALUATION_TASKS = 64
 
 
 class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
-    """Parameters of jobs of the kind `evaluate`."""
+    """Parameters of jobs of the kind `evaluate`, which evaluate locomotion clips by motion matching."""
 
     name: ItemName = Field("evaluation", description="Name of the result.")
     loops: tuple[ItemId, ...] = Field(
@@ -210,7 +210,7 @@ WEIGHT_GROUPS = len(FeatureWeights.model_fields.keys() - {"extra_joints"})
 
 
 class CompareParams(Request):
-    """Parameters of jobs of the kind `compare`."""
+    """Parameters of jobs of the kind `compare`, which compare evaluations."""
 
     title: str = Field(
         "", max_length=200, description="Title of the report; default: the names of the two evaluations."
@@ -219,7 +219,7 @@ class CompareParams(Request):
 
 
 class AnalyseStudyParams(Request):
-    """Parameters of jobs of the kind `analyse_study`."""
+    """Parameters of jobs of the kind `analyse_study`, which analyse the judgements of a study."""
 
     title: str = Field("", max_length=200, description="Title of the report; default: the title of the study.")
     report: bool = Field(True, description="Write the report, a self-contained HTML page.")
@@ -239,7 +239,7 @@ CLIPS_PER_BLOCK = 50
 
 
 class DistancesParams(DistanceOptions, MetricChoice):
-    """Parameters of jobs of the kind `distances`."""
+    """Parameters of jobs of the kind `distances`, which measure perceptual distances of clips."""
 
     loops: tuple[ItemId, ...] = Field(
         (), max_length=MOST_COMPARED_CLIPS, description="Clips that are loops, in addition to those tagged `loop`."
@@ -257,7 +257,7 @@ def count_distance_tasks(_params: DistancesParams, clips: int) -> int:
 
 
 class QualityParams(QualityOptions):
-    """Parameters of jobs of the kind `quality`."""
+    """Parameters of jobs of the kind `quality`, which measure defects of clips."""
 
     draws: int = Field(
         1000,
@@ -270,15 +270,15 @@ class QualityParams(QualityOptions):
 
 
 class SuggestParams(SuggestionOptions, MetricChoice):
-    """Parameters of jobs of the kind `suggest`."""
+    """Parameters of jobs of the kind `suggest`, which find clips to remove from a set or to add."""
 
 
 class OptimiseParams(OptimisationOptions):
-    """Parameters of jobs of the kind `optimise`."""
+    """Parameters of jobs of the kind `optimise`, which improve a set of clips step by step."""
 
 
 class SweepParams(SweepOptions):
-    """Parameters of jobs of the kind `sweep`."""
+    """Parameters of jobs of the kind `sweep`, which repeat an evaluation with other weights."""
 
 
 def count_sweep_tasks(params: SweepParams) -> int:
@@ -287,7 +287,7 @@ def count_sweep_tasks(params: SweepParams) -> int:
 
 
 class ModelParams(ModelOptions, TaggedResults):
-    """Parameters of jobs of the kind `model`."""
+    """Parameters of jobs of the kind `model`, which train a generative model of an action."""
 
     name: ItemName = Field("model", description="Name of the model, and also of the action that it generates.")
     report: bool = Field(True, description="Write the report and its figures.")
@@ -299,7 +299,7 @@ class ModelParams(ModelOptions, TaggedResults):
 
 
 class TreeParams(TreeOptions):
-    """Parameters of jobs of the kind `tree`."""
+    """Parameters of jobs of the kind `tree`, which build the sample tree of a model."""
 
     def unclear_place(self, into: str) -> str | None:
         """Return the reason why the tree cannot be stored in a collection, or None if it can."""
@@ -307,7 +307,7 @@ class TreeParams(TreeOptions):
 
 
 class EditParams(SuffixedResults):
-    """Parameters of jobs of the kind `edit`."""
+    """Parameters of jobs of the kind `edit`, which apply commands to clips."""
 
     commands: tuple[EditCommand, ...] = Field(
         (),
@@ -342,7 +342,7 @@ class EditParams(SuffixedResults):
 
 
 class ImportParams(ImportOptions):
-    """Parameters of jobs of the kind `import`."""
+    """Parameters of jobs of the kind `import`, which import files."""
 
     files: tuple[ImportFile, ...] = Field(
         min_length=1, max_length=10_000, description="Names and digests of the files."
@@ -350,13 +350,13 @@ class ImportParams(ImportOptions):
 
 
 class IndexParams(Request):
-    """Parameters of jobs of the kind `index`."""
+    """Parameters of jobs of the kind `index`, which index the poses of clips for searches."""
 
     name: ItemName = Field("motion-index", description="Name of the index; an index with this name is replaced.")
 
 
 class RetargetParams(RetargetOptions, SuffixedResults):
-    """Parameters of jobs of the kind `retarget`."""
+    """Parameters of jobs of the kind `retarget`, which transfer motions to another skeleton."""
 
     scale: float | None = Field(
         None, gt=0, lt=1000, description="Scale of the root's path; absent: the ratio of the hip heights."

@@ -163,7 +163,7 @@ CacheMode = Literal["use", "refresh", "off"]
 
 
 class JobCreate(Request):
-    """Request to submit a job."""
+    """Request to submit a job: its kind, inputs and parameters, and how it is to run."""
 
     kind: str = Field(min_length=1, max_length=64)
     inputs: dict[str, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
@@ -217,7 +217,7 @@ class JobFailure(Answer):
 
 
 class JobOutput(Answer):
-    """Revision created by a job."""
+    """Output of a job: the revision of an item that the job created, or found unchanged."""
 
     name: str
     item: str
@@ -325,6 +325,6 @@ class JobBatch(Request):
 
 
 class JobList(Answer):
-    """Jobs in the order of submission."""
+    """Jobs of one request, in the order in which they were given."""
 
     jobs: tuple[Job, ...]

@@ -80,7 +80,7 @@ class ScheduleChange(Request):
 
 
 class Schedule(Answer):
-    """Schedule of a project."""
+    """Schedule of a project: a job, and the times at which the server submits it."""
 
     name: str
     project: str

@@ -308,12 +308,12 @@ class ScriptCreate(ScriptDeclaration):
 
     @property
     def declaration(self) -> ScriptDeclaration:
-        """The script without its name and description."""
+        """The declaration of the script, without its name and description."""
         return ScriptDeclaration.model_validate(self.model_dump(exclude={"name", "description"}))
 
 
 class Script(Answer):
-    """Script of a project."""
+    """Script that is registered in a project, with the user who registered it."""
 
     name: str
     project: str
@@ -339,7 +339,7 @@ class ScriptParams(ConsentOverride):
 
 
 class ScriptRunCreate(ConsentOverride):
-    """Request to run a script."""
+    """Request to run a script as a job, with values for its parameters and inputs."""
 
     values: dict[FieldName, Value] = Field(
         default_factory=dict, max_length=MOST_DECLARED, description="Values of the parameters."

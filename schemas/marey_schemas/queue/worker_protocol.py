@@ -160,7 +160,7 @@ class HeartbeatAnswer(Answer):
 
 
 class StagedOutput(Request):
-    """Staged result, invisible until the attempt completes."""
+    """Result of an attempt that is staged: it becomes visible when the attempt completes."""
 
     name: str = Field(
         min_length=1, max_length=1500, description="Name that is unique within the attempt; other outputs refer to it."
@@ -224,7 +224,7 @@ class CompleteRequest(Request):
 
 
 class FailRequest(Request):
-    """Report of a failed attempt."""
+    """Report of a worker that its attempt has failed, with the reason."""
 
     write_id: str = Field(min_length=8, max_length=64)
     code: str = Field(min_length=1, max_length=LONGEST_CODE)
@@ -243,7 +243,7 @@ class FailRequest(Request):
 
 
 class BatchCompletion(CompleteRequest):
-    """Completion of one job in a batch."""
+    """Completion of one job in a request that completes many."""
 
     job: str
     fence: int
@@ -256,7 +256,7 @@ class BatchCompleteRequest(Request):
 
 
 class CompleteAnswer(Answer):
-    """Results that a successful job published."""
+    """Answer to the completion of a job: the published results."""
 
     job: str
     state: JobState

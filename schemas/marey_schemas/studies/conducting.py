@@ -38,7 +38,7 @@ class NewStudyLink(Answer):
 
 
 class NewStudyLinks(Answer):
-    """New links of a study."""
+    """New links of a study, one for each participant."""
 
     revision: int = Field(description="Revision of the study that these participants see.")
     expires_at: datetime
@@ -46,7 +46,7 @@ class NewStudyLinks(Answer):
 
 
 class StudyParticipant(Answer):
-    """A participant, under a pseudonym."""
+    """Participant of a study, under a pseudonym: state and progress."""
 
     id: str
     participant: str = Field(description="Pseudonym, such as p1.")
@@ -111,7 +111,7 @@ class JudgedTrial(Answer):
 
 
 class JudgingParticipant(Answer):
-    """The trials of one participant."""
+    """Participant of a study, under a pseudonym, with the trials that were shown."""
 
     participant: str = Field(description="Pseudonym, such as p1.")
     finished: bool

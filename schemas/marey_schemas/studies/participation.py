@@ -59,7 +59,7 @@ class ParticipationCreate(Request):
 
 
 class Participation(Answer):
-    """Progress of a participant."""
+    """State of a participant: what the study asks for, and the trials answered so far."""
 
     title: str
     clips: int = Field(description="Number of motions. The motions are numbered from 0.")

@@ -191,7 +191,7 @@ def show_user(
     name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show a user; default: yourself."""
+    """Show a user: names, rights and state; default: yourself."""
     with connect(context) as marey:
         found = marey.users.get(name) if name else marey.me()
     if as_json:

@@ -137,7 +137,7 @@ def _at_path(one: ListedCommit) -> str:
 
 @dataset.command("show")
 def show(context: typer.Context, place: VersionPlace, as_json: AsJson = False) -> None:
-    """Show the commit that a version names."""
+    """Show the commit that a version names: digest, parents, author, time, message and number of entries."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).at(at.version)
@@ -191,7 +191,7 @@ def branch(
     place: VersionPlace,
     name: Annotated[str, typer.Argument(help="Name of the new branch.")],
 ) -> None:
-    """Create a branch at a version."""
+    """Create a branch that begins at a version."""
     at = parse(place, version=True)
     with connect(context) as marey:
         made = at.on(marey).create_branch(name, at.version)

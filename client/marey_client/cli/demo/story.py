@@ -57,7 +57,7 @@ def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json:
 
 @dataclass
 class Story:
-    """Steps of the demonstration in one project."""
+    """The demonstration in one project, step by step."""
 
     project: ProjectHandle
     files: FoundFiles

@@ -167,7 +167,7 @@ def mark(
     move_to: Annotated[int | None, typer.Option("--move", min=0, help="Move the keyframe to this frame.")] = None,
     remove_it: Annotated[bool, typer.Option("--remove", help="Remove the keyframe.")] = False,
 ) -> None:
-    """Add, move or remove a keyframe."""
+    """Add a keyframe; with --move or --remove, move it or remove it."""
     if move_to is not None and remove_it:
         raise WrongUsage("give only one of --move and --remove")
     if move_to is not None:

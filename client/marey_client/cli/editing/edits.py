@@ -58,7 +58,7 @@ def apply_edit(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Apply commands to clips, as a job."""
+    """Apply commands, or a saved edit, to clips as a job; the results are new clips or new revisions."""
     addresses = addresses_in_one_project(sources)
     if not (into or params.get("suffix") or params.get("in_place")):
         raise WrongUsage(

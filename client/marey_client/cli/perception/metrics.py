@@ -233,6 +233,6 @@ def _print_distances(document: Mapping[str, Any]) -> None:
 
 
 def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document with its tables as lists."""
+    """Return a document in which lists replace numpy arrays, so that it can be printed as JSON."""
     tables = {name: part.tolist() for name, part in document["components"].items()}
     return {**document, "distances": document["distances"].tolist(), "components": tables}

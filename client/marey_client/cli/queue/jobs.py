@@ -185,7 +185,7 @@ def list_jobs(
 
 @job.command("show")
 def show_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
-    """Show a job and its attempts."""
+    """Show a job with its state, inputs and result, and its attempts."""
     from marey_schemas.queue.jobs import commits_of
 
     with connect(context) as marey:
@@ -207,7 +207,7 @@ def show_log(
     job_id: JobId,
     go_on: Annotated[bool, typer.Option("--follow", "-f", help="Follow the log until the job has ended.")] = False,
 ) -> None:
-    """Print the log of a job."""
+    """Print the log of a job, of all its attempts."""
     with connect(context) as marey:
         for piece in marey.jobs.log(job_id, follow=go_on):
             typer.echo(piece, nl=False)

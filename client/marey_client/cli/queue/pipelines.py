@@ -251,7 +251,7 @@ def _print_shortfalls(run: PipelineRun) -> None:
 
 
 def print_steps(run: PipelineRun, as_json: bool) -> None:
-    """Print the state of each job."""
+    """Print a table with the state of the job of each step."""
     if as_json:
         print_json({"jobs": dict(run.steps)})
     else:

@@ -25,7 +25,7 @@ ANALYSE = OptionsOf("marey_schemas.queue.job_params:AnalyseStudyParams")
 
 
 class ExportForm(StrEnum):
-    """Form of exported judgements."""
+    """Form of the file with exported judgements: trials as JSON or CSV, or compared pairs as CSV."""
 
     JSON = "json"
     CSV = "csv"

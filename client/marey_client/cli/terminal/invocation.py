@@ -41,7 +41,7 @@ AllowExpiredConsent = Annotated[
 
 @dataclass(frozen=True)
 class Invocation:
-    """Global options of `marey`."""
+    """Values of the global options of `marey` in one call: server, token file, and verbosity."""
 
     server: str | None
     token_file: Path | None
