@@ -96,7 +96,9 @@ class Blobs:
         return target
 
     def fetch_into(self, digest: str, file: BufferedRandom) -> None:
-        """Download a blob into an empty file that is open for reading and writing; leave the position at its end."""
+        """Download a blob into an empty file that is open for reading and writing; the file's position is then at the
+        end.
+        """
 
         def once() -> None:
             start = file.tell()

@@ -188,7 +188,7 @@ class RecordedFrame:
 
 
 class DisplayedFrames:
-    """Recorded frames behind the rows of an evaluation's database for motion matching."""
+    """Lookup of the recorded frame from which a row of an evaluation's motion matching database was computed."""
 
     def __init__(self, evaluation: EvaluationHandle, document: dict[str, Any]) -> None:
         self.rate_hz = float(document["options"]["database"]["rate_hz"])

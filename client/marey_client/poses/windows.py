@@ -16,7 +16,7 @@ SplitBy = Literal["subject", "take", "clip"]
 
 
 class MotionWindow(NamedTuple):
-    """Range of frames of a clip, from `first` on."""
+    """Window of frames of a clip, which begins at the frame `first`."""
 
     clip: PosesHandle
     first: int

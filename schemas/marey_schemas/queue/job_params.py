@@ -364,4 +364,4 @@ class RetargetParams(RetargetOptions, SuffixedResults):
 
 
 class ExportParams(MotionFileOptions, ConsentOverride):
-    """Parameters of jobs of the kind `export`: one archive of files."""
+    """Parameters of jobs of the kind `export`, which write clips to files in one archive."""

@@ -235,7 +235,7 @@ def change_password(
 
 @user.command("disable")
 def disable_user(context: typer.Context, name: UserName) -> None:
-    """Disable a user; the data of the user is kept."""
+    """Disable a user: password and tokens of the user do not work any more. The data of the user is kept."""
     with connect(context) as marey:
         marey.users.disable(name)
     print_message(f"{name} is disabled; to undo this, run marey user enable {name}")

@@ -124,7 +124,7 @@ class Story:
         return sorted((clip for clip in clips if _source_path(clip) in sources), key=lambda clip: clip.path)
 
     def _target(self) -> SkeletonHandle:
-        """Return the second skeleton, created on the first run."""
+        """Return the skeleton to which takes are retargeted; it is created on the first run."""
         found = next(self.project.skeletons.list(path=f"{TAKES}/{SKELETON}"), None)
         return found or self.project.skeletons.create(SKELETON, _game_skeleton_parts(), collection=TAKES)
 

@@ -18,7 +18,10 @@ FORMULA_SIGNS = tuple("=+-@\t\r")
 
 
 class RunTable(NamedTuple):
-    """Table of exact values; `numeric` are the headings of columns of numbers, `best` the best cells (row, column)."""
+    """Table of exact values.
+
+    `numeric`: headings of the columns of numbers; `best`: the best cells, as (row, column).
+    """
 
     heads: tuple[str, ...]
     rows: list[list[Value | None]]
