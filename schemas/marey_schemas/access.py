@@ -179,7 +179,9 @@ class Token(Answer):
     labels: dict[str, str] | None = Field(
         None, description="The labels that a worker with this token may announce; null: any."
     )
-    successor_of: str | None = Field(None, description="The id of the token that this token replaced in a rotation.")
+    successor_of: str | None = Field(
+        None, description="The id of the token that this token replaced in a rotation; null: it replaced none."
+    )
 
 
 class NewToken(Token):
@@ -239,9 +241,18 @@ class QuotaChange(Request):
     An absent limit stays as it is; null means the limit in the server's settings.
     """
 
-    items: int | None = Field(None, ge=0, le=2**53, description="Largest number of items.")
+    items: int | None = Field(
+        None,
+        ge=0,
+        le=2**53,
+        description="Largest number of items; absent: unchanged; null: the limit in the server's settings.",
+    )
     stored_bytes: int | None = Field(
-        None, ge=0, le=2**53, description="Largest total size of all revisions of the items, in bytes."
+        None,
+        ge=0,
+        le=2**53,
+        description="Largest total size of all revisions of the items, in bytes; absent: "
+        "unchanged; null: the limit in the server's settings.",
     )
 
 

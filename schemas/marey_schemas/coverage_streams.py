@@ -118,7 +118,9 @@ class CoverageFrames(Request):
         ge=0, le=2**53, description="Number of frames that were sent before the frames of this request."
     )
     poses: Annotated[NDArray[Any], ArrayOf(ndim=2)] | None = Field(
-        None, description="[frames, 3 + 4*joints]: root translation (m), then local quaternions w,x,y,z."
+        None,
+        description="[frames, 3 + 4*joints]: root translation (m), then local quaternions w,x,y,z; an "
+        "alternative to `roots`.",
     )
     translations: Annotated[NDArray[Any], ArrayOf(ndim=3, columns=3)] | None = Field(
         None, description="[frames, k, 3]: local translations (m) that replace the joints' offsets; only with poses."
@@ -128,7 +130,8 @@ class CoverageFrames(Request):
     )
     roots: Annotated[NDArray[Any], ArrayOf(ndim=2, columns=3)] | None = Field(
         None,
-        description="[frames, 3]: x and z of the torso on the ground (m), heading of the body (rad), not smoothed.",
+        description="[frames, 3]: x and z of the torso on the ground (m), heading of the body (rad), not "
+        "smoothed; an alternative to `poses`.",
     )
     ends_take: bool = Field(
         False,
@@ -186,7 +189,10 @@ class Performer(Answer):
     speed_m_s: float | None = Field(description="Speed in metres per second; null during the first second of a take.")
     turn_rate_deg_s: float | None
     forward_m_s: float | None
-    strafe_m_s: float | None = Field(description="Speed sideways, in metres per second, positive to the left.")
+    strafe_m_s: float | None = Field(
+        description="Speed sideways, in metres per second, positive to the left; "
+        "null during the first second of a take."
+    )
 
 
 class CoverageNow(Answer):

@@ -47,7 +47,9 @@ class InvitationCreate(InvitationTerms):
 class AccountInvitationCreate(InvitationTerms):
     """Request to invite people who have no account yet; they choose user name and password themselves."""
 
-    project: ProjectName | None = Field(None, description="Project of which the new user becomes a member.")
+    project: ProjectName | None = Field(
+        None, description="Project of which the new user becomes a member; null: of none."
+    )
     role: Role | None = Field(None, description="Role in the project; needed if a project is named.")
 
     @model_validator(mode="after")

@@ -217,7 +217,7 @@ class UploadCreate(Request):
     """Request to begin an upload of bytes in pieces."""
 
     length: int = Field(ge=1, le=16 * 2**30, description="Number of bytes of the whole upload.")
-    digest: Digest | None = Field(None, description="Digest that the complete upload must have.")
+    digest: Digest | None = Field(None, description="Digest that the complete upload must have; null: any.")
 
 
 class Upload(Answer):
@@ -226,7 +226,7 @@ class Upload(Answer):
     id: str
     length: int
     offset: int = Field(description="Number of bytes received, which is where the next piece starts.")
-    digest: str | None = Field(None, description="Digest of the blob, once the upload is complete.")
+    digest: str | None = Field(None, description="Digest of the blob; null until the upload is complete.")
 
 
 class Event(Answer):

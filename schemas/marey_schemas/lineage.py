@@ -89,7 +89,9 @@ class LineageJob(Answer):
     seed: int
     code_versions: tuple[str, ...] = Field((), description="Versions of the code that created the revisions.")
     commits: tuple[str, ...] = Field((), description="Digests of the commits from which the job took its inputs.")
-    commit: str | None = Field(None, description="Digest of the commit that has the outputs of the job.")
+    commit: str | None = Field(
+        None, description="Digest of the commit that the job made of its outputs; absent: it made none."
+    )
     finished_at: datetime | None = None
 
 

@@ -25,7 +25,9 @@ class PurgeRequest(Request):
     One request examines at most `MOST_PURGED` items; `next` in the answer continues the purge.
     """
 
-    item: str | None = Field(None, max_length=64, description="Id of one deleted item.")
+    item: str | None = Field(
+        None, max_length=64, description="Id of one deleted item; absent: the other conditions select the items."
+    )
     path: str | None = Field(
         None, max_length=1300, description="Path, made of folder and name, that deleted items had."
     )
@@ -36,10 +38,15 @@ class PurgeRequest(Request):
     )
     kind: Kind | None = Field(None, description="Kind of the items; absent: all kinds.")
     query: str | None = Field(
-        None, max_length=MOST_CHARACTERS, description="Query that the items meet, such as `subject = 02`."
+        None,
+        max_length=MOST_CHARACTERS,
+        description="Query that the items meet, such as `subject = 02`; absent: any items.",
     )
     older_than_days: int | None = Field(
-        None, ge=0, le=100_000, description="Only items that were deleted at least this number of days ago."
+        None,
+        ge=0,
+        le=100_000,
+        description="Only items that were deleted at least this number of days ago; absent: all.",
     )
     preview: bool = Field(False, description="Report what a purge would do, but change nothing.")
     after: str | None = Field(

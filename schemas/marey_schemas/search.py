@@ -170,7 +170,7 @@ class SearchAnswer(Answer):
 
 MOST_MOMENTS = 100
 LONGEST_EXAMPLE_S = 60.0
-"""Longest example in seconds."""
+"""Greatest duration of the example of a search, in seconds."""
 
 _MOST_NUMBER = 2**31 - 1
 

@@ -104,7 +104,9 @@ class LookDirectionConstraint(_AngularConstraint):
 
     type: Literal["look_direction"] = "look_direction"
     joint: Joint
-    direction: Direction | None = Field(None, description="Target direction (x, y, z) in the world.")
+    direction: Direction | None = Field(
+        None, description="Target direction (x, y, z) in the world; an alternative to `point_m`."
+    )
     point_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
         None, description="Target point (x, y, z) in the world, in metres, instead of a direction."
     )

@@ -97,12 +97,18 @@ class Webhook(Answer):
     )
     created_at: datetime
     updated_at: datetime
-    delivered_at: datetime | None = Field(None, description="Time of the last successful delivery.")
+    delivered_at: datetime | None = Field(
+        None, description="Time of the last successful delivery; absent: there was none."
+    )
     failures: int = Field(0, description="Number of failed attempts since the last successful delivery.")
     failing_since: datetime | None = None
-    next_attempt_at: datetime | None = Field(None, description="Time of the next attempt after a failure.")
-    last_status: int | None = Field(None, description="HTTP status of the last answer.")
-    last_error: str | None = Field(None, description="Reason why the last attempt has failed.")
+    next_attempt_at: datetime | None = Field(
+        None, description="Time of the next attempt after a failure; absent: no attempt is planned."
+    )
+    last_status: int | None = Field(None, description="HTTP status of the last answer; absent: there was none.")
+    last_error: str | None = Field(
+        None, description="Reason why the last attempt has failed; absent: it succeeded, or there was none."
+    )
     missed: int = Field(
         0,
         description="Number of events that were deleted before their delivery, and of which "
@@ -149,7 +155,9 @@ class WebhookMessage(Answer):
     at: datetime
     subject: str = Field(description="Id of the object of the event.")
     links: dict[str, str] = Field(default_factory=dict, description="Paths of the event and its object on the server.")
-    missed: int | None = Field(None, description="Number of missed events, for `webhook.events_missed`.")
+    missed: int | None = Field(
+        None, description="Number of missed events, in messages of the kind `webhook.events_missed`; otherwise absent."
+    )
 
     def encoded(self) -> str:
         """Return the JSON text of the message."""

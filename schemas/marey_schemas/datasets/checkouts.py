@@ -36,8 +36,9 @@ class CheckoutRequest(Request):
     version: Version = MAIN
     query: Annotated[str, StringConstraints(min_length=1, max_length=MOST_CHARACTERS)] | None = Field(
         None,
-        description="Query that selects entries, as in lists of items. The fields `path`, `folder`, `name` and `tag` "
-        "refer to the entry in the folder of the dataset, all other fields to the content of the entry.",
+        description="Query that selects entries, as in lists of items. The fields `path`, `folder`, `name` and "
+        "`tag` refer to the entry in the folder of the dataset, all other fields to the content of "
+        "the entry. Null: all entries.",
     )
     paths: Annotated[tuple[EntryPath, ...], AfterValidator(_not_too_long)] = Field(
         (), max_length=MOST_PATHS, description="Entries, or folders whose entries are selected; empty: all entries."

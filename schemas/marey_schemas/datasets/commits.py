@@ -76,8 +76,8 @@ class CommitCreate(Request):
     )
     write_id: Annotated[str, StringConstraints(min_length=8, max_length=64)] | None = Field(
         None,
-        description="Name that the client chooses for this commit; a repeated request with the same name gets the "
-        "same commit.",
+        description="Name that the client chooses for this commit, if any; a repeated request with the same name "
+        "gets the same commit.",
     )
 
     @model_validator(mode="after")
@@ -111,7 +111,9 @@ class Entry(Answer):
         description="Content digest of each part. Equal parts have the same digest on every server."
     )
     tags: tuple[str, ...]
-    item: str | None = Field(description="Item of this project that has a revision with this content.")
+    item: str | None = Field(
+        description="Item of this project that has a revision with this content; null: no item has one."
+    )
     revision: int | None
 
 

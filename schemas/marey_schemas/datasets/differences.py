@@ -26,13 +26,13 @@ class ListedCommit(Commit):
     )
     moved_from: str | None = Field(
         None,
-        description="If the commit moved a single entry to the path of the list: the path of the entry before the "
-        "move.",
+        description="If the commit moved a single entry to the path of the list: the path of the entry before "
+        "the move; otherwise null.",
     )
     moved_to: str | None = Field(
         None,
-        description="If the commit moved a single entry away from the path of the list: the path of the entry after "
-        "the move.",
+        description="If the commit moved a single entry away from the path of the list: the path of the entry "
+        "after the move; otherwise null.",
     )
 
 

@@ -61,8 +61,10 @@ class ExportedClip(Answer):
         description="Path of the clip's file in the exported folder; null: an episode of the dataset contains "
         "the clip's frames.",
     )
-    digest: str | None = Field(None, description="Digest of the bytes of `file`.")
-    episode: int | None = Field(None, description="Index of the clip's episode.")
+    digest: str | None = Field(None, description="Digest of the bytes of `file`; null if the clip has no file.")
+    episode: int | None = Field(
+        None, description="Index of the clip's episode in a LeRobotDataset; null in other layouts."
+    )
     tags: tuple[str, ...] = ()
     record: ExportedRecord = ExportedRecord()
     source: ExportedSource | None = None
@@ -88,7 +90,7 @@ class ExportedFolder(ExportedIdentity):
 
     schema_: Literal["marey/export@1"] = Field(alias="schema")
     layout: Layout
-    format: str | None = Field(None, description="Format of the motion files.")
-    unit: str | None = Field(None, description="Unit of length in the motion files.")
+    format: str | None = Field(None, description="Format of the motion files; null in a LeRobotDataset.")
+    unit: str | None = Field(None, description="Unit of length in the motion files; null in a LeRobotDataset.")
     licences: tuple[str, ...] = Field((), description="Different licences in the take records of the clips.")
     clips: tuple[ExportedClip, ...] = ()

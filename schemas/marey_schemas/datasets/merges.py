@@ -64,8 +64,8 @@ class CombineRequest(Request):
     )
     write_id: Annotated[str, StringConstraints(min_length=8, max_length=64)] | None = Field(
         None,
-        description="Name that the client chooses for this change; a repeated request with the same name gets the "
-        "same commit.",
+        description="Name that the client chooses for this change, if any; a repeated request with the same name "
+        "gets the same commit.",
     )
 
 

@@ -36,7 +36,9 @@ class DatasetCreate(Request):
     name: DatasetName
     description: str = Field("", max_length=10_000)
     collection: CollectionPath | None = Field(
-        None, description="Folder of the project whose content the commits of this dataset record."
+        None,
+        description="Folder of the project whose content the commits of this dataset record; null: each "
+        "commit lists its changes.",
     )
 
 

@@ -43,9 +43,11 @@ class CommentCreate(Request):
 
     text: Text
     path: EntryPath | None = Field(None, description="Path of the entry; null: the comment concerns the proposal.")
-    kind: Kind | None = Field(None, description="Kind of the entry.")
+    kind: Kind | None = Field(None, description="Kind of the entry; required with `path`.")
     frames: tuple[Frame, Frame] | None = Field(
-        None, description="First frame, and the frame after the last one, of a clip or an annotation."
+        None,
+        description="First frame, and the frame after the last one, of a clip or an annotation; null: the "
+        "comment concerns the whole entry.",
     )
 
     @model_validator(mode="after")
@@ -88,11 +90,12 @@ class CheckReport(Request):
     )
     job: ItemId | None = Field(
         None,
-        description="Job of the project that carries out the check. The state `succeeded` is refused unless this job "
-        "has succeeded. A job whose inputs are versions of datasets must also have read the newest commit.",
+        description="Job of the project that carries out the check. The state `succeeded` is refused unless this "
+        "job has succeeded. A job whose inputs are versions of datasets must also have read the "
+        "newest commit. Null: no job.",
     )
     link: Annotated[str, StringConstraints(max_length=2000, pattern=_LINK)] | None = Field(
-        None, description="Address of a page about the check."
+        None, description="Address of a page about the check; null: there is none."
     )
     text: str = Field("", max_length=MOST_TEXT, description="Result of the check, as text.")
 
@@ -137,7 +140,7 @@ class Proposal(Answer):
     )
     target_commit: str | None = Field(
         description="Digest of the newest commit of the target branch. After the end of the proposal: the commit "
-        "that was the newest just before the end."
+        "that was the newest just before the end. Null: the branch has no commit."
     )
     merged: str | None = Field(
         description="Digest of the commit that the merge made; null if the proposal is not merged."
@@ -146,7 +149,7 @@ class Proposal(Answer):
         description="User on whose behalf the proposal is merged as soon as no requirement is missing; null: nobody "
         "has requested this."
     )
-    ended_by: str | None = Field(description="User who merged or closed the proposal.")
+    ended_by: str | None = Field(description="User who merged or closed the proposal; null while it is open.")
     created_at: datetime
     updated_at: datetime
     ended_at: datetime | None

@@ -45,7 +45,9 @@ class Annotation(Request):
     made_by: Literal["person", "algorithm"] = "person"
     segments: tuple[SegmentDocument, ...] = Field((), description="Segments in the order of their frames.")
     keyframes: tuple[KeyframeDocument, ...] = Field((), description="Keyframes in the order of their frames.")
-    original: StoredOriginal | None = Field(None, description="The file that the annotation was imported from.")
+    original: StoredOriginal | None = Field(
+        None, description="The file that the annotation was imported from; absent: it was not imported."
+    )
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:

@@ -127,8 +127,13 @@ class MetricFit(Request):
     trials: int = Field(ge=1, description="Number of answered trials.")
     pairs: int = Field(ge=1, description="Number of pairs of motions with a known difference.")
     rmse: _Amount = Field(description="Root mean square of fitted minus perceived differences.")
-    r2: _Number | None = Field(None, description="Share of the variance that the fit explains.")
-    spearman: _Number | None = Field(None, description="Rank correlation of fitted and perceived differences.")
+    r2: _Number | None = Field(
+        None, description="Share of the variance that the fit explains; null: the perceived differences do not vary."
+    )
+    spearman: _Number | None = Field(
+        None,
+        description="Spearman's rank correlation of fitted and perceived differences; null: one of them does not vary.",
+    )
     noise_ceiling: _Amount | None = Field(
         None,
         description="Standard error by chance of the perceived differences. A fit with a smaller error describes "
@@ -151,7 +156,7 @@ class MetricDocument(Request):
         "fitted to the judgements of a study."
     )
     study: RevisionRef | OutputRef | None = Field(
-        None, description="The study whose judgements a fitted metric comes from."
+        None, description="The study whose judgements a fitted metric comes from; absent for other metrics."
     )
     components: tuple[MetricComponent, ...] = Field(
         min_length=1, max_length=len(MEASUREMENTS), description="At most one component for each measurement."

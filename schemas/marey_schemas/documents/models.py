@@ -174,12 +174,12 @@ class MotionPrimitiveDocument(Request):
         default_factory=dict, max_length=MOST_KEYFRAMES, description="Canonical frame of each keyframe, by label."
     )
     duration_range_s: tuple[float, float] | None = Field(
-        None, description="Shortest and longest duration of a sample, in seconds."
+        None, description="Shortest and longest duration of a sample, in seconds; absent: not limited."
     )
     log_slope_range: tuple[float, float] | None = Field(
         None,
         description="Lower and upper limit of the temporal function of samples: the range of the examples, "
-        "slightly widened.",
+        "slightly widened. Absent: only a general limit applies.",
     )
     widening: float = Field(
         1.0,
@@ -193,11 +193,11 @@ class MotionPrimitiveDocument(Request):
         description="Method and weights of the channels during training; the functions in this document are "
         "unweighted.",
     )
-    options: dict[str, Any] | None = Field(None, description="Options of the training.")
+    options: dict[str, Any] | None = Field(None, description="Options of the training; absent: unknown.")
     provenance: ModelProvenance = Field(
         default_factory=ModelProvenance, description="The training examples and their origin."
     )
-    training: TrainingNotes | None = Field(None, description="Measured quality of the model.")
+    training: TrainingNotes | None = Field(None, description="Measured quality of the model; absent: not measured.")
 
     @model_validator(mode="after")
     def _check_shapes(self) -> Self:

@@ -74,8 +74,12 @@ class JointAxesDocument(Request):
 class PredecessorSkeletonOrigin(Request):
     """Files of Marey's predecessor that a skeleton was imported from."""
 
-    skeleton: StoredOriginal | None = Field(None, description="The file of the hierarchy.")
-    model: StoredOriginal | None = Field(None, description="The file of the skeleton model: joints and axes.")
+    skeleton: StoredOriginal | None = Field(
+        None, description="The file of the hierarchy; absent if it was not imported."
+    )
+    model: StoredOriginal | None = Field(
+        None, description="The file of the skeleton model (joint mapping and axes); absent if it was not imported."
+    )
     rest: dict[str, Any] = Field(
         default_factory=dict,
         description="Members of the skeleton model that have no counterpart here, such as limits of joints.",
@@ -86,7 +90,9 @@ class SkeletonMapping(Request):
     """Part `mapping` of a skeleton, which users can edit: the joint for each standard joint, and the axes of joints."""
 
     schema_: Literal["marey/skeleton-mapping@1"] = Field("marey/skeleton-mapping@1", alias="schema")
-    rig: str | None = Field(None, description="The known rig whose joint names were recognised.")
+    rig: str | None = Field(
+        None, description="Name of the known rig whose joint names were recognised; absent: none was."
+    )
     method: Literal["names", "geometry", "manual"] = "manual"
     confidence: float = Field(1.0, ge=0.0, le=1.0)
     joints: dict[str, JointName] = Field(

@@ -77,7 +77,11 @@ class PositionConstraint(_Constraint):
     """
 
     kind: Literal["position"] = "position"
-    point_m: Shift | None = Field(None, description="Target position in the world, in metres.")
+    point_m: Shift | None = Field(
+        None,
+        description="Target position in the world, in metres. Without it and "
+        "`shift_m`: the position in the first frame of the range.",
+    )
     shift_m: Shift | None = Field(
         None, description="Shift of the joint from its position in each frame, in metres; an alternative to `point_m`."
     )
@@ -109,7 +113,9 @@ class OrientationConstraint(_Constraint):
 
     kind: Literal["orientation"] = "orientation"
     rotation: Rotation | None = Field(
-        None, description="Target rotation in the world, as a unit quaternion (w, x, y, z)."
+        None,
+        description="Target rotation in the world, as a unit quaternion (w, x, y, z); absent: the rotation "
+        "in the first frame of the range.",
     )
 
 

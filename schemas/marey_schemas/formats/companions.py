@@ -50,7 +50,7 @@ class Pairing:
 
 
 _Files = Sequence[tuple[str, str]]
-"""Files of one folder: the path of each file as given, by its name."""
+"""Files of one folder, each as a pair of the name of the file and its path as given."""
 
 
 def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:

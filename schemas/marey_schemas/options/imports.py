@@ -61,9 +61,10 @@ class ImportOptions(Options):
     )
     end_index: EndIndex | None = Field(
         None,
-        description="Whether a section of an annotation in a file of Marey's predecessor includes its frame `end_idx`, "
-        "as in the predecessor's editor, or ends before this frame, as in its time warping. Absent: exclusive if "
-        "sections would overlap otherwise, else inclusive.",
+        description="Meaning of `end_idx`, the last index of a section in annotation files of Marey's "
+        "predecessor. inclusive: the section includes this frame, as in the predecessor's editor; "
+        "exclusive: it ends before this frame, as in the predecessor's time warping. Absent: "
+        "exclusive if sections would overlap otherwise, else inclusive.",
     )
     replace_skeleton: bool = Field(
         False,

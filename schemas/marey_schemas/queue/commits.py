@@ -61,7 +61,9 @@ class CommitOptions(Options):
     """Options of commands that submit jobs, for the commit of the results to a branch of a dataset."""
 
     commit_to: str | None = Field(
-        None, description="Commit the results to a branch when the job ends: dataset[@branch][/folder]."
+        None,
+        description="Commit the results to a branch when the job ends: dataset[@branch][/folder]. Absent: "
+        "no commit is made.",
     )
     commit_message: str | None = Field(
         None, description="Message of the commit; absent: the kind and the id of the job."
@@ -101,8 +103,8 @@ class JobCommit(Answer):
     message: str
     replace: bool
     base: str | None = Field(
-        description="Newest commit of the branch at the time when the inputs of the job were fixed. Later changes by "
-        "others are not overwritten."
+        description="Newest commit of the branch at the time when the inputs of the job were fixed. Later "
+        "changes by others are not overwritten. Null: the branch had no commit."
     )
     digest: str | None = Field(
         None, description="Commit that has the outputs; null before the end of the job, and if no entry changed."

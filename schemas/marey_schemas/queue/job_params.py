@@ -90,7 +90,7 @@ class CutParams(TaggedResults):
     )
     shortest_s: Seconds = Field(0.0, description="Shortest segment to cut out, in seconds.")
     longest_s: Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)] | None = Field(
-        None, description="Longest segment to cut out, in seconds."
+        None, description="Longest segment to cut out, in seconds; absent: no limit."
     )
     name: str = Field(
         "{clip}_{label}_{number:2}",

@@ -153,8 +153,8 @@ class Resources(Request):
         None,
         ge=1,
         le=7 * 86400,
-        description="Expected duration of the job in seconds. With the server's setting `own_pods`, a long job "
-        "runs in a separate pod.",
+        description="Expected duration of the job in seconds; null: unknown. With the server's setting "
+        "`own_pods`, a long job runs in a separate pod.",
     )
 
 
@@ -179,7 +179,8 @@ class JobCreate(Request):
     concurrency_key: str | None = Field(
         None,
         max_length=255,
-        description="Key of a lock: of the jobs of a project with the same key, only one runs at a time.",
+        description="Key of a lock: of the jobs of a project with the same key, only one runs at a time. Null: "
+        "no lock.",
     )
     cache: CacheMode = Field(
         "use",
@@ -192,7 +193,8 @@ class JobCreate(Request):
     resources: Resources = Resources()
     message: Message = ""
     commit: OutputsCommit | None = Field(
-        None, description="Commit of the outputs to a branch of a dataset, made when the job succeeds."
+        None,
+        description="Commit of the outputs to a branch of a dataset, made when the job succeeds; null: none is made.",
     )
 
 
@@ -273,16 +275,22 @@ class Job(Answer):
     position: int | None = Field(
         None, description="Index of the task among the tasks of its parent job, from 0; null if the job is not a task."
     )
-    size: int | None = Field(None, description="Number of tasks that the job is split into.")
+    size: int | None = Field(
+        None, description="Number of tasks into which the job is split; null: it is not split, or not yet."
+    )
     children: dict[str, int] = Field(default_factory=dict, description="Number of tasks in each state.")
     retry_of: str | None = None
-    cached_from: str | None = Field(None, description="Id of the job whose cached result this job reuses.")
+    cached_from: str | None = Field(
+        None, description="Id of the job whose cached result this job reuses; null: it computes its result."
+    )
     progress: Progress | None = None
     failure: JobFailure | None = None
     result: dict[str, Any] | None = None
     cancel_requested: bool = False
     publish_conflict: CommitConflict | None = Field(
-        None, description="Reason why the outputs are not on the branch to which the job was to commit them."
+        None,
+        description="Reason why the outputs are not on the branch to which the job was to commit them; "
+        "null: there is no conflict.",
     )
     commit: JobCommit | None = Field(
         None, description="Commit of the outputs; null for tasks, and if the submission requested no commit."
@@ -313,7 +321,9 @@ class Attempt(Answer):
     started_at: datetime
     ended_at: datetime | None
     outcome: str | None = Field(
-        None, description="How the attempt ended: succeeded, failed, interrupted, lost, cancelled or timeout."
+        None,
+        description="How the attempt ended: succeeded, failed, interrupted, lost, cancelled or timeout; "
+        "null while it runs.",
     )
     detail: str | None = None
 

@@ -97,9 +97,12 @@ class Schedule(Answer):
         description="Time of the next submission; null: the schedule is paused, or the time is being computed."
     )
     last_at: datetime | None = Field(
-        None, description="Time at which the schedule last submitted a job, skipped a time, or was refused."
+        None,
+        description="Time at which the schedule last submitted a job, skipped a time, or was refused; null: not yet.",
     )
-    last_job: str | None = Field(None, description="Id of the job that was submitted last; it may be deleted already.")
+    last_job: str | None = Field(
+        None, description="Id of the job that was submitted last; it may be deleted already. Null: none was submitted."
+    )
     problem: str | None = Field(
         None,
         description="Reason why the last job was not submitted, or why the schedule is paused; null: there is none.",

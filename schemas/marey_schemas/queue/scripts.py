@@ -73,8 +73,8 @@ class ScriptParameter(Request):
     """Parameter of a script, which becomes one word of its command."""
 
     type: Literal["number", "integer", "text", "boolean"] = "number"
-    minimum: float | None = Field(None, allow_inf_nan=False, description="Least value of a number.")
-    maximum: float | None = Field(None, allow_inf_nan=False, description="Greatest value of a number.")
+    minimum: float | None = Field(None, allow_inf_nan=False, description="Least value of a number; null: no limit.")
+    maximum: float | None = Field(None, allow_inf_nan=False, description="Greatest value of a number; null: no limit.")
     choices: tuple[str, ...] = Field((), max_length=100, description="Allowed texts; empty: any text.")
     default: Value | None = Field(
         None, description="Value that is used if a run gives no value; null: each run must give a value."
@@ -349,7 +349,8 @@ class ScriptRunCreate(ConsentOverride):
     seed: int = Field(0, ge=0, lt=2**63, description="Value of the environment variable MAREY_SEED of the script.")
     message: Message = Field("", description="Message of the run, shown in the history of its results.")
     commit: OutputsCommit | None = Field(
-        None, description="Commit of the outputs to a branch of a dataset, made when the run succeeds."
+        None,
+        description="Commit of the outputs to a branch of a dataset, made when the run succeeds; null: none is made.",
     )
 
 

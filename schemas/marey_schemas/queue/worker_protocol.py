@@ -42,7 +42,11 @@ class ClaimRequest(Request):
     )
     job: str | None = Field(None, description="Id of the only job that the worker claims; absent: any job.")
     task: int | None = Field(
-        None, ge=0, le=1_000_000, description="Claim only the task of `job` that has this position."
+        None,
+        ge=0,
+        le=1_000_000,
+        description="Index, from 0, of the only task of `job` that the worker claims; "
+        "absent: any task, or the job itself.",
     )
     claim_id: str | None = Field(
         None,
@@ -68,7 +72,11 @@ class PinnedInput(Answer):
         "not given as an output of a job.",
     )
 
-    commit: str | None = Field(None, description="Commit of a dataset from which the input was taken.")
+    commit: str | None = Field(
+        None,
+        description="Digest of the commit of a dataset from which the input was "
+        "taken; null: it was not taken from a dataset.",
+    )
     consent_ended: str | None = Field(
         None,
         description="Last day of the performer's consent. Set only if this day has passed, by the clock of the "
@@ -123,7 +131,8 @@ class Lease(Answer):
     )
     size: int | None = Field(
         None,
-        description="Number of tasks of the parent job; set for its tasks, and for the job that gathers their results.",
+        description="Number of tasks of the parent job, for its tasks and for the job that combines their "
+        "results; otherwise null.",
     )
     resources: Resources
     fence: int
@@ -232,7 +241,8 @@ class FailRequest(Request):
     signature: str | None = Field(
         None,
         max_length=LONGEST_SIGNATURE,
-        description="Signature of the failure; a job is not retried after two attempts with the same signature.",
+        description="Text that equal failures have in common, such as the place of an exception; a job is not "
+        "retried after two attempts with the same signature. Absent: none.",
     )
     retryable: bool = True
     interrupted: bool = Field(
@@ -261,7 +271,9 @@ class CompleteAnswer(Answer):
     job: str
     state: JobState
     outputs: tuple[JobOutput, ...] = ()
-    commit: str | None = Field(None, description="Commit of a dataset that has the outputs.")
+    commit: str | None = Field(
+        None, description="Digest of the commit that the job made of its outputs; null: it made none."
+    )
 
 
 class FailAnswer(Answer):

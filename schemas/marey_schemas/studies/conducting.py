@@ -102,7 +102,9 @@ class JudgedTrial(Answer):
     chosen: tuple[int, int] | None = Field(
         description="Places of the two chosen motions on the screen; null if the trial timed out."
     )
-    latency_s: float | None = Field(description="Seconds until the answer, by the clock of the server.")
+    latency_s: float | None = Field(
+        description="Seconds until the answer, by the clock of the server; null if the trial timed out."
+    )
     timeouts_before: int = Field(
         description="Number of trials of the participant that timed out since the last answer."
     )

@@ -100,7 +100,11 @@ class TrialAnswer(Request):
 
     chosen: tuple[Place, Place] = Field(description="Two different places, from 0.")
     client_fps: float | None = Field(
-        None, gt=0, le=1000, allow_inf_nan=False, description="Frames per second that the browser drew."
+        None,
+        gt=0,
+        le=1000,
+        allow_inf_nan=False,
+        description="Frames per second that the browser drew while the trial was shown; absent: not measured.",
     )
 
     @model_validator(mode="after")
