@@ -47,7 +47,9 @@ def add_to(app: typer.Typer) -> None:
 def retarget(
     context: typer.Context,
     sources: Sources,
-    to: Annotated[str, typer.Option(help="The skeleton: project/folder/name, or project/id.")],
+    to: Annotated[
+        str, typer.Option(help="The skeleton to which the motion is transferred: project/folder/name, or project/id.")
+    ],
     into: Into,
     params: Chosen,
     job: Chosen,

@@ -50,7 +50,9 @@ def compare(
     job: Chosen,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "--output", "-o", help="Write the report of the comparison, an HTML page, to this file."),
+        typer.Option(
+            "--out", "--output", "-o", help="Also write the report of the comparison, an HTML page, to this file."
+        ),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,

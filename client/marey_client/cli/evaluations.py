@@ -74,7 +74,9 @@ def evaluate(
     metric: MetricName = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "--output", "-o", help="Write the report of the evaluation, an HTML page, to this file."),
+        typer.Option(
+            "--out", "--output", "-o", help="Also write the report of the evaluation, an HTML page, to this file."
+        ),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
@@ -141,13 +143,13 @@ def report(
     ),
     figures: Annotated[
         Path | None,
-        typer.Option(help="Write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
+        typer.Option(help="Also write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
     ] = None,
     walk_graph: Annotated[
         Path | None,
         typer.Option(
-            help="Write the displayed frames of an evaluation and the jumps between them, as a graph, to this file: "
-            ".graphml or .json."
+            help="Also write the frames that the trials of an evaluation displayed, and the jumps between them, "
+            "as a graph to this file, which ends in .graphml or .json."
         ),
     ] = None,
     trial: Annotated[

@@ -67,7 +67,7 @@ def size_text(size_bytes: int) -> str:
 
 def stale(
     context: typer.Context,
-    place: Annotated[str, typer.Argument(help="Project or folder: project[/folder].")],
+    place: Annotated[str, typer.Argument(help="Project or folder whose results are examined: project[/folder].")],
     as_json: AsJson = False,
 ) -> None:
     """List the results in a folder and below that are outdated, each with the inputs that have newer revisions."""

@@ -58,8 +58,8 @@ def suggest(
     remove_out: Annotated[
         Path | None,
         typer.Option(
-            help="Write the paths of the clips whose removal has no effect on the trials to this file, one path per "
-            "line."
+            help="Also write the paths of the clips whose removal has no effect on the trials to this file, one "
+            "path per line."
         ),
     ] = None,
     metric: MetricName = None,

@@ -188,7 +188,12 @@ def _last_at_each_path(things: Sequence[Thing]) -> list[Thing]:
 def revert(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="Item and earlier revision: project/folder/name@revision.")],
-    message: Annotated[str, typer.Option("--message", "-m", help="Message of the new revision.")] = "",
+    message: Annotated[
+        str,
+        typer.Option(
+            "--message", "-m", help="Message of the new revision. Default: a sentence that names the earlier revision."
+        ),
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Create a revision of an item with the content of an earlier revision. Name, folder and tags do not change."""

@@ -22,9 +22,14 @@ member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage t
 MemberName = Annotated[
     str, typer.Argument(help="Name of the user; with `--folder`, '*' stands for all members except owners.")
 ]
-ItemLimit = Annotated[int | None, typer.Option("--items", min=0, help="Set the maximum number of items.")]
+ItemLimit = Annotated[
+    int | None, typer.Option("--items", min=0, help="Set the maximum number of items. Default: unchanged.")
+]
 ByteLimit = Annotated[
-    int | None, typer.Option("--stored-bytes", min=0, help="Set the maximum total size of all revisions, in bytes.")
+    int | None,
+    typer.Option(
+        "--stored-bytes", min=0, help="Set the maximum total size of all revisions, in bytes. Default: unchanged."
+    ),
 ]
 DefaultLimits = Annotated[
     bool,
@@ -97,8 +102,8 @@ def change_project(
     visibility: Annotated[
         str | None,
         typer.Option(
-            help="New visibility. private: only members may read the "
-            "project; public: everybody who can reach the server may."
+            help="New visibility. private: only members may read the project; public: everybody who can reach "
+            "the server may. Default: unchanged."
         ),
     ] = None,
     as_json: AsJson = False,
@@ -122,7 +127,10 @@ def project_quota(
     items: ItemLimit = None,
     stored_bytes: ByteLimit = None,
     running_jobs: Annotated[
-        int | None, typer.Option("--running-jobs", min=0, help="Set the maximum number of jobs that run at once.")
+        int | None,
+        typer.Option(
+            "--running-jobs", min=0, help="Set the maximum number of jobs that run at once. Default: unchanged."
+        ),
     ] = None,
     defaults: DefaultLimits = False,
     as_json: AsJson = False,

@@ -48,7 +48,11 @@ def purge(
     query: QueryText = None,
     older_than: Annotated[
         int | None,
-        typer.Option("--older-than", min=0, help="Purge only items that were removed at least this many days ago."),
+        typer.Option(
+            "--older-than",
+            min=0,
+            help="Purge only items that were removed at least this many days ago. Default: all removed items.",
+        ),
     ] = None,
     dataset: Annotated[
         str | None,

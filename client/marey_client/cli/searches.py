@@ -136,7 +136,15 @@ def search(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "--output", "-o", help="File or folder to which the motion is written.")
+        Path | None,
+        typer.Option(
+            "--out",
+            "--output",
+            "-o",
+            help="File or folder to which the motion is also "
+            "written. Default: only the errors of the "
+            "constraints are printed.",
+        ),
     ] = None,
     format: Annotated[str, typer.Option(help=f"Format of the file: {one_of(MOTION_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
     as_json: AsJson = False,

@@ -31,7 +31,10 @@ def map_joints(
     place: Annotated[str, typer.Argument(help="The skeleton: project/folder/name, or project/id.")],
     assignments: Annotated[
         list[str] | None,
-        typer.Argument(help="Mapping of a joint: standard_joint=JointName to set it, standard_joint= to clear it."),
+        typer.Argument(
+            help="Mapping of a joint: standard_joint=JointName to set it, standard_joint= to clear "
+            "it. Default: show the mapping."
+        ),
     ] = None,
     confirm: Annotated[
         bool, typer.Option("--confirm", help="Confirm the recognised mapping, even if it was uncertain.")
@@ -66,9 +69,12 @@ def joint_axes(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="The skeleton: project/folder/name, or project/id.")],
     joint: Annotated[str | None, typer.Argument(help="The joint to change; default: show all joints.")] = None,
-    twist: Annotated[str | None, typer.Option(help="Axis along the bone, in the joint's frame: x,y,z.")] = None,
+    twist: Annotated[
+        str | None, typer.Option(help="New axis along the bone, in the joint's frame: x,y,z. Default: unchanged.")
+    ] = None,
     swing: Annotated[
-        str | None, typer.Option(help="Axis orthogonal to the bone's axis, in the joint's frame: x,y,z.")
+        str | None,
+        typer.Option(help="New swing axis, orthogonal to the bone, in the joint's frame: x,y,z. Default: unchanged."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -106,7 +112,12 @@ def merge(
         typer.Argument(help="A project, or several skeletons of one rig: project/folder/name, or project/id."),
     ],
     keep: Annotated[
-        str | None, typer.Option(help="The skeleton that remains: project/folder/name, or project/id.")
+        str | None,
+        typer.Option(
+            help="The skeleton that remains: project/folder/name, or project/id. Default: "
+            "for each rig, a skeleton with an edited joint mapping, else the most used "
+            "one."
+        ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be merged, and change nothing.")] = False,
     as_json: AsJson = False,

@@ -78,7 +78,9 @@ def view(
             "server or network, if it ends in .html.",
         ),
     ] = None,
-    frames: Annotated[str | None, typer.Option(help="With --out: frames of the clip, such as 100:200.")] = None,
+    frames: Annotated[
+        str | None, typer.Option(help="With --out: frames of the clip, such as 100:200. Default: all frames.")
+    ] = None,
     moments: Annotated[
         int, typer.Option(min=1, help="With --out and a picture: number of poses in a row.")
     ] = DEFAULT_MOMENTS,

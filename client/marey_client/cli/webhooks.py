@@ -109,12 +109,14 @@ def change(
     context: typer.Context,
     project: ProjectName,
     webhook_id: WebhookId,
-    url: Annotated[str | None, typer.Option(help="New address to which requests are sent.")] = None,
+    url: Annotated[str | None, typer.Option(help="New address to which requests are sent. Default: unchanged.")] = None,
     kind: Kinds = None,
     description: Description = None,
     pause: Annotated[
         bool | None,
-        typer.Option("--pause/--resume", help="Pause deliveries, or resume them and send the waiting events."),
+        typer.Option(
+            "--pause/--resume", help="Pause deliveries, or resume them and send the waiting events. Default: unchanged."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -163,7 +165,10 @@ def deliveries(
     project: ProjectName,
     webhook_id: WebhookId,
     state: Annotated[
-        str | None, typer.Option(help="List only deliveries in this state: waiting, retrying, delivered or dead.")
+        str | None,
+        typer.Option(
+            help="List only deliveries in this state: waiting, retrying, delivered or dead. Default: in any state."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

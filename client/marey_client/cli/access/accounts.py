@@ -255,7 +255,8 @@ def change_user(
     name: UserName,
     display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users.")] = None,
     administrator: Annotated[
-        bool | None, typer.Option(help="Grant the user the rights of an administrator, or revoke them.")
+        bool | None,
+        typer.Option(help="Grant the user the rights of an administrator, or revoke them. Default: unchanged."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

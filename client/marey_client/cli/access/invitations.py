@@ -96,7 +96,10 @@ def accept(context: typer.Context, as_json: AsJson = False) -> None:
 def invite_person(
     context: typer.Context,
     project_name: Annotated[
-        str | None, typer.Option("--project", help="Project that the new user joins as a member.")
+        str | None,
+        typer.Option(
+            "--project", help="Project that the new users join as members, with the role of --role. Default: none."
+        ),
     ] = None,
     role: RoleName = None,
     days: Days = 7,

@@ -39,8 +39,9 @@ def create_token(
     scope: Annotated[
         list[str] | None,
         typer.Option(
-            help="Scope: read, write, jobs, work or admin. To limit a scope to one project, append !project= and the "
-            "name of the project, as in read!project=lab."
+            help="Scope: read, write, jobs, work or admin. To limit a scope to one project, append !project= and "
+            "the name of the project, as in read!project=lab. May be repeated. Default: read, write and "
+            "jobs."
         ),
     ] = None,
     days: Annotated[
@@ -62,7 +63,10 @@ def create_token(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "--out", "-o", help="Write the secret to this file (mode 0600) instead of the screen."
+            "--output",
+            "--out",
+            "-o",
+            help="Write the secret to this new file, which only you can read, instead of the screen.",
         ),
     ] = None,
     as_json: AsJson = False,
@@ -103,7 +107,9 @@ def _token_in_file(marey: Marey, wanted: TokenCreate, path: Path) -> NewToken:
 @token.command("ls")
 def list_tokens(
     context: typer.Context,
-    user: Annotated[str | None, typer.Option(help="List the tokens of this user (for administrators).")] = None,
+    user: Annotated[
+        str | None, typer.Option(help="List the tokens of this user (for administrators). Default: your own.")
+    ] = None,
     everybody: Annotated[
         bool, typer.Option("--everybody", help="List the tokens of all users (for administrators).")
     ] = False,

@@ -36,7 +36,7 @@ def diff(
             "before it."
         ),
     ] = None,
-    path: Annotated[str, typer.Option(help="Entry or folder to compare.")] = "",
+    path: Annotated[str, typer.Option(help="Entry or folder to compare. Default: all entries.")] = "",
     most: Annotated[
         int, typer.Option("--limit", "-n", min=1, max=10_000, help="Greatest number of entries to list.")
     ] = 1000,

@@ -38,11 +38,13 @@ def export(
         str,
         typer.Option(
             "--as",
-            help=f"{one_of(LAYOUTS)}: a tree of motion files, a dataset repository of the Hugging Face Hub, or a "
-            "LeRobotDataset v3.0.",
+            help=f"Layout of the folder. {one_of(LAYOUTS)}: a tree of motion files, a dataset repository of the "
+            "Hugging Face Hub, or a LeRobotDataset v3.0.",
         ),
     ] = "files",
-    path: Annotated[str, typer.Option(help="Folder of the version; only the clips below it are exported.")] = "",
+    path: Annotated[
+        str, typer.Option(help="Folder of the version; only the clips below it are exported. Default: all clips.")
+    ] = "",
     format: Annotated[  # noqa: A002
         str | None,
         typer.Option(help=f"Format of the motion files: {one_of(WHOLE_FORMATS)}. Default: {DEFAULT_FORMAT}."),

@@ -75,7 +75,9 @@ def open_proposal(
 def list_proposals(
     context: typer.Context,
     place: DatasetPlace,
-    state: Annotated[ProposalState | None, typer.Option(help="List only proposals in this state.")] = None,
+    state: Annotated[
+        ProposalState | None, typer.Option(help="List only proposals in this state. Default: in any state.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the proposals of a dataset, newest first."""
@@ -152,10 +154,21 @@ def comment(
     number: Number,
     text: Annotated[str, typer.Argument(help="Text of the comment.")],
     entry: Annotated[
-        str | None, typer.Option(metavar="PATH:KIND", help="Entry that the comment is about, such as raw/walk:clip.")
+        str | None,
+        typer.Option(
+            metavar="PATH:KIND",
+            help="Entry that the comment is about, such as "
+            "raw/walk:clip. Default: the comment is about the "
+            "whole proposal.",
+        ),
     ] = None,
     frames: Annotated[
-        str | None, typer.Option(metavar="FIRST:END", help="Range of the entry's frames; END is not included.")
+        str | None,
+        typer.Option(
+            metavar="FIRST:END",
+            help="With --entry: range of frames that the comment is "
+            "about; END is not included. Default: the whole entry.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

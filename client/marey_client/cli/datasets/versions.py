@@ -150,7 +150,7 @@ def show(context: typer.Context, place: VersionPlace, as_json: AsJson = False) -
 def entries(
     context: typer.Context,
     place: VersionPlace,
-    path: Annotated[str, typer.Option(help="Folder below which entries are listed.")] = "",
+    path: Annotated[str, typer.Option(help="Folder below which entries are listed. Default: all entries.")] = "",
     as_json: AsJson = False,
 ) -> None:
     """List the entries of a version by path."""
@@ -215,7 +215,7 @@ def tag(
 def reset(
     context: typer.Context,
     place: VersionPlace,
-    name: Annotated[str, typer.Argument(help="Branch to move.")],
+    name: Annotated[str, typer.Argument(help="Name of the branch to move.")],
 ) -> None:
     """Move a branch to any version, for example to an earlier one. No commit is deleted."""
     at = parse(place, version=True)

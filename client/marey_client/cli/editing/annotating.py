@@ -134,9 +134,14 @@ def move(
     context: typer.Context,
     place: Place,
     at: At,
-    start: Annotated[int | None, typer.Option(min=0, help="New first frame of the segment.")] = None,
+    start: Annotated[
+        int | None, typer.Option(min=0, help="New first frame of the segment. Give either --start or --end.")
+    ] = None,
     end: Annotated[
-        int | None, typer.Option(min=0, help="New end of the segment: the frame after its last frame.")
+        int | None,
+        typer.Option(
+            min=0, help="New end of the segment: the frame after its last frame. Give either --start or --end."
+        ),
     ] = None,
 ) -> None:
     """Move the start or the end of a segment. An adjacent segment is extended or shortened accordingly."""
@@ -164,7 +169,9 @@ def mark(
     place: Place,
     label: Label,
     frame: Annotated[int, typer.Argument(min=0, help="Frame number of the keyframe.")],
-    move_to: Annotated[int | None, typer.Option("--move", min=0, help="Move the keyframe to this frame.")] = None,
+    move_to: Annotated[
+        int | None, typer.Option("--move", min=0, help="Move the keyframe at FRAME to this frame.")
+    ] = None,
     remove_it: Annotated[bool, typer.Option("--remove", help="Remove the keyframe.")] = False,
 ) -> None:
     """Add a keyframe; with --move or --remove, move it or remove it."""

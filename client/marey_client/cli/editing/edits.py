@@ -85,7 +85,9 @@ def save_edit(
     do: Do = None,
     file: From = None,
     title: Annotated[str, typer.Option(help="Purpose of the edit.")] = "",
-    message: Annotated[str, typer.Option("--message", "-m", help="Message shown in the history.")] = "",
+    message: Annotated[
+        str, typer.Option("--message", "-m", help="Message of the new revision, shown in the history.")
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Save commands as an edit, or replace the commands of a saved edit."""

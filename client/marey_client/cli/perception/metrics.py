@@ -68,7 +68,12 @@ def metric_at(marey: Marey, name: str | None) -> str | None:
 @metric.command("ls")
 def list_metrics(
     context: typer.Context,
-    place: Annotated[str | None, typer.Argument(help="Project or folder whose stored metrics are listed, too.")] = None,
+    place: Annotated[
+        str | None,
+        typer.Argument(
+            help="Project or folder whose stored metrics are listed, too. Default: only built-in metrics are listed."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the built-in metrics, and the stored metrics of a project."""
@@ -143,15 +148,17 @@ def compare(
     metric: MetricName = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "--output", "-o", help="Write the report of the comparison, an HTML page, to this file."),
+        typer.Option(
+            "--out", "--output", "-o", help="Also write the report of the comparison, an HTML page, to this file."
+        ),
     ] = None,
     figures: Annotated[
         Path | None,
-        typer.Option(help="Write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
+        typer.Option(help="Also write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
     ] = None,
     maps: Annotated[
         Path | None,
-        typer.Option(help="Write motion maps and registration curves to this file, as a NumPy archive (.npz)."),
+        typer.Option(help="Also write motion maps and registration curves to this file, as a NumPy archive (.npz)."),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,

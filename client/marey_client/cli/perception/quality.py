@@ -59,13 +59,13 @@ def quality(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "--output", "-o", help="Write the report of the measurement, an HTML page, to this file."
+            "--out", "--output", "-o", help="Also write the report of the measurement, an HTML page, to this file."
         ),
     ] = None,
-    csv: Annotated[Path | None, typer.Option(help="Write one row for each clip to this file, as CSV.")] = None,
+    csv: Annotated[Path | None, typer.Option(help="Also write one row for each clip to this file, as CSV.")] = None,
     figures: Annotated[
         Path | None,
-        typer.Option(help="Write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
+        typer.Option(help="Also write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,

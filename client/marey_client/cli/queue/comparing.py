@@ -69,7 +69,8 @@ def compare(
     chart: Annotated[
         Path | None,
         typer.Option(
-            help="Draw to this file: .html contains a page with all charts and tables, .svg or .png one chart."
+            help="Draw charts to this file instead of printing a table: .html is a page with all charts and "
+            "tables, .svg or .png one chart."
         ),
     ] = None,
     plot: Annotated[

@@ -155,7 +155,9 @@ def list_jobs(
     kind: Annotated[
         list[str] | None, typer.Option(help="List only jobs of this kind, such as retarget; may be repeated.")
     ] = None,
-    author: Annotated[str | None, typer.Option(help="List only jobs that this user submitted.")] = None,
+    author: Annotated[
+        str | None, typer.Option(help="List only jobs that this user submitted. Default: of all users.")
+    ] = None,
     tasks_of: Annotated[
         str | None,
         typer.Option(

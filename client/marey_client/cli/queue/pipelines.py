@@ -68,7 +68,10 @@ def build_model(
     name: Annotated[str, typer.Option(help="Name of the model.")],
     propose: Chosen,
     job: Chosen,
-    project: Annotated[str | None, typer.Option(help="Project to which local files are uploaded.")] = None,
+    project: Annotated[
+        str | None,
+        typer.Option(help="Project to which local files are uploaded. Default: the takes are clips on the server."),
+    ] = None,
     to: Annotated[
         str | None,
         typer.Option(

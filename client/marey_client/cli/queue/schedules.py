@@ -103,10 +103,21 @@ def change(
     context: typer.Context,
     project: ProjectName,
     name: Name,
-    cron: Annotated[str | None, typer.Option(metavar="TIMES", help="New times, as for `create`.")] = None,
-    timezone: Annotated[str | None, typer.Option(metavar="ZONE", help="New time zone.")] = None,
+    cron: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIMES",
+            help="New times: minute, hour, day, month and day "
+            "of the week, as for `marey schedule create`. "
+            "Default: unchanged.",
+        ),
+    ] = None,
+    timezone: Annotated[
+        str | None, typer.Option(metavar="ZONE", help="New time zone, such as Europe/Berlin. Default: unchanged.")
+    ] = None,
     job: Annotated[
-        Path | None, typer.Option("--job", help="JSON file of the new job to submit; - reads standard input.")
+        Path | None,
+        typer.Option("--job", help="JSON file of the new job to submit; - reads standard input. Default: unchanged."),
     ] = None,
     overlap: Annotated[
         bool | None,
@@ -116,7 +127,9 @@ def change(
             "skip the time in this case. Default: unchanged.",
         ),
     ] = None,
-    pause: Annotated[bool | None, typer.Option("--pause/--resume", help="Pause the schedule, or resume it.")] = None,
+    pause: Annotated[
+        bool | None, typer.Option("--pause/--resume", help="Pause the schedule, or resume it. Default: unchanged.")
+    ] = None,
     description: Annotated[str | None, typer.Option(help="New purpose of the schedule.")] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -45,8 +45,8 @@ def export(
     form: Annotated[
         ExportForm,
         typer.Option(
-            help="json: participants with their trials; csv: one line for each trial; pairs: one line for each "
-            "comparison of the chosen pair with another pair."
+            help="Form of the file. json: participants with their trials; csv: one line for each trial; pairs: "
+            "one line for each comparison of the chosen pair with another pair."
         ),
     ] = ExportForm.CSV,
     revision: Annotated[int | None, typer.Option(min=1, help="Revision of the study; default: the newest.")] = None,
@@ -74,9 +74,13 @@ def analyse(
     job: Chosen,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "--output", "-o", help="Write the report of the analysis, an HTML page, to this file."),
+        typer.Option(
+            "--out", "--output", "-o", help="Also write the report of the analysis, an HTML page, to this file."
+        ),
     ] = None,
-    metric: Annotated[Path | None, typer.Option(help="Write the best fitted metric to this file, as JSON.")] = None,
+    metric: Annotated[
+        Path | None, typer.Option(help="Also write the best fitted metric to this file, as JSON.")
+    ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
