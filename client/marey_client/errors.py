@@ -118,7 +118,7 @@ class FileChanged(MareyError):
 
 
 class NothingToUpload(MareyError):
-    """The given places contain no motion files, or do not exist."""
+    """The given places do not exist, or contain no motion files that can be imported."""
 
 
 class BadFileName(MareyError):

@@ -164,7 +164,9 @@ class DatasetPurgeAnswer(Answer):
         f"{MOST_HOLDERS}: items that "
         "jobs made from a version, and jobs that have not ended."
     )
-    others: int = Field(0, description="Number of further such objects, which are not listed.")
+    others: int = Field(
+        0, description="Number of further objects that refer to a version of the dataset and are not listed."
+    )
     freed_bytes: int = Field(
         description="Bytes of the trees of entries, without the chunks that other datasets also have."
     )

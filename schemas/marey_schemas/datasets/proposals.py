@@ -17,7 +17,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.names import LINE, ItemId, Message, form
 
 MOST_TEXT = 10_000
-"""Greatest length of a description, a comment or the text of a review."""
+"""Greatest length, in characters, of a description, a comment or the text of a review."""
 WITH_FRAMES = (Kind.CLIP, Kind.ANNOTATION)
 """Kinds of entries that have frames on which somebody can comment."""
 

@@ -37,7 +37,7 @@ class AlignedPlacement(Request):
     y: Metres = Field(0.0, allow_inf_nan=False, description="Height that was subtracted from the clip, in metres.")
     z: Metres = 0.0
     joint: JointName | None = Field(
-        None, description="The joint whose position on the ground `x` and `z` state; default: the root."
+        None, description="The joint whose position on the ground is (x, z); default: the root."
     )
 
 

@@ -152,8 +152,8 @@ class TakeRecord(Request):
     capture_system: str | None = Field(None, description="System that recorded the motion; absent: not recorded.")
     consent_until: Day | None = Field(
         None,
-        description="Last day of the performer's consent; clips are not exported after this day, in UTC. "
-        "Absent: the consent does not end.",
+        description="Last day of the performer's consent; clips are not exported after this day, in UTC. Absent: "
+        "no last day is recorded.",
     )
 
 

@@ -79,7 +79,9 @@ class FrameRun(Answer):
 class Exceeding(Answer):
     """Size of a change over the matched frames, and the times at which the change exceeds the threshold."""
 
-    mean: float = Field(description="Mean size of the change over all matched frames.")
+    mean: float = Field(
+        description="Mean size of the change over all matched frames, in degrees or centimetres, as the threshold."
+    )
     largest: float
     largest_at: int = Field(description="Frame of the revision `after` with the largest change.")
     spans: tuple[Range, ...] = Field(

@@ -110,7 +110,7 @@ class EvaluationDocument(Request):
         (), max_length=16, description="Verdict on each region of the trials; empty in evaluations of old versions."
     )
     headline: dict[str, float | int | None] = Field(
-        max_length=64, description="Numbers by name, shown in lists of items."
+        max_length=64, description="Headline metrics by name, which lists of items show; null: not defined."
     )
 
 

@@ -157,7 +157,9 @@ class MotionPrimitiveDocument(Request):
     name: ItemName = Field(description="Name of the action that the model generates.")
     verdict: str = Field("", max_length=2000, description="Assessment of the model in one or two sentences.")
     headline: dict[str, float | int | str | None] = Field(
-        default_factory=dict, max_length=64, description="Numbers by name, shown in lists of items."
+        default_factory=dict,
+        max_length=64,
+        description="Headline numbers by name, which lists of items show; null: not defined.",
     )
     skeleton: RevisionRef | OutputRef
     joints: tuple[JointName, ...] = Field(

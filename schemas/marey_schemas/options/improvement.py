@@ -85,8 +85,8 @@ class SuggestionOptions(ConfirmedEffects):
         10,
         ge=0,
         le=1000,
-        description="Number of removals to suggest, in the order of their harm, in addition to the clips that no "
-        "trial uses; 0: none.",
+        description="Greatest number of removals to plan, in addition to the clips that no trial uses. Each step "
+        "removes the clip whose removal harms least per second of data. 0: none.",
     )
     simulated_additions: int = Field(
         3,

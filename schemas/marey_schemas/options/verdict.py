@@ -47,8 +47,8 @@ class VerdictLimits(Options):
     )
     turn_wobble_deg_s: _Limit = Field(
         25.0,
-        description="Greatest standard deviation of the turn rate, in degrees per second. Steps sway: the "
-        "baseline of generated clips reaches 21.",
+        description="Greatest standard deviation of the turn rate, in degrees per second. The heading sways with "
+        "each step: the baseline of generated clips reaches 21.",
     )
     response_s: _Limit = Field(
         2.0,

@@ -121,9 +121,13 @@ class FieldSummary(Answer):
 class ComparedSetting(Answer):
     """Runs with the same command, inputs and parameters, which differ only by their seeds."""
 
-    runs: tuple[int, ...] = Field(description="Indices in `runs` of the counted runs.")
+    runs: tuple[int, ...] = Field(
+        description="Indices in `runs` of the counted runs: of the newest run with each seed."
+    )
     repeats: int = Field(description="Number of further runs, which have the same seed as a counted run.")
-    fields: dict[str, FieldSummary] = Field(description="Summary of each numeric field that a counted run logged.")
+    fields: dict[str, FieldSummary] = Field(
+        description="Mean and interval of each numeric field over the counted runs, by the name of the field."
+    )
 
 
 class RunComparison(Answer):

@@ -345,7 +345,9 @@ class ImportParams(ImportOptions):
     """Parameters of jobs of the kind `import`, which import files."""
 
     files: tuple[ImportFile, ...] = Field(
-        min_length=1, max_length=10_000, description="Names and digests of the files."
+        min_length=1,
+        max_length=10_000,
+        description="The files to import, by name and digest; the server already has their bytes.",
     )
 
 
