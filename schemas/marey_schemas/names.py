@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import StringConstraints
 
 FORMS: dict[str, str] = {}
-"""Explanation of each pattern for error texts, by the pattern; it continues the words "the value must"."""
+"""Explanation of each pattern for error texts, by the pattern; it continues the words "the text must"."""
 
 
 def form(pattern: str, words: str) -> str:

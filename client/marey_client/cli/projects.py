@@ -51,7 +51,7 @@ def add_to(app: typer.Typer) -> None:
 def create_project(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the project: lower-case letters, digits, - and _.")],
-    title: Annotated[str | None, typer.Option(help="Title of the project.")] = None,
+    title: Annotated[str | None, typer.Option(help="Title of the project, shown beside its name.")] = None,
     description: Annotated[str, typer.Option(help="Purpose of the project.")] = "",
     public: Annotated[
         bool, typer.Option("--public", help="Make the project public: everybody who can reach the server may read it.")
@@ -97,8 +97,8 @@ def show_project(context: typer.Context, name: ProjectName, as_json: AsJson = Fa
 def change_project(
     context: typer.Context,
     name: ProjectName,
-    title: Annotated[str | None, typer.Option(help="Title of the project.")] = None,
-    description: Annotated[str | None, typer.Option(help="Purpose of the project.")] = None,
+    title: Annotated[str | None, typer.Option(help="New title of the project. Default: unchanged.")] = None,
+    description: Annotated[str | None, typer.Option(help="New purpose of the project. Default: unchanged.")] = None,
     visibility: Annotated[
         str | None,
         typer.Option(

@@ -31,7 +31,9 @@ def add_to(app: typer.Typer) -> None:
 
 def login(
     context: typer.Context,
-    name: Annotated[str | None, typer.Option(help="User name; the command asks for it if it is left out.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the user who signs in. Default: the command asks for it.")
+    ] = None,
     with_token: Annotated[
         bool, typer.Option("--with-token", help="Read a token from standard input instead of asking for a password.")
     ] = False,

@@ -187,7 +187,10 @@ def list_jobs(
 
 @job.command("show")
 def show_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
-    """Show a job with its state, inputs and result, and its attempts."""
+    """Show a job: its parameters, state and result, the commits of its inputs, and its attempts.
+
+    The option --json also shows the inputs.
+    """
     from marey_schemas.queue.jobs import commits_of
 
     with connect(context) as marey:
