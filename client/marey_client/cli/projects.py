@@ -174,7 +174,7 @@ def delete_project(context: typer.Context, name: ProjectName) -> None:
 
 @project.command("restore")
 def restore_project(context: typer.Context, name: ProjectName) -> None:
-    """Restore a deleted project."""
+    """Restore the project of this name that was deleted last."""
     with connect(context) as marey:
         marey.project(name).restore()
     print_message(f"project {name} is restored")
