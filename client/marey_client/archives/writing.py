@@ -100,7 +100,7 @@ def write_archive(
                 "earlier versions"
             )
         documents = _documents(dataset, writer, part.parent, on_progress, check, differences=False)
-        _Making(dataset, documents, to_send=False).run(head, commits)
+        _ArchiveInProgress(dataset, documents, to_send=False).run(head, commits)
 
     _write(part, path, fill, on_progress)
     return head
@@ -118,7 +118,7 @@ def write_transfer(
 
     def fill(writer: ArchiveWriter) -> None:
         documents = _documents(dataset, writer, path.parent, on_progress, _accept, differences=differences)
-        _Making(dataset, documents, to_send=True).run(commits[0], commits)
+        _ArchiveInProgress(dataset, documents, to_send=True).run(commits[0], commits)
 
     _write(path.with_name(f"{path.name}.part"), path, fill, on_progress)
 
@@ -219,7 +219,7 @@ def _history(dataset: DatasetReader, head: Commit, known: Mapping[str, Commit]) 
 
 
 @dataclass
-class _Making:
+class _ArchiveInProgress:
     """Archive while it is written: the commits to write, and the documents that are in it already."""
 
     dataset: DatasetReader

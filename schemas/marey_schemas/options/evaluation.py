@@ -124,8 +124,9 @@ class EvaluationOptions(Grid):
         ge=1,
         le=64,
         description="Number of replicates of each trial. The first one is the trial itself; each further one has "
-        "another phase of the stride at the start, and an approach that is up to one second longer. Results are means "
-        "with 95 % intervals. 1: only the trial itself, as published, without intervals.",
+        "another phase of the stride at the start, and an approach that is up to one second longer. "
+        "Results are means with 95 % intervals. 1: only the trial itself, as in the published "
+        "method, without intervals.",
     )
     seed: int = Field(
         0, ge=0, lt=2**63, description="Seed of the random differences between the replicates of a trial."

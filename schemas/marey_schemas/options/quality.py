@@ -33,9 +33,10 @@ class QualityOptions(Options):
     )
     floor: Literal["planted", "zero"] = Field(
         "planted",
-        description="Reference from which the heights of feet are measured. planted: the height of the joint while "
-        "the foot stands on the floor, which is the 5th percentile of the heights of the joint in the clip; "
-        "zero: height 0, as published. Penetration is always measured from height 0.",
+        description="Reference from which the heights of feet are measured. planted: the height of the joint "
+        "while the foot stands on the floor, which is the 5th percentile of the heights of the joint "
+        "in the clip; zero: height 0, as in the publications of the measures. Penetration is always "
+        "measured from height 0.",
     )
     weighted_height_m: _Height = Field(
         0.025,

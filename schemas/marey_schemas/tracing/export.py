@@ -197,7 +197,7 @@ def _readable(context: TraceContext, span: Span, resource: Resource) -> Readable
     )
 
 
-class _Seldom(logging.Handler):
+class _RateLimited(logging.Handler):
     """Logging handler that logs at most one message in `WARN_EVERY_S` seconds, so that no collector floods the log."""
 
     def __init__(self) -> None:
@@ -219,8 +219,8 @@ def _quieten(name: str) -> None:
     """Send the log messages of a library only to a handler that limits their rate."""
     logger = logging.getLogger(name)
     logger.propagate = False
-    if not any(isinstance(handler, _Seldom) for handler in logger.handlers):
-        logger.addHandler(_Seldom())
+    if not any(isinstance(handler, _RateLimited) for handler in logger.handlers):
+        logger.addHandler(_RateLimited())
 
 
 @contextmanager
