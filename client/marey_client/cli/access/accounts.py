@@ -136,7 +136,7 @@ def logout(context: typer.Context) -> None:
 def create_user(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name that the user signs in with.")],
-    display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users.")] = None,
+    display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users. Default: none.")] = None,
     administrator: Annotated[
         bool, typer.Option("--administrator", help="Make the user an administrator, with all rights.")
     ] = False,
@@ -255,7 +255,9 @@ def enable_user(context: typer.Context, name: UserName) -> None:
 def change_user(
     context: typer.Context,
     name: UserName,
-    display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users.")] = None,
+    display_name: Annotated[
+        str | None, typer.Option(help="New name that is shown to other users. Default: unchanged.")
+    ] = None,
     administrator: Annotated[
         bool | None,
         typer.Option(help="Grant the user the rights of an administrator, or revoke them. Default: unchanged."),

@@ -327,7 +327,7 @@ def protect(
         typer.Option(
             "--check",
             metavar="NAME",
-            help="Name of a check that must succeed before a merge; repeat the option for several.",
+            help="Name of a check that must succeed before a merge; may be repeated.",
         ),
     ] = None,
     up_to_date: Annotated[

@@ -130,7 +130,7 @@ def change(
     pause: Annotated[
         bool | None, typer.Option("--pause/--resume", help="Pause the schedule, or resume it. Default: unchanged.")
     ] = None,
-    description: Annotated[str | None, typer.Option(help="New purpose of the schedule.")] = None,
+    description: Annotated[str | None, typer.Option(help="New purpose of the schedule. Default: unchanged.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Change, pause or resume a schedule.
