@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 PATIENCE_S = 0.8
 """Longest time in seconds for all requests after one press of Tab, without the program's start (about 0.4 s)."""
-REQUESTS_AT_ONCE = 4
+LISTS_AT_ONCE = 4
 MOST_ENTRIES = 200
 """Greatest number of entries that one request asks for."""
 MOST_PAGES = 50
@@ -88,7 +88,7 @@ class ListClient:
                 for page in self._pages(request):
                     answers[place] += page
 
-        threads = [threading.Thread(target=work, daemon=True) for _ in requests[:REQUESTS_AT_ONCE]]
+        threads = [threading.Thread(target=work, daemon=True) for _ in requests[:LISTS_AT_ONCE]]
         for one in threads:
             one.start()
         for one in threads:

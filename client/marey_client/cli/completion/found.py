@@ -67,7 +67,7 @@ def listed_in(declared: str, *more: str) -> How:
 
 
 def several_listed_in(declared: str) -> How:
-    """Return a function that completes the last word of a comma-separated list; `declared` is that of `listed_in`."""
+    """Return a function that completes the word after the last comma of a list; `declared` is that of `listed_in`."""
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         before, comma, _ = typed.start.rpartition(",")
