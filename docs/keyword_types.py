@@ -125,7 +125,7 @@ class KeywordModule:
     def _class_lines(self, name: str, content: tuple[str, list[_Field]]) -> Iterator[str]:
         model, fields = content
         yield f"class {name}(TypedDict, total=False):"
-        yield f'    """Fields of `{model}`."""'
+        yield f'    """Keyword arguments, one for each field of `{model}`."""'
         yield ""
         for field in fields:
             yield f"    {field.name}: {field.type}"

@@ -1,4 +1,4 @@
-"""Marey in Python, with one import.
+"""Python SDK of Marey under a short name: `import marey`.
 
     import marey
 
@@ -9,8 +9,8 @@
 
 Programs with an event loop call `connect_async` instead of `connect`; the methods have the same names and are awaited.
 
-The classes are those of `marey_client`, which also contains the parts that fewer programs need. Names are loaded when
-they are first used, so that the import takes hardly any time.
+The classes are those of the package `marey_client`, which also contains less frequently used parts. Each name is loaded
+when it is first used, so that the import takes hardly any time.
 """
 
 from importlib import import_module

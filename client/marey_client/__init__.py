@@ -7,7 +7,7 @@
         motion = clip.motion(frames=slice(0, 120), joints=["Hips", "LeftFoot"])
         motion.rotations  # (120, 2, 4) float32
 
-Names are loaded when they are first used, so that `marey --help` does not load numpy and httpx.
+Each name is loaded when it is first used, so that `marey --help` does not load numpy and httpx.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""Users, tokens and members."""
+"""Administration of access: users, tokens, and members of projects with their roles."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Q = TypeVar("Q", bound=QuotasInUse)
 
 
 def change_quotas(transport: Transport, path: str, change: QuotaChange, answer: type[Q]) -> Q:
-    """Change quotas of the project or user at `path`; return all quotas at `path`, each with the amount in use."""
+    """Change quotas of the project or user at `path`, a path of the REST API; return all quotas and their use."""
     return read_model(answer, transport.send("PATCH", path, content=as_json(change), repeatable=True))
 
 
@@ -54,19 +54,19 @@ class Users:
 
     @property
     def invitations(self) -> AccountInvitations:
-        """The invitations of people who have no account."""
+        """The invitations with which people can create an account."""
         return AccountInvitations(self.transport, "/invitations")
 
     def list(self) -> Iterator[User]:
-        """List the users."""
+        """List the users of the server."""
         return pages(self.transport, User, "/users")
 
     def get(self, name: str) -> User:
-        """Return a user by name."""
+        """Return the user with this name. Raises `NotFound` if there is none."""
         return self.transport.get(User, f"/users/{name}")
 
     def create(self, user: UserCreate) -> User:
-        """Create a user."""
+        """Create a user. Raises `Conflict` if the name is taken."""
         return self.transport.post(User, "/users", user, repeatable=False)
 
     def change(self, name: str, change: UserChange) -> User:
@@ -76,7 +76,7 @@ class Users:
         )
 
     def disable(self, name: str) -> None:
-        """Disable a user; the data of the user is kept."""
+        """Disable a user, whose data is kept; password and tokens of the user do not work until `enable` is called."""
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
     def identities(self, name: str) -> Iterator[Identity]:
@@ -84,7 +84,7 @@ class Users:
         return pages(self.transport, Identity, f"/users/{name}/identities")
 
     def link(self, name: str, identity: IdentityLink) -> Identity:
-        """Let a person at an identity provider sign in as a user."""
+        """Link a person at an identity provider with a user; the person can then sign in as this user."""
         return self.transport.post(Identity, f"/users/{name}/identities", identity, repeatable=True)
 
     def unlink(self, name: str, identity_id: str) -> None:
@@ -158,17 +158,17 @@ class Tokens:
 
 @dataclass(frozen=True)
 class Members:
-    """Members of a project and their roles."""
+    """Members of a project, each with a role that applies in the whole project; folders may have other roles."""
 
     transport: Transport
     project: str
 
     def list(self) -> Iterator[Member]:
-        """List the members with their roles."""
+        """List the members of the project with their roles; roles in folders are in `in_folders`."""
         return pages(self.transport, Member, f"/projects/{self.project}/members")
 
     def put(self, user: str, role: Role) -> Member:
-        """Add a user to the project, or change the user's role."""
+        """Add a user to the project with the given role, or give a member this role."""
         return read_model(
             Member,
             self.transport.send(
@@ -182,7 +182,7 @@ class Members:
 
     @property
     def in_folders(self) -> FolderRoles:
-        """The roles of members in folders, which apply there instead of the roles in the project."""
+        """The roles that members have in folders; inside a folder, they replace the role in the project."""
         return FolderRoles(self.transport, self.project)
 
     def remove(self, user: str) -> None:

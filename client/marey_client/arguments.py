@@ -15,7 +15,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def checked(model: type[Model], values: Mapping[str, Any] | None = None, /, **more: Any) -> Model:
-    """Return a model with the given field values. Raises `BadArgument`, which names the first invalid field."""
+    """Return an instance of `model` with these values. Raises `BadArgument`, which names the first invalid field."""
     given = {**(values or {}), **more}
     try:
         return model.model_validate(given)
@@ -24,5 +24,8 @@ def checked(model: type[Model], values: Mapping[str, Any] | None = None, /, **mo
 
 
 def several(given: str | Path | Mapping[str, Any] | BaseModel | Iterable[Any]) -> tuple[Any, ...]:
-    """Return one value or several as a tuple; a text, a path, a document or a model is one value."""
+    """Return an argument, which is one value or several values, as a tuple of values.
+
+    A text, a path, a document or a pydantic model counts as one value.
+    """
     return (given,) if isinstance(given, (str, Path, Mapping, BaseModel)) else tuple(given)

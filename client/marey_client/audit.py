@@ -16,7 +16,7 @@ class AuditConditions(TypedDict, total=False):
     """Conditions on the entries of an audit log; None, like a missing condition, matches every entry."""
 
     kind: AuditKind | None
-    """Kind of the change."""
+    """Kind of the change, such as `member.added`."""
     actor: str | None
     """Name of the user who made the change."""
     subject: str | None

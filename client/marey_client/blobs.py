@@ -96,7 +96,7 @@ class Blobs:
         return target
 
     def fetch_into(self, digest: str, file: BufferedRandom) -> None:
-        """Download a blob into an empty file that is open for reading and writing; leave the position at its end."""
+        """Download a blob into an empty file that is open for reading and writing; the file is then at its end."""
 
         def once() -> None:
             start = file.tell()
@@ -153,7 +153,7 @@ def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
 
 
 def _send_piece(transport: Transport, upload: Upload, file: BinaryIO) -> Upload:
-    """Send the next piece and return the state of the upload; the last piece, which may be empty, completes it."""
+    """Send the next piece and return the state of the upload; the last piece, which may be empty, ends the upload."""
     file.seek(upload.offset)
     piece = file.read(min(PIECE_BYTES, upload.length - upload.offset))
     if not piece and upload.offset < upload.length:

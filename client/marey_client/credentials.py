@@ -1,4 +1,4 @@
-"""Lookup of the server's address and the token.
+"""Lookup of the address of the server and of the token that clients send.
 
 The token is taken from the first of these places that has one: a file named on the command line, `MAREY_TOKEN`, the
 file written by `marey login`, and `admin.token` in the data folder of a server on this machine.
@@ -37,7 +37,7 @@ _PLAIN_ADDRESS = re.compile(
     r"https?://(127\.0\.0\.1|(?![0-9.]+[:/]|[0-9.]+$)[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?)(:[1-9][0-9]{0,3})?"
     r"(/[A-Za-z0-9._/-]*)?"
 )
-"""Pattern of addresses that need no further check: with a host name, or with 127.0.0.1."""
+"""Pattern of addresses that are certainly valid, with a host name or with 127.0.0.1; others are parsed and checked."""
 
 
 class TokenFile:
@@ -79,14 +79,14 @@ def trusted_authorities() -> ssl.SSLContext:
 
 
 class BearerToken:
-    """Function for httpx that adds the token to requests; the `repr` of the function does not show the token."""
+    """Authentication for httpx: adds the token to each request. Its `repr` does not show the token."""
 
     def __init__(self, token: str | TokenFile) -> None:
         self._source = token if isinstance(token, TokenFile) else as_token(token)
 
     @property
     def token(self) -> str:
-        """The current token."""
+        """The token to send now; a `TokenFile` may have read a new one."""
         return self._source.token if isinstance(self._source, TokenFile) else self._source
 
     def __call__(self, request: httpx.Request) -> httpx.Request:
@@ -105,11 +105,11 @@ class Credential:
     url: str
     token: str | None = field(repr=False)
     origin: str = ""
-    """Place where the token was found, for messages."""
+    """Text that names the place where the token was found, such as a file, for messages."""
     file: Path | None = None
-    """File that contains nothing but the token."""
+    """File that contains only the token; None if the token does not come from such a file."""
     logins: Path | None = None
-    """File of stored logins that contains the token."""
+    """File of stored logins in which the token was found, or was searched for last; otherwise None."""
 
     @property
     def bearer(self) -> str | TokenFile | None:
@@ -120,7 +120,7 @@ class Credential:
 def resolve(
     url: str | None = None, token_file: Path | None = None, environment: Mapping[str, str] | None = None
 ) -> Credential:
-    """Return the server and token given by flags, environment or stored logins."""
+    """Return the server and the token, from arguments, environment variables, a stored login or a local server."""
     environment = os.environ if environment is None else environment
     stored = read_logins(logins_path(environment))
     by_variable = next(filter(None, map(environment.get, SERVER_VARIABLES)), None)
@@ -217,7 +217,7 @@ def _forbidden_rights(path: Path) -> int:
 
 @dataclass(frozen=True)
 class Logins:
-    """Tokens by server, and the default server."""
+    """Stored logins: the token for each server, by its address, and the default server."""
 
     default: str | None = None
     tokens: Mapping[str, str] = field(default_factory=dict, repr=False)
@@ -247,7 +247,7 @@ def store_login(path: Path, url: str, token: str) -> None:
 
 
 def forget_login(path: Path, url: str) -> bool:
-    """Delete the token for a server; return whether there was one."""
+    """Delete the stored token for a server from the file of logins; return False if none was stored."""
     stored = read_logins(path)
     if url not in stored.tokens:
         return False

@@ -16,7 +16,7 @@ from typing import Any
 
 from marey_client.credentials import Credential
 from marey_client.errors import MareyError
-from marey_client.extras import room
+from marey_client.extras import import_optional
 from marey_schemas.documents.differences import Difference
 from marey_schemas.lineage import LineageGraph
 from marey_schemas.queue.comparisons import RunComparison
@@ -24,28 +24,28 @@ from marey_schemas.queue.comparisons import RunComparison
 
 def serve(**settings: Any) -> None:
     """Run a server until it is stopped; settings that are None come from the environment or `marey.toml`."""
-    commands = room("marey_server.commands", "server")
+    commands = import_optional("marey_server.commands", "server")
     with _refusals_of(commands):
         commands.serve(**_given(settings))
 
 
 def database(action: str, *, data: Path | None, database_url: str | None, **options: Any) -> None:
     """Run the database command `action`, a function of `marey_server.commands`, with the options that are given."""
-    commands = room("marey_server.commands", "server")
+    commands = import_optional("marey_server.commands", "server")
     with _refusals_of(commands):
         getattr(commands, action)(**_given({"data": data, "database_url": database_url}), **options)
 
 
 def examine(*, data: Path | None, database_url: str | None) -> list[tuple[str, str, str]]:
     """Check a server's machine; return for each check its name, its state (ok, warning or fault) and a detail."""
-    commands = room("marey_server.commands", "server")
+    commands = import_optional("marey_server.commands", "server")
     found: list[tuple[str, str, str]] = commands.examine(**_given({"data": data, "database_url": database_url}))
     return found
 
 
 def examine_scripts() -> tuple[str, str, str]:
     """Check which limits and isolation this machine can enforce on scripts; return check, state and detail as texts."""
-    found: tuple[str, str, str] = room("marey_worker.kinds.script", "worker").examine()
+    found: tuple[str, str, str] = import_optional("marey_worker.kinds.script", "worker").examine()
     return found
 
 
@@ -54,7 +54,7 @@ def compute_capacity(**amounts: Any) -> dict[str, Any]:
 
     `amounts` are the options of `marey capacity`.
     """
-    answers = room("marey_server.capacity.answers", "server")
+    answers = import_optional("marey_server.capacity.answers", "server")
     try:
         found: dict[str, Any] = answers.capacity(**amounts)
     except answers.NotComputable as error:
@@ -69,7 +69,7 @@ def predict_jobs(
 
     `known` is a number of workers whose jobs per second were measured, and this measured value.
     """
-    answers = room("marey_server.capacity.answers", "server")
+    answers = import_optional("marey_server.capacity.answers", "server")
     try:
         fitted = answers.fit_idle(job, *known, work_s, seed)
         found: dict[int, float] = answers.predict(fitted, workers, work_s, seed)
@@ -80,12 +80,14 @@ def predict_jobs(
 
 def work(credential: Credential, **options: Any) -> None:
     """Run jobs of a server until the worker is stopped."""
-    room("marey_worker.commands", "worker").work(credential, **options)
+    import_optional("marey_worker.commands", "worker").work(credential, **options)
 
 
 def draw_difference(difference: Difference, file_type: str) -> bytes:
     """Return a picture of a difference as a file of the type `png` or `svg`."""
-    picture: bytes = room("marey_reports.differences.picture", "figures").draw_difference(difference, file_type)
+    picture: bytes = import_optional("marey_reports.differences.picture", "figures").draw_difference(
+        difference, file_type
+    )
     return picture
 
 
@@ -95,7 +97,7 @@ def draw_lineage(graph: LineageGraph, file_type: str) -> bytes:
     Raises `MareyError` if the graph is too large for a picture.
     """
     try:
-        picture: bytes = room("marey_reports.lineage.picture", "figures").draw_lineage(graph, file_type)
+        picture: bytes = import_optional("marey_reports.lineage.picture", "figures").draw_lineage(graph, file_type)
     except ValueError as error:
         raise MareyError(str(error)) from error
     return picture
@@ -108,7 +110,9 @@ def draw_comparison(comparison: RunComparison, **options: Any) -> bytes:
     Raises `MareyError` if the runs have no values for the wanted chart.
     """
     try:
-        chart: bytes = room("marey_reports.comparisons.page", "figures").draw_comparison(comparison, **options)
+        chart: bytes = import_optional("marey_reports.comparisons.page", "figures").draw_comparison(
+            comparison, **options
+        )
     except ValueError as error:
         raise MareyError(str(error)) from error
     return chart
@@ -117,8 +121,8 @@ def draw_comparison(comparison: RunComparison, **options: Any) -> bytes:
 @contextmanager
 def server_in_thread(data: Path, *, workers: int) -> Iterator[str]:
     """Run a server with workers on a free local port until the `with` block ends; yield the server's address."""
-    app = room("marey_server.app", "all")
-    settings = room("marey_server.process.settings", "all").Settings(
+    app = import_optional("marey_server.app", "all")
+    settings = import_optional("marey_server.process.settings", "all").Settings(
         data=data, host="127.0.0.1", port=0, local_workers=workers, log_form="text"
     )
     started: Future[str] = Future()

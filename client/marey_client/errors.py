@@ -12,7 +12,7 @@ class MareyError(Exception):
 
 
 class BadArgument(MareyError, ValueError):
-    """An argument of a function of this package is not valid; the text names the argument."""
+    """An argument of a function of the SDK is not valid; the text names the argument."""
 
 
 # Nobody answered, or somebody else did
@@ -23,7 +23,7 @@ class Unreachable(MareyError):
 
 
 class ConnectionClosed(MareyError):
-    """The async client was closed before the call ended, or before it began."""
+    """The async client was closed before a call ended, or before the call began."""
 
     def __init__(self) -> None:
         super().__init__("the client is closed; keep it open until all calls have ended")
@@ -90,7 +90,7 @@ class CannotExport(MareyError):
 
 
 class NotReplaced(MareyError):
-    """A file that would be replaced exists, and is of another kind than the new file."""
+    """The file to write exists and is not an archive, so that it is not replaced."""
 
 
 class FolderNotEmpty(MareyError):
@@ -110,7 +110,7 @@ class CannotBisect(MareyError):
 
 
 class NotComparable(MareyError):
-    """The numbers of two results mean different things; the text gives the reason and what to do."""
+    """Two results cannot be compared, because their numbers mean different things; the text says what to do."""
 
 
 class FileChanged(MareyError):
@@ -118,15 +118,15 @@ class FileChanged(MareyError):
 
 
 class NothingToUpload(MareyError):
-    """There are no motion files where some were expected."""
+    """The given places do not exist, or contain no motion files that can be imported."""
 
 
 class BadFileName(MareyError):
-    """A file has a name that cannot be sent."""
+    """A file has a name that a request cannot contain."""
 
 
 class SameName(MareyError):
-    """Two files would get the same name."""
+    """Two files of one import would get the same name on the server."""
 
 
 class NoSuchPath(MareyError, KeyError):
@@ -140,7 +140,7 @@ class NoSuchJoint(MareyError):
 
 
 class NoAnnotations(MareyError):
-    """None of the given clips has an annotation that the request needs."""
+    """None of the given clips has an annotation in the requested layer."""
 
 
 # How jobs end
@@ -165,7 +165,7 @@ class WaitedTooLong(MareyError):
 
 
 class RequestFailed(MareyError):
-    """The server refused or failed a request."""
+    """The server answered a request with an error; subclasses distinguish the errors."""
 
     status: ClassVar[int] = 0
 
@@ -193,7 +193,7 @@ class RequestFailed(MareyError):
 
     @property
     def code(self) -> str:
-        """The short name of the error, for programs."""
+        """The short name of the error, such as `name-taken`, for programs."""
         return self.problem.code
 
     @property
@@ -208,23 +208,23 @@ class RequestFailed(MareyError):
 
     @property
     def errors(self) -> tuple[FieldError, ...]:
-        """The invalid fields of the request, one entry each."""
+        """The invalid fields of the request, one entry for each."""
         return self.problem.errors
 
     @property
     def context(self) -> dict[str, Any]:
-        """Details of the error, such as the current revision."""
+        """Details of the error by name, such as the current revision."""
         return self.problem.context
 
 
 class BadRequest(RequestFailed):
-    """The request is malformed."""
+    """The request is malformed, for example a query parameter."""
 
     status = 400
 
 
 class Unauthenticated(RequestFailed):
-    """A valid token is needed."""
+    """The request needs a valid token: it had none, or its token is unknown, revoked or expired."""
 
     status = 401
 
@@ -252,7 +252,7 @@ class LeaseLost(Conflict):
 
 
 class PreconditionFailed(RequestFailed):
-    """The resource has changed since it was read."""
+    """The resource has changed since it was read; read it again, and repeat the change."""
 
     status = 412
 
@@ -264,7 +264,7 @@ class TooLarge(RequestFailed):
 
 
 class Invalid(RequestFailed):
-    """The request is well formed but not valid."""
+    """The request is well formed but not valid; `errors` names the invalid fields."""
 
     status = 422
 

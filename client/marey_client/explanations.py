@@ -26,7 +26,7 @@ def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> li
 
 
 def _limit_of(marey: Marey, job: Job) -> RunningJobs | None:
-    """Return the number and the limit of running jobs in the project; None if unknown or if the job is not queued."""
+    """Return the number of running jobs of the project and its limit; None if unknown, or if the job is not queued."""
     if job.state is not JobState.QUEUED:
         return None
     try:
@@ -130,7 +130,7 @@ def _why_own_pod(job: Job) -> str:
 
 
 def _may_fit(worker: Worker, job: Job) -> bool:
-    """Return whether a worker runs jobs like this one, or whether its kinds and labels are unknown."""
+    """Return whether a worker may run the job: the worker's kinds and labels fit, or they are unknown."""
     if worker.kinds is None or worker.labels is None:
         return True
     return job.kind in worker.kinds and job.labels.items() <= worker.labels.items()

@@ -11,7 +11,7 @@ from types import ModuleType
 from marey_client.errors import MissingPackage
 
 
-def room(module: str, extra: str) -> ModuleType:
+def import_optional(module: str, extra: str) -> ModuleType:
     """Import a module. Raises `MissingPackage`, which names the pip extra to install, if a package is missing."""
     try:
         return importlib.import_module(module)

@@ -67,13 +67,13 @@ class FoundFiles:
     exported: Mapping[str, ExportedClip] = field(default_factory=dict)
     """Description of each clip whose file an export of a dataset wrote, by the name of the file."""
     unit: LengthUnit | None = None
-    """Unit of length of the files; known if all files come from one export, otherwise None."""
+    """Unit of length of the files if all of them come from one export; otherwise None."""
     changed_tables: tuple[Path, ...] = ()
     """Tables of take records that differ from the sidecars in their folders; imports use only the sidecars."""
 
     @property
     def motions_left_out(self) -> tuple[Path, ...]:
-        """Left-out files whose endings are those of motion files, and left-out folders, which contain such files."""
+        """Left-out files that seem to contain motion, by their endings, and left-out folders with such files."""
         return tuple(path for path in self.left_out if _is_motion(path.name) or path.is_dir())
 
 
@@ -95,7 +95,9 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
             _add(files, place.name, place)
             continue
         if not place.is_dir():
-            raise NothingToUpload(f"{place} does not exist")
+            raise NothingToUpload(
+                f"{place} does not exist; give the path of a motion file, or of a folder with motion files"
+            )
         folder = ReturningFolder.at(place)
         returning += [folder] if folder is not None else []
         visible, hidden = _files_below(place)
@@ -194,7 +196,7 @@ def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
 
 @dataclass(frozen=True)
 class Imports:
-    """Imports into a project."""
+    """Imports of motion files into a project: search, upload, import, and restoring of exported clips."""
 
     transport: Transport
     project: str
@@ -206,8 +208,8 @@ class Imports:
     ) -> list[ImportEntry]:
         """Import files; return one entry for each file, in order. A refused file does not affect the other files."""
         notify = notice or _ignore_notice
-        named = [file for file in files if _may_travel(file.name)]
-        entries = {file.name: _refused_name(file.name) for file in files if not _may_travel(file.name)}
+        named = [file for file in files if _can_be_sent(file.name)]
+        entries = {file.name: _refused_name(file.name) for file in files if not _can_be_sent(file.name)}
         sent = {file.name: file for file in self.send(named, notice=notify)}
         for portion in batches(named):
             for entry in self.run(tuple(sent[file.name] for file in portion), options):
@@ -246,12 +248,12 @@ class Imports:
         return ImportAnswer.model_validate(job.result).entries
 
     def send(self, files: Sequence[LocalFile], *, notice: Notice | None = None) -> tuple[ImportFile, ...]:
-        """Upload the bytes that the server does not have; return the files in the form of an import request.
+        """Upload the bytes that the server does not have; return the files as an import request names them.
 
         Raises `BadFileName` if a name cannot be sent.
         """
         for file in files:
-            if not _may_travel(file.name):
+            if not _can_be_sent(file.name):
                 raise BadFileName(refusal_text(_refused_name(file.name)))
         notify = notice or _ignore_notice
         digests: dict[str, str] = {}
@@ -268,8 +270,8 @@ class Imports:
         return tuple(ImportFile(name=file.name, blob=digests[file.name]) for file in files)
 
 
-def _may_travel(name: str) -> bool:
-    """Return whether a file name can be sent in a request; some names that file systems allow cannot be sent."""
+def _can_be_sent(name: str) -> bool:
+    """Return whether a request can contain a file name, which must be short UTF-8 text without control characters."""
     try:
         _FILE_NAME.validate_python(name)
     except ValidationError:
@@ -278,7 +280,7 @@ def _may_travel(name: str) -> bool:
 
 
 def _refused_name(name: str) -> ImportEntry:
-    """Return the entry of a file that is refused because of its name."""
+    """Return the entry in the result of an import for a file that is refused because of its name."""
     shown = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in name)
     detail = "its name is too long, is not UTF-8, or contains line breaks or other control characters; rename the file"
     return ImportEntry(name=shown, status="failed", error=Refusal(code="file-name", detail=detail))

@@ -1,4 +1,4 @@
-"""Items of every kind: lookup, creation, changes, parts and history."""
+"""Handles of items of every kind: lookup, creation, changes, parts and history."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from marey_schemas.queue.jobs import ItemInput
 
 
 class ItemHandle:
-    """Handle of an item in the state in which it was read; its methods send requests."""
+    """Handle of an item, in the state in which the item was read; its methods send requests to the server."""
 
     transport: Transport
     project: str
     """Name of the project."""
     item: Item
-    """State of the item when it was read, or changed by this handle."""
+    """State of the item when the handle read it, or changed it last."""
 
     def __init__(self, transport: Transport, project: str, item: Item) -> None:
         self.transport = transport
@@ -56,7 +56,7 @@ class ItemHandle:
 
     @property
     def name(self) -> str:
-        """The name within its collection."""
+        """The name, which is unique among the items of this kind in the folder."""
         return self.item.name
 
     @property
@@ -66,7 +66,7 @@ class ItemHandle:
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the item, relative to the API's root."""
         return f"/projects/{self.project}/{self.item.kind.plural}/{self.item.id}"
 
     @sends_nothing
@@ -75,7 +75,7 @@ class ItemHandle:
         return ItemInput(item=self.id, revision=self.item.revision)
 
     def part(self, part: str, *, revision: int | None = None, **query: str | None) -> dict[str, Any]:
-        """Return the document of a part, with numpy arrays."""
+        """Return the document of a part, with numpy arrays: of the given revision, or of the newest one."""
         tree, _ = self.transport.get_tree(f"{self.url}/parts/{part}", {"revision": revision, **query})
         return dict(tree)
 
@@ -104,7 +104,10 @@ class ItemHandle:
         return self._renewed(read_model(Item, response))
 
     def delete(self) -> None:
-        """Delete the item; `restore` restores it."""
+        """Delete the item; `restore` restores it.
+
+        Raises `PreconditionFailed` if the item was changed since it was read.
+        """
         self.transport.send("DELETE", self.url, headers=self._if_match())
 
     def restore(self) -> Item:
@@ -116,7 +119,7 @@ class ItemHandle:
         return pages(self.transport, Revision, f"{self.url}/revisions")
 
     def revision(self, number: int) -> Revision:
-        """Return one revision of the item."""
+        """Return the revision of the item with this number. Raises `NotFound` if there is none."""
         return self.transport.get(Revision, f"{self.url}/revisions/{number}")
 
     def lineage(self) -> Lineage:
@@ -134,7 +137,7 @@ class ItemHandle:
         return self.transport.get(LineageGraph, f"{self.url}/lineage-graph", params)
 
     def staleness(self) -> Staleness:
-        """Return whether an input of the item has a newer revision."""
+        """Return whether an input from which the item was made has a newer revision now, and which inputs have."""
         return self.transport.get(Staleness, f"{self.url}/stale")
 
     def difference(
@@ -204,7 +207,7 @@ Handle = TypeVar("Handle", bound=ItemHandle)
 
 @dataclass(frozen=True)
 class Items(Generic[Handle]):
-    """Items of one kind in a project, which can be iterated, counted, and looked up by `items[path]`."""
+    """Items of one kind in a project: iterable, counted by `len`, and looked up by `items[path]`."""
 
     transport: Transport
     project: str
@@ -264,7 +267,7 @@ class Items(Generic[Handle]):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the items, relative to the API's root."""
         return f"/projects/{self.project}/{self.kind.plural}"
 
     def list(
@@ -309,7 +312,7 @@ class Items(Generic[Handle]):
         return self.transport.get(QueryExplanation, path, {"query": query, "collection": collection})
 
     def get(self, item_id: str) -> Handle:
-        """Return an item by its id."""
+        """Return the item with this id. Raises `NotFound` if there is none."""
         return self._handle(self.transport.get(Item, f"{self.url}/{item_id}"))
 
     def count(self, *, collection: str | None = None, filters: Params | None = None) -> int:
@@ -318,7 +321,7 @@ class Items(Generic[Handle]):
         return self.transport.get(Page, self.url, params).count or 0
 
     def restore(self, item_id: str) -> Handle:
-        """Restore a deleted item by its id."""
+        """Restore the deleted item with this id, and return it."""
         return self._handle(self.transport.post(Item, f"{self.url}/{item_id}/restore"))
 
     def create(

@@ -1,4 +1,4 @@
-"""Jobs: submit, wait, cancel, retry, read the log."""
+"""Jobs of a server: submission, waiting, cancellation, repetition, and logs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def job_request(kind: str, inputs: Mapping[str, JobInput | Sequence[JobInput]], 
 
 @dataclass(frozen=True)
 class Jobs:
-    """Jobs that the caller may read, by id."""
+    """Jobs of a server, which are named by their ids; methods submit, read, await and cancel them."""
 
     transport: Transport
 
@@ -39,7 +39,7 @@ class Jobs:
         return pages(self.transport, JobKind, "/job-kinds")
 
     def submit(self, project: str, job: JobCreate) -> Job:
-        """Submit a job."""
+        """Submit a job to a project; return the job in its present state, without waiting for it."""
         return self.transport.post(Job, f"/projects/{project}/jobs", job)
 
     def run(self, project: str, job: JobCreate, *, on_progress: OnProgress | None = None) -> Job:
@@ -91,7 +91,7 @@ class Jobs:
                 pause_s = min(2 * pause_s, 1.0)
 
     def cancel(self, job_id: str) -> Job:
-        """Ask a job to stop; a queued job is cancelled at once."""
+        """Ask a job to stop; a job that does not run yet is cancelled at once."""
         return self.transport.post(Job, f"{_address(job_id)}/cancel")
 
     def retry(self, job_id: str) -> Job:
@@ -99,7 +99,7 @@ class Jobs:
         return self.transport.post(Job, f"{_address(job_id)}/retry")
 
     def attempts(self, job_id: str) -> Iterator[Attempt]:
-        """List the attempts of a job."""
+        """List the attempts to run a job, oldest first."""
         return pages(self.transport, Attempt, f"{_address(job_id)}/attempts")
 
     def outputs(self, job_id: str) -> Iterator[JobOutput]:

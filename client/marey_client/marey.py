@@ -102,7 +102,7 @@ class Marey:
         return self.transport.post(AcceptedInvitation, "/invitations/accept", request, repeatable=True)
 
     def me(self) -> Me:
-        """Return the user and the scopes of the token."""
+        """Return the user and the scopes of the client's token."""
         return self.transport.get(Me, "/me")
 
     @sends_nothing
@@ -112,7 +112,7 @@ class Marey:
         if slash:
             raise BadArgument(f"project: {name!r} is a path; the project is {known!r}, and {path!r} a path in it")
         if name in ("", ".", ".."):
-            raise BadArgument(f"project: {name!r} is not the name of a project")
+            raise BadArgument(f"project: {name!r} is not the name of a project; `marey project ls` lists the names")
         return ProjectHandle(self.transport, name)
 
     def projects(self) -> Iterator[Project]:
@@ -142,12 +142,12 @@ class Marey:
 
     @cached_property
     def jobs(self) -> Jobs:
-        """Jobs by id."""
+        """The jobs of the server, each by its id."""
         return Jobs(self.transport)
 
     @cached_property
     def blobs(self) -> Blobs:
-        """Blobs by digest."""
+        """The blobs (bytes identified by their digest) of the server."""
         return Blobs(self.transport)
 
     @cached_property
@@ -157,7 +157,7 @@ class Marey:
 
     @cached_property
     def tokens(self) -> Tokens:
-        """The caller's tokens."""
+        """The tokens of the caller; administrators also reach tokens of other users."""
         return Tokens(self.transport)
 
 

@@ -1,4 +1,4 @@
-"""Lists that are requested page by page."""
+"""Lists of the server, which are requested page by page."""
 
 from __future__ import annotations
 

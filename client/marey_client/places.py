@@ -38,7 +38,7 @@ def _looked_up(items: Items[Handle], text: str) -> ExistingInput:
 
 
 def as_inputs(places: Places[Handle]) -> tuple[ExistingInput, ...]:
-    """Return one or several folders or items as inputs of jobs; a handle gives the revision in which it was read."""
+    """Return one or several folders or items as inputs of jobs; a handle stands for the revision that it has read."""
     return tuple(map(_as_input, _as_list(places)))
 
 
@@ -66,7 +66,7 @@ def _as_list(places: Places[Handle]) -> list[Place[Handle]]:
 
 
 def entries_at(items: Items[Handle], place: DatasetInput) -> Iterator[tuple[Entry, Item]]:
-    """Yield the entries of a dataset version that have the kind of `items`, each with its item.
+    """Yield the entries of a version of a dataset that have the kind of `items`, each with its item of the project.
 
     The item may have been deleted since the commit. Entries without an item are left out.
     """

@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from marey_schemas.queue.jobs import Job
 
 OnProgress = Callable[[str, int, int | None], None]
-"""Function called with the current activity, the amount done, and the total amount if it is known."""
+"""Function called with a text on the activity, the number of steps done, and their total, which is None if unknown."""
 
 Advance = Callable[[str, float, float | None], None]
-"""Function called with the current activity, the amount done, and the total amount if known, all of them floats."""
+"""Function called with a text on the activity, the amount done, and the total amount, which is None if unknown."""
 
 
 _bar = Lock()
-"""Held by the thread that shows a bar."""
+"""Lock of the thread that shows a progress bar, because only one bar can be shown at a time."""
 
 
 def ignore_progress(_doing: str, _done: float, _of: float | None) -> None:
@@ -59,7 +59,11 @@ def _new_bar() -> Iterator[Advance]:
 
 
 def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:
-    """Show the progress of a job. The progress of a job with tasks is counted in tasks, or scaled to `count` units."""
+    """Report the progress of a job by calling `advance`.
+
+    The progress of a job with tasks is counted in tasks, or, with `count`, scaled to this number of units called
+    `unit`.
+    """
     what = f"{now.kind} {now.state}"
     if now.progress is None:
         return advance(what, 0, None)

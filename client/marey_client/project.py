@@ -1,4 +1,4 @@
-"""Handle of a project: its settings, members and datasets, its items, and its jobs."""
+"""Handle of a project, with access to its settings, members, datasets, items and jobs."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ class ProjectHandle(JobSubmission):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the project, relative to the API's root."""
         return f"/projects/{self.name}"
 
     def read(self) -> Project:
-        """Return the project's title, visibility and the caller's role."""
+        """Return the project: its title, its visibility, and the caller's role in it."""
         return self.transport.get(Project, self.url)
 
     def change(self, change: ProjectChange) -> Project:
-        """Change title, description or visibility."""
+        """Change title, description or visibility of the project; absent fields stay as they are."""
         return read_model(
             Project, self.transport.send("PATCH", self.url, content=as_json(change), headers={"If-Match": "*"})
         )
 
     def quotas(self) -> ProjectQuotasInUse:
-        """Return the number of items and bytes in the project, and the limits."""
+        """Return the numbers of items, bytes and running jobs in the project, and their limits."""
         return self.transport.get(ProjectQuotasInUse, f"{self.url}/quotas")
 
     def change_quotas(self, change: ProjectQuotaChange) -> ProjectQuotasInUse:
@@ -73,7 +73,10 @@ class ProjectHandle(JobSubmission):
         self.transport.send("DELETE", self.url, headers={"If-Match": "*"})
 
     def restore(self) -> Project:
-        """Restore the deleted project."""
+        """Restore the project of this name that was deleted last.
+
+        Raises `Conflict` if another project has the name now.
+        """
         return self.transport.post(Project, f"{self.url}/restore")
 
     def browser_link(self) -> BrowserLink:

@@ -1,4 +1,4 @@
-"""Items of a project by kind, and its folders."""
+"""Items of a project by kind, the folders of a project, and purges."""
 
 from __future__ import annotations
 
@@ -53,17 +53,17 @@ class ProjectItems:
 
     @cached_property
     def clips(self) -> Items[ClipHandle]:
-        """The clips of the project."""
+        """The clips of the project: iterable, and by path or id, as in `clips["raw/walk"]`."""
         return Items(self.transport, self.name, Kind.CLIP, ClipHandle)
 
     @cached_property
     def skeletons(self) -> Items[SkeletonHandle]:
-        """The skeletons of the project."""
+        """The skeletons of the project: iterable, and by path or id."""
         return Items(self.transport, self.name, Kind.SKELETON, SkeletonHandle)
 
     @cached_property
     def annotations(self) -> Items[AnnotationHandle]:
-        """The annotations of the project."""
+        """The annotations of clips in the project: iterable, and by path or id."""
         return Items(self.transport, self.name, Kind.ANNOTATION, AnnotationHandle)
 
     @cached_property
@@ -73,32 +73,32 @@ class ProjectItems:
 
     @cached_property
     def edits(self) -> Edits:
-        """The edits of the project."""
+        """The edits (saved lists of commands) of the project: iterable, and by path or id."""
         return Edits(self.transport, self.name, Kind.EDIT, EditHandle)
 
     @cached_property
     def models(self) -> Items[ModelHandle]:
-        """The models of the project."""
+        """The generative models of the project: iterable, and by path or id."""
         return Items(self.transport, self.name, Kind.MODEL, ModelHandle)
 
     @cached_property
     def evaluations(self) -> Items[EvaluationHandle]:
-        """The evaluations of the project."""
+        """The evaluations of locomotion clips in the project: iterable, and by path or id."""
         return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
 
     @cached_property
     def studies(self) -> Studies:
-        """The perceptual studies of the project."""
+        """The perceptual studies of the project: iterable, and by path or id."""
         return Studies(self.transport, self.name, Kind.STUDY, StudyHandle)
 
     @cached_property
     def metrics(self) -> PerceptualMetrics:
-        """The perceptual metrics of the project."""
+        """The stored perceptual metrics of the project: iterable, and by path or id."""
         return PerceptualMetrics(self.transport, self.name, Kind.METRIC, MetricHandle)
 
     @sends_nothing
     def items(self, kind: Kind) -> Items[Any]:
-        """The items of the project, of any kind."""
+        """The items of the given kind in the project: iterable, and by path or id."""
         known: tuple[Items[Any], ...] = (
             self.clips, self.skeletons, self.annotations, self.processed, self.edits, self.models, self.evaluations,
             self.studies, self.metrics,
@@ -196,7 +196,7 @@ class Collections:
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the folders, relative to the API's root."""
         return f"/projects/{self.project}/collections"
 
     def list(
@@ -216,7 +216,7 @@ class Collections:
         return self.transport.post(Collection, self.url, checked(CollectionCreate, path=path))
 
     def move(self, collection: Collection, path: str) -> Collection:
-        """Move or rename a folder with its contents."""
+        """Move or rename a folder with its contents; the items keep their ids and their history."""
         state = {"If-Match": f'"{collection.rev}.json"'}
         body = as_json(checked(CollectionChange, path=path))
         return read_model(
@@ -229,5 +229,5 @@ class Collections:
         self.transport.send("DELETE", f"{self.url}/{collection.id}", headers=state)
 
     def restore(self, collection: Collection) -> Collection:
-        """Restore a deleted folder with its contents."""
+        """Restore a deleted folder with the contents that were deleted along with it."""
         return self.transport.post(Collection, f"{self.url}/{collection.id}/restore")

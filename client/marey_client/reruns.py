@@ -14,10 +14,10 @@ from marey_schemas.queue.job_kinds import job_kinds
 from marey_schemas.queue.jobs import ItemInput, Job, JobCreate, JobKind, JobOutput, JobState
 
 RERUNS = "reruns"
-"""Folder that receives the results of repetitions, in one subfolder for each repeated job, named by the job's id."""
+"""Folder for the results of repeated jobs; each job has a subfolder, whose name is the job's id."""
 
 Agreement = Literal["identical", "other bytes", "missing", "deleted"]
-"""Comparison of an output with its repetition.
+"""How an output of a job compares with the same output of its repetition.
 
 identical: both have the same bytes; other bytes: the bytes differ; missing: only one of the two jobs has this output;
 deleted: one of the two items was deleted, so the outputs cannot be compared. An output that refers to another output of
@@ -26,12 +26,12 @@ its job always has other bytes, because the ids differ.
 
 
 class CannotRerun(ValueError):
-    """The job cannot be repeated."""
+    """A job cannot be repeated; the text gives the reason."""
 
 
 @dataclass(frozen=True)
 class ComparedOutput:
-    """Output of a job (`first`), and the output of the same name of its repetition (`second`); None if missing."""
+    """Output of a job (`first`), and the output with the same name of the repetition (`second`); None if missing."""
 
     name: str
     agreement: Agreement

@@ -15,7 +15,7 @@ NEVER_ARRIVED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 """Failures after which the server cannot have seen the request."""
 
 TRIES_IN_SILENCE = 3
-"""Number of failed tries from which on each wait is reported; the earlier waits take less than two seconds in total."""
+"""Number of failed tries after which waits are reported; all earlier waits take less than two seconds in total."""
 
 BUSY_STATUSES = frozenset({429, 502, 503, 504})
 """HTTP statuses by which a server refuses a request temporarily, without having processed it."""
@@ -49,7 +49,7 @@ class Retries:
         return backoff.delay_s(tried) + (retry_after_s or 0.0)
 
     def report_wait(self, url: str, tried: int, elapsed_s: float, *, busy: bool) -> None:
-        """Call `notice` with the server's state and the remaining time; do nothing after the first failed tries."""
+        """Call `notice` with a text on the server and the remaining time, except after the first few failed tries."""
         if self.notice is not None and tried >= TRIES_IN_SILENCE:
             left_s = max(1, round(self.total_s - elapsed_s))
             self.notice(f"{url} {'is busy' if busy else 'does not answer'}; trying again for {left_s} s")

@@ -22,7 +22,7 @@ PARENT_VARIABLE = "TRACEPARENT"
 
 @dataclass(slots=True)
 class TracedRequest:
-    """Request in a trace; the request may be sent several times."""
+    """Request of a client that belongs to a trace, if there is one; it may be sent several times."""
 
     scope: SpanScope | None
     tries: int = 0
@@ -33,13 +33,13 @@ class TracedRequest:
         return trace_headers(self.scope)
 
     def note_try(self) -> None:
-        """Record that the request is sent; from the second time on, also record the number of repetitions."""
+        """Record in the span that the request is sent; from the second time on, record the number of repetitions."""
         if self.tries:
             self._note("http.request.resend_count", self.tries)
         self.tries += 1
 
     def note_answer(self, status: int) -> None:
-        """Record the status of an answer."""
+        """Record the HTTP status of an answer in the span."""
         self._note("http.response.status_code", status)
 
     def _note(self, attribute: str, value: int) -> None:

@@ -126,7 +126,7 @@ class Transport:
         return other
 
     def close(self) -> None:
-        """Close every connection."""
+        """Close every connection to the server."""
         self._client.close()
 
     # -- models --------------------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ class Transport:
         params: Params | None = None,
         headers: Mapping[str, str] | None = None,
     ) -> Model:
-        """Request a JSON document by GET."""
+        """Request a JSON document by GET, and return it as an instance of `answer`."""
         return read_model(answer, self.send("GET", path, params=params, headers=headers))
 
     def post(self, answer: type[Model], path: str, body: BaseModel | None = None, **options: Any) -> Model:
@@ -241,7 +241,7 @@ class Transport:
             busy = isinstance(failure, RequestFailed)
             self.retries.report_wait(self.url, tried, time.monotonic() - started, busy=busy)
             self.retries.sleep(delay_s)
-        raise AssertionError("unreachable")
+        raise AssertionError("the loop over the tries ended without a result")
 
     # -- documents with arrays -----------------------------------------------------------------------------------------
 
@@ -362,7 +362,9 @@ def read_tree(response: httpx.Response) -> Any:
     try:
         return decode_tree(response.content, media_type_of(response), max_bytes=MAX_ANSWER_BYTES)
     except CodecError as error:
-        raise UnexpectedAnswer(f"{response.request.url.path}: {error}") from error
+        raise UnexpectedAnswer(
+            f"{response.request.url.path}: the server's answer cannot be decoded: {error}"
+        ) from error
 
 
 def raise_for_problem(response: httpx.Response) -> None:

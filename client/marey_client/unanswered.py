@@ -1,4 +1,4 @@
-"""Explanations of requests that no Marey server has answered: nobody answered, or another program did."""
+"""Explanations for requests without an answer of a Marey server: no answer, or an answer of another program."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ADVICE = {
     503: _BEHIND,
     504: _BEHIND,
 }
-"""What is likely, or what to do, by the status of an answer of another program than Marey."""
+"""End of an error text by HTTP status: what another program than Marey means by the status, or what to do."""
 
 
 def explain_silence(url: str, error: httpx.TransportError) -> str:

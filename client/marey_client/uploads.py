@@ -37,7 +37,7 @@ class UploadReport:
 
     @property
     def left_out(self) -> tuple[Path, ...]:
-        """Files in the folders that were not imported, because they are not motion files or are hidden."""
+        """Paths in the folders that were not imported: hidden files, files without motion, and skipped folders."""
         return self.found.left_out
 
     def clips(self) -> Iterator[ClipHandle]:

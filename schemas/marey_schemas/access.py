@@ -1,4 +1,4 @@
-"""Users, tokens, projects and members."""
+"""Users, tokens, projects and members in requests and answers."""
 
 from datetime import datetime
 from enum import StrEnum
@@ -41,7 +41,10 @@ class Scope(StrEnum):
 
 
 class EndTokens(StrEnum):
-    """Tokens that a change of a user revokes. The token that authenticates the request always stays valid."""
+    """Tokens that a change of a user revokes: none, `sessions` (the tokens of sign-ins), or all.
+
+    The token that authenticates the request always stays valid.
+    """
 
     NONE = "none"
     SESSIONS = "sessions"
@@ -97,9 +100,9 @@ class User(Answer):
     created_at: datetime
     last_seen_at: datetime | None = Field(
         None,
-        description="Time when a token or an identity of the user was last used, to the hour; only in the list of "
-        "users, which administrators may read. Uses of tokens that were deleted later do not count. Null: there was "
-        "no use, or the answer is not this list.",
+        description="Time, to the hour, when a token or an identity of the user was last used; uses of tokens "
+        "that were deleted later do not count. Only the list of users contains this time, which "
+        "administrators may read. Null: there was no use, or the answer is not this list.",
     )
     rev: int
 
@@ -110,7 +113,8 @@ class Me(Answer):
     user: User | None
     scopes: tuple[str, ...]
     job: str | None = Field(
-        None, description="The id of the job whose attempt uses the token; null for tokens of users."
+        None,
+        description="The id of the job for which the server made the token, for one attempt; null for tokens of users.",
     )
     expires_at: datetime | None = Field(
         None, description="Time at which the token of this request ends; null: it never ends."
@@ -156,7 +160,7 @@ class TokenRotation(Request):
 
 
 class Token(Answer):
-    """A token without its secret."""
+    """Token of a user: scopes, expiry and use, without its secret."""
 
     id: str
     name: str
@@ -175,7 +179,9 @@ class Token(Answer):
     labels: dict[str, str] | None = Field(
         None, description="The labels that a worker with this token may announce; null: any."
     )
-    successor_of: str | None = Field(None, description="The id of the token that this token replaced in a rotation.")
+    successor_of: str | None = Field(
+        None, description="The id of the token that this token replaced in a rotation; null: it replaced none."
+    )
 
 
 class NewToken(Token):
@@ -235,9 +241,18 @@ class QuotaChange(Request):
     An absent limit stays as it is; null means the limit in the server's settings.
     """
 
-    items: int | None = Field(None, ge=0, le=2**53, description="Largest number of items.")
+    items: int | None = Field(
+        None,
+        ge=0,
+        le=2**53,
+        description="Largest number of items; absent: unchanged; null: the limit in the server's settings.",
+    )
     stored_bytes: int | None = Field(
-        None, ge=0, le=2**53, description="Largest total size of all revisions of the items, in bytes."
+        None,
+        ge=0,
+        le=2**53,
+        description="Largest total size of all revisions of the items, in bytes; absent: "
+        "unchanged; null: the limit in the server's settings.",
     )
 
 
@@ -257,7 +272,7 @@ class ProjectQuotaChange(QuotaChange):
 
 
 class QuotaUse(Answer):
-    """Amount used of one quota, and its limit."""
+    """Used amount of one quota, such as the number of items, and its limit."""
 
     used: int
     allowed: int
@@ -282,13 +297,14 @@ class ProjectQuotasInUse(QuotasInUse):
 
     running_jobs: RunningJobs | None = Field(
         None,
-        description="Number of the project's jobs that workers run, and its limit. A job that is divided into tasks "
-        "does not count, but its tasks do. Null: the server is too old.",
+        description="Number of the project's jobs that workers run, and its limit. A job that is divided into "
+        "tasks does not count, but its tasks do. Null: the server has an earlier version, which does "
+        "not report it.",
     )
 
 
 class MemberChange(Request):
-    """Request to set the role of a user in a project."""
+    """Request to add a user to a project with a role, or to change the role of a member."""
 
     role: Role
 

@@ -1,4 +1,4 @@
-"""Default addresses of a server. This module imports nothing, so that the command line starts quickly."""
+"""Default address of a server, and names of settings. This module imports nothing, so that commands start quickly."""
 
 API = "/api/v1"
 """Prefix of the paths of the REST API. Other paths, such as those of health checks, do not have this prefix."""

@@ -59,7 +59,7 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "token.rotated": "replaced a token of the user",
     "token.revoked": "revoked a token of the user",
 }
-"""Words for each kind of entry, such as "added the member"; a sentence has them between `actor` and `about`."""
+"""Words for each kind of entry, such as "added the member"; in a sentence, they stand between `actor` and `about`."""
 
 
 class AuditEntry(Answer):

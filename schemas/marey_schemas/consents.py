@@ -1,4 +1,4 @@
-"""Consent of performers: texts of refusals, and permissions to export clips after the end of the consent."""
+"""Consent of performers: refusals of exports after the end of a consent, and permissions for such exports."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ class ConsentOverride(Request):
         "maintainer and a reason; an event records both.",
     )
     consent_reason: ConsentReason | None = Field(
-        None, description="Reason why clips are exported although the consent of the performer has ended."
+        None,
+        description="Reason why clips are exported although the consent of the performer has ended; "
+        "required with `allow_expired_consent`.",
     )
 
     @model_validator(mode="after")

@@ -78,11 +78,16 @@ class CoverageStreamCreate(Request):
         gt=0,
         le=3600,
         allow_inf_nan=False,
-        description=f"Seconds of data that each cell needs. Absent: those of the evaluation, or {COVERAGE_LEAST_S:g}.",
+        description="Seconds of data that each cell (a speed and a turn rate) needs to count as covered. Absent: "
+        f"those of the evaluation, or {COVERAGE_LEAST_S:g}.",
     )
-    target_count: int = Field(3, ge=0, le=16, description="Number of targets in each answer.")
+    target_count: int = Field(3, ge=0, le=16, description="Number of targets (motions to record next) in each answer.")
     path_s: float = Field(
-        TARGET_PATH_S, ge=0.5, le=20, allow_inf_nan=False, description="Duration of a target's path, in seconds."
+        TARGET_PATH_S,
+        ge=0.5,
+        le=20,
+        allow_inf_nan=False,
+        description="Duration in seconds of the path that a target asks the performer to walk.",
     )
 
     @model_validator(mode="after")
@@ -100,7 +105,8 @@ class CoverageStreamCreate(Request):
             cells = len(self.speeds_m_s) * len(self.turn_rates_deg_s)
             if cells > MOST_CELLS:
                 raise ValueError(
-                    f"these speeds and turn rates make a grid of {cells} cells; at most {MOST_CELLS} are allowed"
+                    f"speeds_m_s and turn_rates_deg_s make a grid of {cells} cells; at most {MOST_CELLS} are "
+                    "allowed, so leave out some values"
                 )
         return self
 
@@ -112,7 +118,9 @@ class CoverageFrames(Request):
         ge=0, le=2**53, description="Number of frames that were sent before the frames of this request."
     )
     poses: Annotated[NDArray[Any], ArrayOf(ndim=2)] | None = Field(
-        None, description="[frames, 3 + 4*joints]: root translation (m), then local quaternions w,x,y,z."
+        None,
+        description="[frames, 3 + 4*joints]: root translation (m), then local quaternions w,x,y,z; an "
+        "alternative to `roots`.",
     )
     translations: Annotated[NDArray[Any], ArrayOf(ndim=3, columns=3)] | None = Field(
         None, description="[frames, k, 3]: local translations (m) that replace the joints' offsets; only with poses."
@@ -122,7 +130,8 @@ class CoverageFrames(Request):
     )
     roots: Annotated[NDArray[Any], ArrayOf(ndim=2, columns=3)] | None = Field(
         None,
-        description="[frames, 3]: x and z of the torso on the ground (m), heading of the body (rad), not smoothed.",
+        description="[frames, 3]: x and z of the torso on the ground (m), heading of the body (rad), not "
+        "smoothed; an alternative to `poses`.",
     )
     ends_take: bool = Field(
         False,
@@ -143,12 +152,12 @@ class CoverageFrames(Request):
         if self.frame_count > MOST_FRAMES:
             raise ValueError(f"the request has {self.frame_count} frames; at most {MOST_FRAMES} are allowed")
         if self.frame_count == 0 and not self.ends_take:
-            raise ValueError("the request is empty; send frames, or set ends_take")
+            raise ValueError("the request has no frames and does not end the take; send frames, or set ends_take")
         return self
 
     @property
     def frame_count(self) -> int:
-        """The number of frames."""
+        """The number of frames in the request."""
         return sum(len(frames) for frames in (self.poses, self.roots) if frames is not None)
 
 
@@ -172,7 +181,7 @@ class CoverageTarget(CoverageCell):
 
 
 class Performer(Answer):
-    """Position of the performer in the newest frame, and velocity over the newest measured second."""
+    """Position of the performer in the newest frame, and mean velocity in the newest second that was measured."""
 
     x_m: float
     z_m: float
@@ -180,7 +189,10 @@ class Performer(Answer):
     speed_m_s: float | None = Field(description="Speed in metres per second; null during the first second of a take.")
     turn_rate_deg_s: float | None
     forward_m_s: float | None
-    strafe_m_s: float | None = Field(description="Speed sideways, in metres per second, positive to the left.")
+    strafe_m_s: float | None = Field(
+        description="Speed sideways, in metres per second, positive to the left; "
+        "null during the first second of a take."
+    )
 
 
 class CoverageNow(Answer):
@@ -211,8 +223,10 @@ class CoverageStream(Answer):
     frame_rate_hz: float
     skeleton: RevisionRef | None
     evaluation: RevisionRef | None
-    speeds_m_s: tuple[float, ...] = Field(description="Speeds of the grid in ascending order.")
-    turn_rates_deg_s: tuple[float, ...] = Field(description="Turn rates of the grid in ascending order.")
+    speeds_m_s: tuple[float, ...] = Field(description="Speeds of the grid in metres per second, in ascending order.")
+    turn_rates_deg_s: tuple[float, ...] = Field(
+        description="Turn rates of the grid in degrees per second, positive to the left, in ascending order."
+    )
     least_s: float
     target_count: int
     path_s: float
@@ -244,7 +258,7 @@ class MeasuredOptions(Answer):
 
 
 class MeasuredCells(Answer):
-    """The coverage of each cell in an evaluation."""
+    """The coverage of each cell (a speed and a turn rate) in an evaluation."""
 
     seconds: Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=2)]
 
@@ -256,7 +270,7 @@ class MeasuredCells(Answer):
 
 
 class MeasuredCoverage(Answer):
-    """The part of `EvaluationDocument` that contains the coverage."""
+    """The members of an `EvaluationDocument` from which a coverage stream takes its grid and its initial coverage."""
 
     options: MeasuredOptions
     coverage: MeasuredCells

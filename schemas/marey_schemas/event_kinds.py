@@ -1,4 +1,4 @@
-"""Kinds of events. The type checker verifies that the server records only events of these kinds.
+"""Kinds of events of projects and of the server. The type checker verifies that no other kinds are recorded.
 
 The audit log consists of the events that concern access or deletion; their kinds are the kinds of audit entries.
 """

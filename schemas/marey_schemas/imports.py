@@ -30,7 +30,7 @@ class ImportRequest(ImportOptions):
 
 
 class Refusal(Answer):
-    """Refusal of a file, with the reason."""
+    """Reason why a file was not imported, for programs (`code`) and for people (`detail`)."""
 
     code: str
     detail: str
@@ -39,7 +39,7 @@ class Refusal(Answer):
 
 
 class ImportEntry(Answer):
-    """Result of importing one file."""
+    """Result of the import of one file: the item and the revision, or the reason of the refusal."""
 
     name: str
     status: Literal["created", "unchanged", "failed", "companion"] = Field(
@@ -77,7 +77,7 @@ def notes_output(file_name: str, layer: str) -> str:
 
 
 class Made(Protocol):
-    """Revision that the server published for an imported file."""
+    """Published revision of an item for an imported file, as a protocol of the objects that jobs and the server use."""
 
     @property
     def item(self) -> str:
@@ -144,6 +144,6 @@ def published_result(result: Mapping[str, Any], made: Mapping[str, Made]) -> dic
 
 
 class ImportAnswer(Answer):
-    """One entry per file, in the order sent."""
+    """Result of an import: one entry for each file, in the order of the request."""
 
     entries: tuple[ImportEntry, ...]

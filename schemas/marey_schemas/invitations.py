@@ -22,14 +22,19 @@ Code = Annotated[SecretStr, Field(max_length=200)]
 
 
 class InvitationTerms(Request):
-    """Limits of a new invitation."""
+    """Base of requests for invitations: the lifetime and the number of uses of the invitation."""
 
     note: Note = Field(
         "",
         description="Person or purpose that the invitation is for; shown only to users who may "
         "withdraw the invitation.",
     )
-    expires_in_s: int = Field(7 * DAY_S, ge=60, le=MAX_DAYS * DAY_S, description="Seconds until the invitation ends.")
+    expires_in_s: int = Field(
+        7 * DAY_S,
+        ge=60,
+        le=MAX_DAYS * DAY_S,
+        description="Seconds until the invitation ends, counted from its creation.",
+    )
     uses: int = Field(1, ge=1, le=MAX_USES, description="Number of people who can use the invitation.")
 
 
@@ -42,7 +47,9 @@ class InvitationCreate(InvitationTerms):
 class AccountInvitationCreate(InvitationTerms):
     """Request to invite people who have no account yet; they choose user name and password themselves."""
 
-    project: ProjectName | None = Field(None, description="Project of which the new user becomes a member.")
+    project: ProjectName | None = Field(
+        None, description="Project of which the new user becomes a member; null: of none."
+    )
     role: Role | None = Field(None, description="Role in the project; needed if a project is named.")
 
     @model_validator(mode="after")
@@ -53,7 +60,7 @@ class AccountInvitationCreate(InvitationTerms):
 
 
 class Invitation(Answer):
-    """Open invitation without its code."""
+    """Open invitation to a project or to the server, without its code."""
 
     id: str
     prefix: str = Field(description="The text between the two `_` of the code.")

@@ -31,7 +31,7 @@ class ItemToExport:
 
 @dataclass(frozen=True, slots=True)
 class OriginalFile:
-    """Original file that an item was imported from."""
+    """The file from which an item was imported, byte for byte."""
 
     name: str
     digest: str

@@ -27,7 +27,7 @@ class CollectionChange(Request):
 
 
 class Collection(Answer):
-    """A folder in a project's tree."""
+    """Folder (collection) of a project, which contains items and folders."""
 
     id: str
     path: str
@@ -70,7 +70,7 @@ class ItemRevert(Request):
 
 
 class HidingCondition(Answer):
-    """Condition of a query, with the numbers of items that the condition excludes."""
+    """Condition of a query, with the numbers of items that this condition excludes."""
 
     condition: str
     hides: int = Field(description="Number of items that do not meet this condition.")
@@ -80,13 +80,13 @@ class HidingCondition(Answer):
 class QueryExplanation(Answer):
     """Number of items that a query selects, and the numbers of items that its conditions exclude."""
 
-    items: int = Field(description="Number of items that the query was applied to.")
+    items: int = Field(description="Number of items to which the query was applied.")
     selected: int
     conditions: tuple[HidingCondition, ...] = Field(description="Conditions that every selected item meets.")
 
 
 class PartSummary(Answer):
-    """Part of an item: one document."""
+    """Part of an item, without its content: schema, digest and size of the document."""
 
     document: str
     schema_: str = Field(alias="schema")
@@ -94,7 +94,7 @@ class PartSummary(Answer):
 
 
 class PartPlace(Request):
-    """Address of a document to read: a part of a revision of an item."""
+    """Address of a document to read: an item, a revision, and the name of a part."""
 
     kind: Kind
     item: str = Field(max_length=64)
@@ -103,13 +103,13 @@ class PartPlace(Request):
 
 
 class PartsRequest(Request):
-    """Request for several documents."""
+    """Request to read several documents, each a part of a revision of an item."""
 
     parts: tuple[PartPlace, ...] = Field(min_length=1, max_length=256)
 
 
 class Item(Answer):
-    """Named object of one kind in a project, at its newest revision."""
+    """Item: a named object of one kind in a project, such as a clip, at its newest revision."""
 
     id: str
     kind: Kind
@@ -140,7 +140,7 @@ class Item(Answer):
 
 
 class Revision(Answer):
-    """One immutable state of an item."""
+    """Revision: one immutable state of an item, with its author, time and message."""
 
     item: str
     revision: int
@@ -191,7 +191,7 @@ class Staleness(Answer):
 
 
 class Page(Answer):
-    """One page of a list."""
+    """One page of a list, with the cursor of the next page."""
 
     items: tuple[Any, ...]
     next_cursor: str | None = None
@@ -208,7 +208,7 @@ class BlobsQuery(Request):
 
 
 class BlobsMissing(Answer):
-    """Digests of the blobs that must be sent."""
+    """Digests of the requested blobs that are missing, so that they must be sent."""
 
     missing: tuple[str, ...]
 
@@ -217,16 +217,16 @@ class UploadCreate(Request):
     """Request to begin an upload of bytes in pieces."""
 
     length: int = Field(ge=1, le=16 * 2**30, description="Number of bytes of the whole upload.")
-    digest: Digest | None = Field(None, description="Digest that the complete upload must have.")
+    digest: Digest | None = Field(None, description="Digest that the complete upload must have; null: any.")
 
 
 class Upload(Answer):
-    """Progress of a resumable upload."""
+    """Resumable upload of bytes: the bytes received so far, and the digest at the end."""
 
     id: str
     length: int
     offset: int = Field(description="Number of bytes received, which is where the next piece starts.")
-    digest: str | None = Field(None, description="Digest of the blob, once the upload is complete.")
+    digest: str | None = Field(None, description="Digest of the blob; null until the upload is complete.")
 
 
 class Event(Answer):

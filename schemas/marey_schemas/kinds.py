@@ -45,7 +45,7 @@ _BY_PLURAL = {kind.plural: kind for kind in Kind}
 
 @dataclass(frozen=True)
 class PartSpec:
-    """Part of a kind: the schema of its documents, and whether a revision must have it."""
+    """Declaration of a part of the items of a kind: the schema of its document, and whether revisions must have it."""
 
     schema: str
     required: bool

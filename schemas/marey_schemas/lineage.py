@@ -14,9 +14,9 @@ from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
 
 MOST_REVISIONS = 1000
-"""Greatest number of revisions that a graph holds in each direction."""
+"""Greatest number of revisions that a graph contains in each direction (inputs and results)."""
 MOST_LINKS = 10_000
-"""Greatest number of links that a graph holds in each direction."""
+"""Greatest number of links that a graph contains in each direction (inputs and results)."""
 CUT_OFF = (
     f"The graph is cut off: it has more than {MOST_REVISIONS:,} revisions or {MOST_LINKS:,} links in one direction. "
     "The nearest ones are shown."
@@ -89,7 +89,9 @@ class LineageJob(Answer):
     seed: int
     code_versions: tuple[str, ...] = Field((), description="Versions of the code that created the revisions.")
     commits: tuple[str, ...] = Field((), description="Digests of the commits from which the job took its inputs.")
-    commit: str | None = Field(None, description="Digest of the commit that has the outputs of the job.")
+    commit: str | None = Field(
+        None, description="Digest of the commit that the job made of its outputs; absent: it made none."
+    )
     finished_at: datetime | None = None
 
 
@@ -118,7 +120,7 @@ class LineageGroup(NamedTuple):
 
 
 class GroupLink(NamedTuple):
-    """Link between two groups of revisions: jobs used revisions of the group `source` to create the group `result`.
+    """Link between two groups of revisions: jobs used revisions of one group to create revisions of the other.
 
     Parameters
     ----------

@@ -81,7 +81,7 @@ class LruCache(Generic[Key, Value]):
         return value
 
     def items(self) -> list[tuple[Key, Value]]:
-        """Return all keys with their values, the least recently used first."""
+        """Return all pairs of key and value, the least recently used first."""
         with self._lock:
             return [(key, value) for key, (value, _) in self._entries.items()]
 

@@ -1,4 +1,4 @@
-"""Types of constrained strings for documents."""
+"""Types of texts with a required form, such as names, paths and digests, for fields of documents."""
 
 import re
 from typing import Annotated
@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import StringConstraints
 
 FORMS: dict[str, str] = {}
-"""Explanations of patterns for messages to people, by pattern; each continues a sentence that ends with "must"."""
+"""Explanation of each pattern for error texts, by the pattern; it continues the words "the text must"."""
 
 
 def form(pattern: str, words: str) -> str:

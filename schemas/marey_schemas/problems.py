@@ -10,7 +10,7 @@ MEDIA_TYPE = "application/problem+json"
 
 
 class FieldError(Answer):
-    """An error in a request and its place."""
+    """An invalid value in a request: its place, and what is wrong with it."""
 
     pointer: str = Field(description="JSON Pointer into the body, or the name of a query parameter or header.")
     code: str

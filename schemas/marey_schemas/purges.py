@@ -25,7 +25,9 @@ class PurgeRequest(Request):
     One request examines at most `MOST_PURGED` items; `next` in the answer continues the purge.
     """
 
-    item: str | None = Field(None, max_length=64, description="Id of one deleted item.")
+    item: str | None = Field(
+        None, max_length=64, description="Id of one deleted item; absent: the other conditions select the items."
+    )
     path: str | None = Field(
         None, max_length=1300, description="Path, made of folder and name, that deleted items had."
     )
@@ -36,14 +38,22 @@ class PurgeRequest(Request):
     )
     kind: Kind | None = Field(None, description="Kind of the items; absent: all kinds.")
     query: str | None = Field(
-        None, max_length=MOST_CHARACTERS, description="Query that the items meet, such as `subject = 02`."
+        None,
+        max_length=MOST_CHARACTERS,
+        description="Query that the items meet, such as `subject = 02`; absent: any items.",
     )
     older_than_days: int | None = Field(
-        None, ge=0, le=100_000, description="Only items that were deleted at least this number of days ago."
+        None,
+        ge=0,
+        le=100_000,
+        description="Only items that were deleted at least this number of days ago; absent: all.",
     )
     preview: bool = Field(False, description="Report what a purge would do, but change nothing.")
     after: str | None = Field(
-        None, max_length=64, description="Value of `next` in the last answer, to continue a purge of many items."
+        None,
+        max_length=64,
+        description="Value of `next` in the previous answer, to continue a purge of many "
+        "items; absent: the purge begins.",
     )
 
     @model_validator(mode="after")
@@ -107,7 +117,7 @@ class HeldItem(Answer):
     kind: Kind
     path: str
     holders: tuple[Holder, ...] = Field(description=f"Objects that still need the item, at most {MOST_HOLDERS}.")
-    others: int = Field(0, description="Number of further holders that are not listed.")
+    others: int = Field(0, description="Number of further objects that need the item and are not listed.")
 
 
 class PurgeAnswer(Answer):
@@ -154,7 +164,9 @@ class DatasetPurgeAnswer(Answer):
         f"{MOST_HOLDERS}: items that "
         "jobs made from a version, and jobs that have not ended."
     )
-    others: int = Field(0, description="Number of further holders that are not listed.")
+    others: int = Field(
+        0, description="Number of further objects that refer to a version of the dataset and are not listed."
+    )
     freed_bytes: int = Field(
         description="Bytes of the trees of entries, without the chunks that other datasets also have."
     )

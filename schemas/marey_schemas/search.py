@@ -25,13 +25,13 @@ MOST_CONSTRAINTS = 64
 MOST_STEPS = 16
 MOST_CANDIDATES = 256
 MOST_CANDIDATE_CONSTRAINTS = 4096
-"""Greatest product of the numbers of candidates and constraints; a search at this limit takes a few seconds."""
+"""Greatest product of the number of candidates and the number of constraints; such a search takes a few seconds."""
 
 SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOST_CONSTRAINTS)]
 
 
 class StartPlacement(Request):
-    """Position and heading of the model's coordinate frame in the world, which determine where a motion starts."""
+    """Position and heading at which a motion of a model starts in the world."""
 
     x: Coordinate = Field(0.0, description="Position along x, in metres.")
     z: Coordinate = Field(0.0, description="Position along z, in metres.")
@@ -39,7 +39,7 @@ class StartPlacement(Request):
 
 
 class SearchStep(Request):
-    """One of several motions that follow each other, with its constraints."""
+    """One motion of a sequence, with the constraints that it must meet."""
 
     model: ItemId | None = Field(
         None, description="Id of a model of the project; absent: the model in the request's path."
@@ -120,8 +120,8 @@ class ConstraintError(Answer):
     error_s: float | None = None
     searched_error: float | None = Field(
         None,
-        description="Error after the search of the tree and before numerical optimisation, in the unit of the error. "
-        "Null: the server is too old.",
+        description="Error after the search of the tree and before numerical optimisation, in the unit of the "
+        "error. Null: the server has an earlier version, which does not report it.",
     )
     finished_error: float | None = Field(
         None, description="Error after inverse kinematics, in the unit of the error; null without inverse kinematics."
@@ -141,7 +141,7 @@ class FoundStep(Answer):
     log_likelihood: float
     likelihood_percentile: float | None = Field(
         None,
-        description="Percentage of training examples less likely than the motion; null if unknown.",
+        description="Percentage of the training examples that are less likely than the motion; null if unknown.",
     )
     duration_s: float
     placement: StartPlacement
@@ -154,7 +154,7 @@ class FoundStep(Answer):
 
 
 class SearchAnswer(Answer):
-    """Result of a search."""
+    """Result of a search: the motion of each step, and the error of each constraint."""
 
     steps: tuple[FoundStep, ...]
     errors: tuple[ConstraintError, ...]
@@ -162,7 +162,7 @@ class SearchAnswer(Answer):
     out_of_reach: tuple[int, ...] = Field(
         (), description="Indices in `errors` of the constraints whose error exceeds 5 cm before inverse kinematics."
     )
-    iterations: int = Field(description="Number of iterations of the optimisation.")
+    iterations: int = Field(description="Number of iterations of the numerical optimisation.")
     motion: MotionDocument | None = None
 
 
@@ -170,7 +170,7 @@ class SearchAnswer(Answer):
 
 MOST_MOMENTS = 100
 LONGEST_EXAMPLE_S = 60.0
-"""Longest example in seconds."""
+"""Greatest duration of the example of a search, in seconds."""
 
 _MOST_NUMBER = 2**31 - 1
 
@@ -238,4 +238,7 @@ class SimilarAnswer(Answer):
     behind: int = Field(
         description="Number of clips that were created or changed since the index was updated, and were not searched."
     )
-    metric: MetricIdentity | None = Field(None, description="The metric of the distances. Null: the server is too old.")
+    metric: MetricIdentity | None = Field(
+        None,
+        description="The metric of the distances. Null: the server has an earlier version, which does not report it.",
+    )

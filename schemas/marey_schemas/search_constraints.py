@@ -23,7 +23,7 @@ Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Component = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 Tolerance = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
-"""Tolerance of a constraint.
+"""Tolerance of a constraint, in the unit of its target: metres, degrees or seconds.
 
 The smallest tolerance is finer than the accuracy of any motion capture. It is also large enough that squared errors,
 divided by the tolerance, stay finite.
@@ -48,7 +48,7 @@ def _require_coordinate(target: _Target) -> _Target:
 
 def _require_length(vector: _Vector) -> _Vector:
     if not any(abs(component) > 1e-9 for component in vector):
-        raise _invalid("the components must not all be zero")
+        raise _invalid("at least one component must not be zero")
     return vector
 
 
@@ -104,7 +104,9 @@ class LookDirectionConstraint(_AngularConstraint):
 
     type: Literal["look_direction"] = "look_direction"
     joint: Joint
-    direction: Direction | None = Field(None, description="Target direction (x, y, z) in the world.")
+    direction: Direction | None = Field(
+        None, description="Target direction (x, y, z) in the world; an alternative to `point_m`."
+    )
     point_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
         None, description="Target point (x, y, z) in the world, in metres, instead of a direction."
     )

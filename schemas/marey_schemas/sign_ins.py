@@ -91,7 +91,10 @@ class Identity(Answer):
 
 
 class BrowserLink(Answer):
-    """Code that signs one browser in, once. It belongs in the fragment of an address, which browsers do not send."""
+    """Code that signs in the first browser that uses it.
+
+    It is put after the `#` of an address, because browsers do not send this part to servers.
+    """
 
     code: str
     path: str = Field(VIEW_PATH, description="Path of a page that accepts the code, as in `/view#<code>`.")

@@ -13,9 +13,9 @@ MIB = 1024 * KIB
 GIB = 1024 * MIB
 DAY_S = 86400
 LOGIN_DAYS, LONGEST_LOGIN_DAYS = 7, 90
-"""Default and greatest number of days for which the token of a login is valid."""
+"""Default number of days, and greatest number of days, for which the token of a login is valid."""
 LONGEST_TOKEN_DAYS = 3650
-"""Greatest number of days for which another token is valid, unless it never ends."""
+"""Greatest number of days for which a token that no login created is valid, unless it never ends."""
 
 
 def batched(values: Iterable[T], size: int) -> Iterator[list[T]]:

@@ -51,7 +51,7 @@ EventKinds = Annotated[
 
 
 class WebhookCreate(Request):
-    """Request to create a webhook."""
+    """Request to create a webhook, which sends events of a project to an address."""
 
     url: WebhookUrl = Field(description="Address to which the server sends requests.")
     kinds: EventKinds = Field(DEFAULT_WEBHOOK_KINDS, description="Kinds of events that are sent.")
@@ -69,7 +69,8 @@ class WebhookChange(Request):
     description: Message | None = None
     paused: bool | None = Field(
         None,
-        description="Whether the webhook is paused: nothing is sent, and the events of the pause are sent after it.",
+        description="Whether the webhook is paused: nothing is sent, and events during the pause are sent when "
+        "it ends.",
     )
 
 
@@ -82,7 +83,7 @@ class WebhookRotation(Request):
 
 
 class Webhook(Answer):
-    """Webhook of a project, without its secret."""
+    """Webhook of a project, without its secret: address, kinds of events, and state of the deliveries."""
 
     id: str
     project: str
@@ -91,16 +92,28 @@ class Webhook(Answer):
     description: str
     creator: str | None
     paused: bool
-    paused_reason: str | None = Field(None, description="Reason, if the server has paused the webhook.")
+    paused_reason: str | None = Field(
+        None, description="Reason why the server has paused the webhook; absent if it has not."
+    )
     created_at: datetime
     updated_at: datetime
-    delivered_at: datetime | None = Field(None, description="Time of the last successful delivery.")
+    delivered_at: datetime | None = Field(
+        None, description="Time of the last successful delivery; absent: there was none."
+    )
     failures: int = Field(0, description="Number of failed attempts since the last successful delivery.")
     failing_since: datetime | None = None
-    next_attempt_at: datetime | None = Field(None, description="Time of the next attempt after a failure.")
-    last_status: int | None = Field(None, description="HTTP status of the last answer.")
-    last_error: str | None = Field(None, description="Reason why the last attempt has failed.")
-    missed: int = Field(0, description="Number of events that were deleted before delivery and not yet reported.")
+    next_attempt_at: datetime | None = Field(
+        None, description="Time of the next attempt after a failure; absent: no attempt is planned."
+    )
+    last_status: int | None = Field(None, description="HTTP status of the last answer; absent: there was none.")
+    last_error: str | None = Field(
+        None, description="Reason why the last attempt has failed; absent: it succeeded, or there was none."
+    )
+    missed: int = Field(
+        0,
+        description="Number of events that were deleted before their delivery, and of which "
+        "the webhook has not been informed yet.",
+    )
     dead: int = Field(0, description="Number of deliveries that failed and will not be sent again.")
 
 
@@ -142,7 +155,9 @@ class WebhookMessage(Answer):
     at: datetime
     subject: str = Field(description="Id of the object of the event.")
     links: dict[str, str] = Field(default_factory=dict, description="Paths of the event and its object on the server.")
-    missed: int | None = Field(None, description="Number of missed events, for `webhook.events_missed`.")
+    missed: int | None = Field(
+        None, description="Number of missed events, in messages of the kind `webhook.events_missed`; otherwise absent."
+    )
 
     def encoded(self) -> str:
         """Return the JSON text of the message."""

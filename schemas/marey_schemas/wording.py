@@ -27,7 +27,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def part_of(shown: int, total: int, noun: str) -> str:
-    """Return how many of all things are shown, for example "8 of 130 takes"; "8 takes" if all of them are shown."""
+    """Return a text on how many things are shown, such as "8 of 130 takes", or "8 takes" if all of them are shown."""
     return counted(total, noun) if shown == total else f"{shown:,} of {counted(total, noun)}"
 
 
@@ -149,7 +149,7 @@ _REASONS = {
     **dict.fromkeys(("date_type", "date_parsing", "date_from_datetime_parsing", "date_from_datetime_inexact"), _DATE),
     **dict.fromkeys(("datetime_type", "datetime_parsing", "datetime_from_date_parsing"), _TIME),
 }
-"""Reasons by pydantic's names of errors; the context of an error is inserted."""
+"""Reasons for people, by pydantic's name of the error; values of the error's context replace the placeholders."""
 
 
 def _length_reason(kind: str, context: Mapping[str, Any]) -> str:

@@ -34,7 +34,10 @@ def request_contents(
 
 
 def read_facets(transport: Transport, project_url: str, contents: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return the facets of at most `MOST_CONTENTS` revisions of a project; revisions without facets are left out."""
+    """Return the facets (published numbers) of revisions, by content digest; revisions without facets are left out.
+
+    `contents` are the content digests of at most `MOST_CONTENTS` revisions of the project.
+    """
     found = request_contents(transport, project_url, ContentsRequest(revisions=tuple(contents)))
     named = zip(contents, found.get("facets", ()), strict=False)  # servers of earlier versions send none
     return {content: values for content, values in named if values}
@@ -54,7 +57,9 @@ def first_documents(
         if not isinstance(tree, dict):
             raise UnexpectedAnswer(f"the project no longer has the revision with the content digest {place.content}")
     if not found:
-        raise UnexpectedAnswer("the server's answer contains none of the requested documents")
+        raise UnexpectedAnswer(
+            "the server's answer contains none of the requested documents; update the older of client and server"
+        )
     return found
 
 
@@ -63,7 +68,7 @@ def read_documents(
 ) -> Iterator[dict[str, Any]]:
     """Yield the documents at the addresses `places`, in order, with numpy arrays.
 
-    Memory holds the documents of one answer at a time.
+    Only the documents of one answer of the server are in memory at a time.
     """
     waiting = list(places)
     while waiting:
@@ -74,7 +79,7 @@ def read_documents(
 
 @dataclass(frozen=True)
 class ArrayBases:
-    """Document of the receiving project, and the tiles of its arrays; these tiles need not be sent to the project."""
+    """Document that the receiving project has, with the tiles of its arrays: these tiles need not be sent to it."""
 
     content: str
     """Content digest of the revision that contains the document."""
@@ -92,8 +97,8 @@ class ArrayBases:
 def bases_of_arrays(transport: Transport, project_url: str, places: Mapping[K, PartOfContent]) -> dict[K, ArrayBases]:
     """Request the tiles of the arrays of documents; documents that the project does not have are left out.
 
-    `places` are the addresses of the documents. An answer covers as many documents as fit into it, at least one; the
-    remaining documents are requested again. Raises `UnexpectedAnswer` if an answer covers no document.
+    `places` are the addresses of the documents. One answer of the server covers at least one document; the documents
+    that do not fit are requested again. Raises `UnexpectedAnswer` if an answer covers no document.
     """
     found: dict[K, ArrayBases] = {}
     waiting = list(places.items())
@@ -105,6 +110,8 @@ def bases_of_arrays(transport: Transport, project_url: str, places: Mapping[K, P
             if of_document:
                 found[key] = ArrayBases(place.content, of_document)
         if not tiles:
-            raise UnexpectedAnswer("the server's answer contains none of the requested tiles")
+            raise UnexpectedAnswer(
+                "the server's answer contains no requested tile; update the older of client and server"
+            )
         waiting = waiting[len(tiles) :]
     return found

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 OF_UNKNOWN_FIELDS = "invalid-body"
 """Code of the error by which servers of earlier versions refuse requests for differences between arrays."""
 CheckContents = Callable[[Sequence[str]], object]
-"""Function called with content digests of revisions before their documents are read."""
+"""Function that may refuse an archive: called with content digests of revisions before their documents are read."""
 
 
 class EarlierDocument(NamedTuple):
@@ -55,14 +55,14 @@ class DocumentWriter:
     differences: bool
     """Whether arrays may be replaced by their differences from arrays that the reader of the archive has."""
     known: set[str] = field(default_factory=set)
-    """Content digests of the revisions that the archive has, or will have."""
+    """Content digests of the revisions that are in the archive or are about to be added."""
     documents: dict[str, PartOfContent] = field(default_factory=dict)
     """Address on the server of each document of an entry, by the digest of the document."""
     earlier: dict[str, EarlierDocument] = field(default_factory=dict)
-    """The replaced document, by the digest of the document that replaced it."""
+    """For each document that replaced another one in a commit, by its digest: the replaced document."""
 
     def run(self) -> None:
-        """Add all documents, and the facets of all revisions."""
+        """Add all documents, and the facets (published numbers) of all revisions."""
         self.check(sorted(self.known))
         self._add_documents(self.documents)
         self._add_facets()
@@ -98,7 +98,10 @@ class DocumentWriter:
         for digest, body in bodies.items():
             data = canonical_json(body)
             if digest_of(data) != digest:
-                raise UnexpectedAnswer(f"the server's document {digest} does not match its digest")
+                raise UnexpectedAnswer(
+                    f"the server's document {digest} does not match its digest; `marey db check` on the server finds "
+                    "damaged data"
+                )
             if found := differences[digest]:
                 self.writer.add(ArchiveMember(MemberKind.DIFFERENCES, digest), differences_member(found))
             for file in self._files(digest, body):
@@ -106,7 +109,7 @@ class DocumentWriter:
             self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
 
     def _files(self, digest: str, body: Any) -> set[str]:
-        """Return the digests of the files that a document names, without the files that the replaced document named."""
+        """Return the digests of the files that a document names and the document that it replaced did not name."""
         named = _files_in(body)
         if named and digest in self.earlier:
             place = self.earlier[digest].place
@@ -124,7 +127,8 @@ class DocumentWriter:
             for content, one in zip(some, found, strict=True):
                 if one is None:
                     raise UnexpectedAnswer(
-                        f"a document refers to the revision with the content digest {content}, which the project lacks"
+                        f"a document refers to the revision with the content digest {content}, which the project "
+                        "lacks; `marey db check` on the server finds wrong references"
                     )
                 self._add_documents(
                     {digest: PartOfContent(content=content, part=part) for part, digest in one["parts"].items()}
@@ -132,7 +136,7 @@ class DocumentWriter:
                 self.writer.add(ArchiveMember(MemberKind.REVISION, content), canonical_json(one))
 
     def _add_facets(self) -> None:
-        """Add the facets of all revisions, which jobs may have published after the revisions were committed.
+        """Add the facets (published numbers) of all revisions; jobs may have published them after the commits.
 
         Each member of the archive contains the facets of a few revisions, because readers refuse members of more than
         `MOST_BYTES`.

@@ -21,9 +21,9 @@ ENTRY_SCHEMA = "marey/entry@1"
 def extract_archive(archive: Archive, folder: Path) -> Iterator[Path]:
     """Write the newest version of an archive to a folder, and yield the path of each written file.
 
-    Each entry becomes one JSON document with the parts of the entry, and with the revisions to which these parts refer.
-    For a clip, the file from which it was imported is written, too. Raises `BadArchive` if the content of a member of
-    the archive does not have the digest in the member's name.
+    Each entry becomes one JSON file with the parts of the entry, and with the revisions to which these parts refer. For
+    a clip, the file from which it was imported is written, too. Raises `BadArchive` if the content of a member of the
+    archive does not have the digest in the member's name.
     """
     entries = list(archive.versions().entries(archive.manifest.commit))
     extraction = _Extraction(archive, folder, {one.content: one for one in entries}, TakenPaths())
@@ -33,7 +33,7 @@ def extract_archive(archive: Archive, folder: Path) -> Iterator[Path]:
 
 @dataclass
 class _Extraction:
-    """Archive that is being extracted into a folder."""
+    """Extraction of the newest version of an archive into a folder, while it runs."""
 
     archive: Archive
     folder: Path

@@ -44,7 +44,7 @@ LEAST_BYTES_SHARED = 16 * KIB
 
 
 class ReceivingDataset(Protocol):
-    """Members of `DatasetHandle` that an import needs."""
+    """Properties and methods of `DatasetHandle` that the import of an archive needs."""
 
     @property
     def transport(self) -> Transport:
@@ -59,7 +59,7 @@ class ReceivingDataset(Protocol):
         """The path of the dataset, relative to the API's root."""
 
     def at(self, version: str) -> Commit:
-        """Return the commit that a version names."""
+        """Return the commit that a version (a branch, a tag or a digest) names."""
 
 
 def send_versions(
@@ -70,7 +70,7 @@ def send_versions(
     *,
     begins: str | None = None,
 ) -> Commit:
-    """Record the versions of an archive in a dataset, with their digests; return the newest version.
+    """Record the versions of an archive in a dataset, where they keep their digests; return the newest version.
 
     `has` returns whether the dataset has a commit. If `begins` names a branch without commits, this branch moves to the
     newest version; no other branch moves. After an interrupted import, the next import sends only the data that the
@@ -121,12 +121,12 @@ class _Import:
     """Function that returns whether the dataset has the commit with the given digest."""
     revisions: dict[str, _Revision] = field(default_factory=dict)
     """Revisions of entries, by content digest."""
-    held: set[str] = field(default_factory=set)
+    present: set[str] = field(default_factory=set)
     """Content digests of the revisions that the project has."""
     sent: set[str] = field(default_factory=set)
     """Content digests of the revisions that were sent."""
     facets: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Facets of the revisions in the archive, by content digest."""
+    """Facets (published numbers) of the revisions in the archive, by content digest."""
     homes: dict[str, str] = field(default_factory=dict)
     """For each document, by digest: the content digest of a revision that contains the document."""
     earlier: dict[str, str] = field(default_factory=dict)
@@ -187,22 +187,22 @@ class _Import:
 
     def _ensure(self, contents: Iterable[str]) -> None:
         """Send the revisions that the project lacks; a revision is sent after the revisions to which it refers."""
-        missing = self._missing(sorted(set(contents) - self.held))
+        missing = self._missing(sorted(set(contents) - self.present))
         referred = {content: self._references(content) for content in missing}
-        if further := set[str]().union(*referred.values()) - self.held - referred.keys():
+        if further := set[str]().union(*referred.values()) - self.present - referred.keys():
             self._ensure(further)
-        while waiting := [content for content in missing if content not in self.held]:
-            ready = [content for content in waiting if referred[content] <= self.held]
+        while waiting := [content for content in missing if content not in self.present]:
+            ready = [content for content in waiting if referred[content] <= self.present]
             for together in self._batches(ready or waiting):
                 self._send(together)
 
     def _references(self, content: str) -> set[str]:
-        """Return the revisions to which a revision's documents refer; documents that the project has are skipped."""
+        """Return the revisions to which those documents of a revision refer that the project does not have yet."""
         documents = [digest for digest in self._revision(content).parts.values() if not self._is_stored(digest)]
         return {one for digest in documents for one in contents_in(self._document(digest))}
 
     def _missing(self, contents: list[str]) -> list[str]:
-        """Request which revisions the project lacks, and return these; record all others in `held`."""
+        """Ask the server which revisions the project lacks, and return these; record all others in `present`."""
         missing = []
         for some in batched(contents, MOST_CONTENTS):
             request = ContentsRequest(revisions=tuple(some))
@@ -213,7 +213,7 @@ class _Import:
 
     def _note(self, contents: Iterable[str]) -> None:
         for content in contents:
-            self.held.add(content)
+            self.present.add(content)
             self.homes.update(dict.fromkeys(self._revision(content).parts.values(), content))
 
     def _revision(self, content: str) -> _Revision:
@@ -225,12 +225,12 @@ class _Import:
     def _is_stored(self, document: str) -> bool:
         """Return whether the project has a document, so that a request can refer to a revision that contains it.
 
-        The project has a document of `homes` in two cases. Either the project has the revision that `homes` names for
-        this document. Or the archive lacks the document, because it belongs to a version before the versions in the
-        archive; the dataset has all of these earlier versions.
+        `homes` names a revision that contains the document. The project has the document if it has this revision. The
+        project also has the document if the archive lacks it: the document then belongs to a version before the
+        versions in the archive, and the dataset has all of these earlier versions.
         """
         member = ArchiveMember(MemberKind.DOCUMENT, document)
-        return document in self.homes and (self.homes[document] in self.held or member not in self.archive.members)
+        return document in self.homes and (self.homes[document] in self.present or member not in self.archive.members)
 
     def _document(self, digest: str) -> Any:
         return self.archive.tree(MemberKind.DOCUMENT, digest)
@@ -255,11 +255,11 @@ class _Import:
             yield batch
 
     def _differences(self, document: str) -> dict[str, ArrayDifference]:
-        """Return the differences with which arrays of a document are sent, by the digest of the array."""
+        """Return the differences that are sent instead of arrays of a document, by the digest of the whole array."""
         return {} if self._is_stored(document) else self.archive.differences(document)
 
     def _size_bytes(self, document: str) -> int:
-        """Return the size of a document without the arrays that are sent as differences."""
+        """Return the size of a document in bytes, without the arrays that are sent as differences from other arrays."""
         if self._is_stored(document):
             return 0
         arrays, _ = references_of("", self._document(document))
@@ -290,14 +290,14 @@ class _Import:
         self.sent.update(contents)
 
     def _add_facets(self) -> None:
-        """Add facets to the revisions that the project already had; the requests refer to stored documents."""
-        for some in batched(sorted(self.facets.keys() & self.held - self.sent), MOST_CONTENTS):
+        """Send the facets (published numbers) of revisions that the project already had, without their documents."""
+        for some in batched(sorted(self.facets.keys() & self.present - self.sent), MOST_CONTENTS):
             self._send(some)
 
     def _bases(self, contents: list[str]) -> dict[tuple[str, str], ArrayBases]:
-        """Request the tiles of earlier revisions' arrays, so that new arrays are sent without the tiles they share.
+        """Ask for the tiles of arrays in earlier revisions, so that these tiles are not sent again with new arrays.
 
-        Returns the tiles by content digest and part of the new revision. Small documents are left out.
+        The keys of the result are the content digest and the part of the new revision. Small documents are left out.
         """
         places = {
             (content, part): PartOfContent(content=self.earlier[content], part=part)

@@ -55,7 +55,7 @@ class DatasetReader(Protocol):
         """The name of the dataset."""
 
     def at(self, version: str) -> Commit:
-        """Return the commit that a version names."""
+        """Return the commit that a version (a branch, a tag or a digest) names."""
 
     def log(self, version: str) -> Iterator[Commit]:
         """List a version and the versions before it; of the parents of a merge, only the first is followed."""
@@ -64,7 +64,7 @@ class DatasetReader(Protocol):
         """List the entries of a version."""
 
     def difference(self, before: str, after: str, *, limit: int) -> DatasetDifference:
-        """Return the entries that differ in two versions."""
+        """Return the entries that differ between two versions."""
 
 
 def write_archive(
@@ -80,8 +80,8 @@ def write_archive(
 
     Before the documents of revisions are read, `check` is called with the content digests of these revisions, and may
     raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call with the same arguments
-    continues it. Raises `ArchiveInUse` if another process is writing the file, `NotReplaced` if another file than an
-    archive has the name, and `NothingToArchive` if no version is left.
+    continues it. Raises `ArchiveInUse` if another process is writing the file, `NotReplaced` if a file of this name
+    exists and is not an archive, and `NothingToArchive` if no version is left.
     """
     if path.is_file() and path.stat().st_size and not is_tarfile(path):
         raise NotReplaced(f"{path} exists and is not an archive, so it is not replaced; choose another name")
@@ -95,9 +95,12 @@ def write_archive(
             before = _history(dataset, base, before)
         commits = [one for one in _history(dataset, head, before).values() if one.digest not in before]
         if not commits:
-            raise NothingToArchive(f"there is nothing to archive: the versions to leave out include {head.digest}")
+            raise NothingToArchive(
+                f"there is nothing to archive: the versions to leave out include {head.digest}; leave out only "
+                "earlier versions"
+            )
         documents = _documents(dataset, writer, part.parent, on_progress, check, differences=False)
-        _Making(dataset, documents, to_send=False).run(head, commits)
+        _ArchiveInProgress(dataset, documents, to_send=False).run(head, commits)
 
     _write(part, path, fill, on_progress)
     return head
@@ -115,13 +118,13 @@ def write_transfer(
 
     def fill(writer: ArchiveWriter) -> None:
         documents = _documents(dataset, writer, path.parent, on_progress, _accept, differences=differences)
-        _Making(dataset, documents, to_send=True).run(commits[0], commits)
+        _ArchiveInProgress(dataset, documents, to_send=True).run(commits[0], commits)
 
     _write(path.with_name(f"{path.name}.part"), path, fill, on_progress)
 
 
 def _accept(_contents: Sequence[str]) -> None:
-    """Accept all revisions, without a check of consents."""
+    """Do nothing: accept revisions without a check of the consents."""
 
 
 def _documents(
@@ -154,7 +157,7 @@ def _write(part: Path, path: Path, fill: Callable[[ArchiveWriter], None], on_pro
 
 
 def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequence[str]) -> frozenset[str]:
-    """Check that revisions, given by content digest, may be exported.
+    """Ask the server whether revisions, given by content digest, may be exported.
 
     Returns the ids of the items whose consent has ended. Raises `Conflict` if there are such items and `reason` is
     None. A `reason` permits the export of these items; the server records the reason.
@@ -216,8 +219,8 @@ def _history(dataset: DatasetReader, head: Commit, known: Mapping[str, Commit]) 
 
 
 @dataclass
-class _Making:
-    """Archive that is being written."""
+class _ArchiveInProgress:
+    """Archive while it is written: the commits to write, and the documents that are in it already."""
 
     dataset: DatasetReader
     documents: DocumentWriter
@@ -242,7 +245,10 @@ class _Making:
         at = commit.at.strftime(TIME_OF_COMMIT)
         record = CommitRecord(commit.tree, commit.parents, commit.author, commit.message, at)
         if record.digest != commit.digest:
-            raise UnexpectedAnswer(f"the server's commit {commit.digest} does not match its digest")
+            raise UnexpectedAnswer(
+                f"the server's commit {commit.digest} does not match its digest; `marey db check` on the server finds "
+                "damaged data"
+            )
         changes = self._changes(commit)
         if self.to_send:
             require_receivable(commit.digest, len(changes))

@@ -37,20 +37,20 @@ class AsyncUsers(Counterpart):
 
     @property
     def invitations(self) -> AsyncAccountInvitations:
-        """The invitations of people who have no account."""
+        """The invitations with which people can create an account."""
         exchanged: AsyncAccountInvitations = self._as_async(self._sync.invitations)
         return exchanged
 
     def list(self) -> AsyncIterator[User]:
-        """List the users."""
+        """List the users of the server."""
         return self._each(self._sync.list)
 
     async def get(self, name: str) -> User:
-        """Return a user by name."""
+        """Return the user with this name. Raises `NotFound` if there is none."""
         return await self._run(self._sync.get, name)
 
     async def create(self, user: UserCreate) -> User:
-        """Create a user."""
+        """Create a user. Raises `Conflict` if the name is taken."""
         return await self._run(self._sync.create, user)
 
     async def change(self, name: str, change: UserChange) -> User:
@@ -58,7 +58,7 @@ class AsyncUsers(Counterpart):
         return await self._run(self._sync.change, name, change)
 
     async def disable(self, name: str) -> None:
-        """Disable a user; the data of the user is kept."""
+        """Disable a user, whose data is kept; password and tokens of the user do not work until `enable` is called."""
         await self._run(self._sync.disable, name)
 
     def identities(self, name: str) -> AsyncIterator[Identity]:
@@ -66,7 +66,7 @@ class AsyncUsers(Counterpart):
         return self._each(self._sync.identities, name)
 
     async def link(self, name: str, identity: IdentityLink) -> Identity:
-        """Let a person at an identity provider sign in as a user."""
+        """Link a person at an identity provider with a user; the person can then sign in as this user."""
         return await self._run(self._sync.link, name, identity)
 
     async def unlink(self, name: str, identity_id: str) -> None:
@@ -132,7 +132,7 @@ class AsyncTokens(Counterpart):
 
 @counterpart_of(Members)
 class AsyncMembers(Counterpart):
-    """Members of a project and their roles."""
+    """Members of a project, each with a role that applies in the whole project; folders may have other roles."""
 
     _sync: Members
 
@@ -141,16 +141,16 @@ class AsyncMembers(Counterpart):
         return self._sync.project
 
     def list(self) -> AsyncIterator[Member]:
-        """List the members with their roles."""
+        """List the members of the project with their roles; roles in folders are in `in_folders`."""
         return self._each(self._sync.list)
 
     async def put(self, user: str, role: Role) -> Member:
-        """Add a user to the project, or change the user's role."""
+        """Add a user to the project with the given role, or give a member this role."""
         return await self._run(self._sync.put, user, role)
 
     @property
     def in_folders(self) -> AsyncFolderRoles:
-        """The roles of members in folders, which apply there instead of the roles in the project."""
+        """The roles that members have in folders; inside a folder, they replace the role in the project."""
         exchanged: AsyncFolderRoles = self._as_async(self._sync.in_folders)
         return exchanged
 

@@ -19,7 +19,7 @@ AsyncNotice = Callable[[str, int, int], Awaitable[None] | None]
 
 @counterpart_of(Imports)
 class AsyncImports(Counterpart):
-    """Imports into a project."""
+    """Imports of motion files into a project: search, upload, import, and restoring of exported clips."""
 
     _sync: Imports
 
@@ -60,7 +60,7 @@ class AsyncImports(Counterpart):
         return await self._run(self._sync.run, files, options)
 
     async def send(self, files: Sequence[LocalFile], *, notice: AsyncNotice | None = None) -> tuple[ImportFile, ...]:
-        """Upload the bytes that the server does not have; return the files in the form of an import request.
+        """Upload the bytes that the server does not have; return the files as an import request names them.
 
         Raises `BadFileName` if a name cannot be sent.
         """

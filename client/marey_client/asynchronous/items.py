@@ -23,7 +23,7 @@ from marey_schemas.queue.jobs import ItemInput
 
 @counterpart_of(ItemHandle)
 class AsyncItemHandle(Counterpart):
-    """Handle of an item in the state in which it was read; its methods send requests."""
+    """Handle of an item, in the state in which the item was read; its methods send requests to the server."""
 
     _sync: ItemHandle
 
@@ -34,7 +34,7 @@ class AsyncItemHandle(Counterpart):
 
     @property
     def item(self) -> Item:
-        """State of the item when it was read, or changed by this handle."""
+        """State of the item when the handle read it, or changed it last."""
         return self._sync.item
 
     @property
@@ -44,7 +44,7 @@ class AsyncItemHandle(Counterpart):
 
     @property
     def name(self) -> str:
-        """The name within its collection."""
+        """The name, which is unique among the items of this kind in the folder."""
         return self._sync.name
 
     @property
@@ -54,7 +54,7 @@ class AsyncItemHandle(Counterpart):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the item, relative to the API's root."""
         return self._sync.url
 
     def as_input(self) -> ItemInput:
@@ -62,7 +62,7 @@ class AsyncItemHandle(Counterpart):
         return self._sync.as_input()
 
     async def part(self, part: str, *, revision: int | None = None, **query: str | None) -> dict[str, Any]:
-        """Return the document of a part, with numpy arrays."""
+        """Return the document of a part, with numpy arrays: of the given revision, or of the newest one."""
         return await self._run(self._sync.part, part, revision=revision, **query)
 
     async def put_part(self, part: str, document: Mapping[str, Any], *, message: str | None = None) -> Item:
@@ -84,7 +84,10 @@ class AsyncItemHandle(Counterpart):
         return await self._run(self._sync.revert, revision, message=message)
 
     async def delete(self) -> None:
-        """Delete the item; `restore` restores it."""
+        """Delete the item; `restore` restores it.
+
+        Raises `PreconditionFailed` if the item was changed since it was read.
+        """
         await self._run(self._sync.delete)
 
     async def restore(self) -> Item:
@@ -96,7 +99,7 @@ class AsyncItemHandle(Counterpart):
         return self._each(self._sync.revisions)
 
     async def revision(self, number: int) -> Revision:
-        """Return one revision of the item."""
+        """Return the revision of the item with this number. Raises `NotFound` if there is none."""
         return await self._run(self._sync.revision, number)
 
     async def lineage(self) -> Lineage:
@@ -112,7 +115,7 @@ class AsyncItemHandle(Counterpart):
         return await self._run(self._sync.lineage_graph, revision, **options)
 
     async def staleness(self) -> Staleness:
-        """Return whether an input of the item has a newer revision."""
+        """Return whether an input from which the item was made has a newer revision now, and which inputs have."""
         return await self._run(self._sync.staleness)
 
     async def difference(
@@ -170,7 +173,7 @@ AsyncHandle = TypeVar("AsyncHandle", bound=AsyncItemHandle)
 
 @counterpart_of(Items)
 class AsyncItems(Counterpart, Generic[AsyncHandle]):
-    """Items of one kind in a project, which can be iterated, counted, and looked up by `items[path]`."""
+    """Items of one kind in a project: iterable, counted by `len`, and looked up by `items[path]`."""
 
     _sync: Items[Any]
 
@@ -215,7 +218,7 @@ class AsyncItems(Counterpart, Generic[AsyncHandle]):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the items, relative to the API's root."""
         return self._sync.url
 
     def list(
@@ -264,7 +267,7 @@ class AsyncItems(Counterpart, Generic[AsyncHandle]):
         return await self._run(self._sync.explain, query, collection=collection)
 
     async def get(self, item_id: str) -> AsyncHandle:
-        """Return an item by its id."""
+        """Return the item with this id. Raises `NotFound` if there is none."""
         exchanged: AsyncHandle = await self._exchange(self._sync.get, item_id)
         return exchanged
 
@@ -273,7 +276,7 @@ class AsyncItems(Counterpart, Generic[AsyncHandle]):
         return await self._run(self._sync.count, collection=collection, filters=filters)
 
     async def restore(self, item_id: str) -> AsyncHandle:
-        """Restore a deleted item by its id."""
+        """Restore the deleted item with this id, and return it."""
         exchanged: AsyncHandle = await self._exchange(self._sync.restore, item_id)
         return exchanged
 

@@ -17,7 +17,7 @@ AsyncOnProgress = Callable[[Job], Awaitable[None] | None]
 
 @counterpart_of(Jobs)
 class AsyncJobs(Counterpart):
-    """Jobs that the caller may read, by id."""
+    """Jobs of a server, which are named by their ids; methods submit, read, await and cancel them."""
 
     _sync: Jobs
 
@@ -26,7 +26,7 @@ class AsyncJobs(Counterpart):
         return self._each(self._sync.kinds)
 
     async def submit(self, project: str, job: JobCreate) -> Job:
-        """Submit a job."""
+        """Submit a job to a project; return the job in its present state, without waiting for it."""
         return await self._run(self._sync.submit, project, job)
 
     async def run(self, project: str, job: JobCreate, *, on_progress: AsyncOnProgress | None = None) -> Job:
@@ -61,7 +61,7 @@ class AsyncJobs(Counterpart):
         return exchanged
 
     async def cancel(self, job_id: str) -> Job:
-        """Ask a job to stop; a queued job is cancelled at once."""
+        """Ask a job to stop; a job that does not run yet is cancelled at once."""
         return await self._run(self._sync.cancel, job_id)
 
     async def retry(self, job_id: str) -> Job:
@@ -69,7 +69,7 @@ class AsyncJobs(Counterpart):
         return await self._run(self._sync.retry, job_id)
 
     def attempts(self, job_id: str) -> AsyncIterator[Attempt]:
-        """List the attempts of a job."""
+        """List the attempts to run a job, oldest first."""
         return self._each(self._sync.attempts, job_id)
 
     def outputs(self, job_id: str) -> AsyncIterator[JobOutput]:

@@ -66,7 +66,7 @@ class AsyncMarey(Connection):
         return await self._run(self._sync.accept_invitation, code)
 
     async def me(self) -> Me:
-        """Return the user and the scopes of the token."""
+        """Return the user and the scopes of the client's token."""
         return await self._run(self._sync.me)
 
     def project(self, name: str) -> AsyncProjectHandle:
@@ -101,13 +101,13 @@ class AsyncMarey(Connection):
 
     @property
     def jobs(self) -> AsyncJobs:
-        """Jobs by id."""
+        """The jobs of the server, each by its id."""
         exchanged: AsyncJobs = self._as_async(self._sync.jobs)
         return exchanged
 
     @property
     def blobs(self) -> AsyncBlobs:
-        """Blobs by digest."""
+        """The blobs (bytes identified by their digest) of the server."""
         exchanged: AsyncBlobs = self._as_async(self._sync.blobs)
         return exchanged
 
@@ -119,7 +119,7 @@ class AsyncMarey(Connection):
 
     @property
     def tokens(self) -> AsyncTokens:
-        """The caller's tokens."""
+        """The tokens of the caller; administrators also reach tokens of other users."""
         exchanged: AsyncTokens = self._as_async(self._sync.tokens)
         return exchanged
 

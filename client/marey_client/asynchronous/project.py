@@ -42,19 +42,19 @@ class AsyncProjectHandle(AsyncJobSubmission):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the project, relative to the API's root."""
         return self._sync.url
 
     async def read(self) -> Project:
-        """Return the project's title, visibility and the caller's role."""
+        """Return the project: its title, its visibility, and the caller's role in it."""
         return await self._run(self._sync.read)
 
     async def change(self, change: ProjectChange) -> Project:
-        """Change title, description or visibility."""
+        """Change title, description or visibility of the project; absent fields stay as they are."""
         return await self._run(self._sync.change, change)
 
     async def quotas(self) -> ProjectQuotasInUse:
-        """Return the number of items and bytes in the project, and the limits."""
+        """Return the numbers of items, bytes and running jobs in the project, and their limits."""
         return await self._run(self._sync.quotas)
 
     async def change_quotas(self, change: ProjectQuotaChange) -> ProjectQuotasInUse:
@@ -69,7 +69,10 @@ class AsyncProjectHandle(AsyncJobSubmission):
         await self._run(self._sync.delete)
 
     async def restore(self) -> Project:
-        """Restore the deleted project."""
+        """Restore the project of this name that was deleted last.
+
+        Raises `Conflict` if another project has the name now.
+        """
         return await self._run(self._sync.restore)
 
     async def browser_link(self) -> BrowserLink:

@@ -50,19 +50,19 @@ class AsyncProjectItems(Counterpart):
 
     @property
     def clips(self) -> AsyncItems[AsyncClipHandle]:
-        """The clips of the project."""
+        """The clips of the project: iterable, and by path or id, as in `clips["raw/walk"]`."""
         exchanged: AsyncItems[AsyncClipHandle] = self._as_async(self._sync.clips)
         return exchanged
 
     @property
     def skeletons(self) -> AsyncItems[AsyncSkeletonHandle]:
-        """The skeletons of the project."""
+        """The skeletons of the project: iterable, and by path or id."""
         exchanged: AsyncItems[AsyncSkeletonHandle] = self._as_async(self._sync.skeletons)
         return exchanged
 
     @property
     def annotations(self) -> AsyncItems[AsyncAnnotationHandle]:
-        """The annotations of the project."""
+        """The annotations of clips in the project: iterable, and by path or id."""
         exchanged: AsyncItems[AsyncAnnotationHandle] = self._as_async(self._sync.annotations)
         return exchanged
 
@@ -74,36 +74,36 @@ class AsyncProjectItems(Counterpart):
 
     @property
     def edits(self) -> AsyncEdits:
-        """The edits of the project."""
+        """The edits (saved lists of commands) of the project: iterable, and by path or id."""
         exchanged: AsyncEdits = self._as_async(self._sync.edits)
         return exchanged
 
     @property
     def models(self) -> AsyncItems[AsyncModelHandle]:
-        """The models of the project."""
+        """The generative models of the project: iterable, and by path or id."""
         exchanged: AsyncItems[AsyncModelHandle] = self._as_async(self._sync.models)
         return exchanged
 
     @property
     def evaluations(self) -> AsyncItems[AsyncEvaluationHandle]:
-        """The evaluations of the project."""
+        """The evaluations of locomotion clips in the project: iterable, and by path or id."""
         exchanged: AsyncItems[AsyncEvaluationHandle] = self._as_async(self._sync.evaluations)
         return exchanged
 
     @property
     def studies(self) -> AsyncStudies:
-        """The perceptual studies of the project."""
+        """The perceptual studies of the project: iterable, and by path or id."""
         exchanged: AsyncStudies = self._as_async(self._sync.studies)
         return exchanged
 
     @property
     def metrics(self) -> AsyncPerceptualMetrics:
-        """The perceptual metrics of the project."""
+        """The stored perceptual metrics of the project: iterable, and by path or id."""
         exchanged: AsyncPerceptualMetrics = self._as_async(self._sync.metrics)
         return exchanged
 
     def items(self, kind: Kind) -> AsyncItems[Any]:
-        """The items of the project, of any kind."""
+        """The items of the given kind in the project: iterable, and by path or id."""
         exchanged: AsyncItems[Any] = self._now(self._sync.items, kind)
         return exchanged
 
@@ -184,7 +184,7 @@ class AsyncCollections(Counterpart):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the folders, relative to the API's root."""
         return self._sync.url
 
     def list(
@@ -202,7 +202,7 @@ class AsyncCollections(Counterpart):
         return await self._run(self._sync.create, path)
 
     async def move(self, collection: Collection, path: str) -> Collection:
-        """Move or rename a folder with its contents."""
+        """Move or rename a folder with its contents; the items keep their ids and their history."""
         return await self._run(self._sync.move, collection, path)
 
     async def delete(self, collection: Collection) -> None:
@@ -210,5 +210,5 @@ class AsyncCollections(Counterpart):
         await self._run(self._sync.delete, collection)
 
     async def restore(self, collection: Collection) -> Collection:
-        """Restore a deleted folder with its contents."""
+        """Restore a deleted folder with the contents that were deleted along with it."""
         return await self._run(self._sync.restore, collection)

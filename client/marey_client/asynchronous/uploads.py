@@ -47,7 +47,7 @@ class AsyncUploadReport(Counterpart):
 
     @property
     def left_out(self) -> tuple[Path, ...]:
-        """Files in the folders that were not imported, because they are not motion files or are hidden."""
+        """Paths in the folders that were not imported: hidden files, files without motion, and skipped folders."""
         return self._sync.left_out
 
     def clips(self) -> AsyncIterator[AsyncClipHandle]:

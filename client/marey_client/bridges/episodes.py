@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 STATE, ACTION = "observation.state", "action"
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 EPISODES_PER_GROUP = 100
-"""Number of episodes that are written to the table of episodes at once."""
+"""Number of rows (one for each episode) that are collected before they are written to the table of episodes."""
 
 
 @dataclass(frozen=True)
 class ColumnStatistics:
-    """Number of rows, and the extremes, the mean and the summed squared deviations of each column, all as float64."""
+    """Statistics of a table: the number of rows and, for each column, extremes, mean and summed squared deviations."""
 
     count: int
     low: NDArray[np.float64]
@@ -63,15 +63,15 @@ class ColumnStatistics:
 
 
 class Episode(NamedTuple):
-    """Rows of one clip."""
+    """One clip as an episode of a LeRobotDataset: a row for each frame."""
 
     state: NDArray[np.float32]
     columns: Mapping[str, NDArray[Any]]
-    """All columns, by name."""
+    """All columns by name, each with a row for each frame; `state` is one of them."""
 
 
 class EpisodeTable:
-    """Table of episodes, written in groups of rows."""
+    """Writer of the table that lists the episodes of a LeRobotDataset, one row for each; it writes groups of rows."""
 
     def __init__(self, files: ParquetFiles) -> None:
         self._files = files
@@ -86,7 +86,10 @@ class EpisodeTable:
         place: FilePlace,
         statistics: Mapping[str, ColumnStatistics],
     ) -> None:
-        """Add an episode; its frames are in the data file at `place`, and begin at the index `start` of the dataset."""
+        """Add a row for an episode.
+
+        The frames of the episode are in the data file `place` and begin at the index `start` of the dataset.
+        """
         row: dict[str, Any] = {
             "episode_index": number, "tasks": [task], "length": length,
             "data/chunk_index": place.chunk, "data/file_index": place.file,
@@ -99,7 +102,7 @@ class EpisodeTable:
             self.flush()
 
     def flush(self) -> None:
-        """Write the rows that are still in memory."""
+        """Write the collected rows to the table; needed after the last episode."""
         if not self._rows:
             return
         place = self._files.place_for(self._table(FilePlace(0, 0)).nbytes)
@@ -120,7 +123,7 @@ class EpisodeTable:
 
 
 def episode_of(motion: Mapping[str, Any], fps: float, number: int, start: int, task: int) -> Episode:
-    """Return the rows of a clip as episode `number`; its first frame has the index `start` in the whole dataset."""
+    """Return a clip as the episode `number`; its first frame has the index `start` among all frames of the dataset."""
     poses = np.asarray(motion["poses"], dtype=np.float32)
     length = len(poses)
     moved = motion.get("translations")
@@ -140,7 +143,7 @@ def episode_of(motion: Mapping[str, Any], fps: float, number: int, start: int, t
 
 
 def data_table(episode: Episode) -> pa.Table:
-    """Return the rows of an episode as a table; columns of vectors have lists of fixed size."""
+    """Return an episode as a pyarrow table with a row for each frame; a vector becomes a list of fixed size."""
     pyarrow = import_pyarrow()
     columns = {}
     for name, rows in episode.columns.items():

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class FileExportOptions(ExportOptions, total=False):
-    """Options of exports to motion files."""
+    """Keyword arguments of exports to motion files."""
 
     format: str
     """Name of the format of the files; default: `DEFAULT_FORMAT`."""
@@ -40,15 +40,15 @@ class FileExportOptions(ExportOptions, total=False):
 
 
 class ExportedVersion(NamedTuple):
-    """Result of an export."""
+    """Result of the export of a version: its commit, the new folder, and the number of exported clips."""
 
     commit: Commit
     folder: Path
     clips: int
     renamed: Mapping[str, str]
-    """File names that differ from the paths of their clips, because not every system accepts these paths; by path."""
+    """Names of files whose clips have paths that some systems refuse, by the path of the clip."""
     left_out: Mapping[str, int]
-    """Number of entries that are not clips, by kind."""
+    """Number of entries that were not exported, because they are not clips; by kind."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class MotionFiles:
     allow_expired_consent: str | None
 
     def header(self, layout: Layout) -> dict[str, object]:
-        """Return the beginning of the sidecar."""
+        """Return the first members of the sidecar: the version, the layout, and the format and unit of the files."""
         identity = self.version.identity.model_dump(mode="json", exclude_none=True)
         return {**identity, "layout": layout, "format": self.format, "unit": self._unit}
 
@@ -72,7 +72,7 @@ class MotionFiles:
 
     @property
     def ending(self) -> str:
-        """The ending of the names of the files."""
+        """The ending of the file names, such as `.bvh`."""
         return format_named(self.format).endings[0]
 
     def write(
@@ -82,7 +82,10 @@ class MotionFiles:
         add: Callable[[ExportedClip], None],
         on_progress: OnProgress,
     ) -> None:
-        """Write the clips to the files `names` below `folder`, and call `add` with each clip, in order."""
+        """Write each clip to its file below `folder`; `names` are the paths of the files, in the order of the clips.
+
+        Calls `add` with each clip that was written, in this order.
+        """
         total, done = len(self.version.clips), 0
         with CallPool(EXPORTS_AT_ONCE, thread_name_prefix="marey-export") as pool:
             for group in self.version.described(pool):
@@ -118,7 +121,7 @@ def prepare_files(
     unit: str | None = None,
     allow_expired_consent: str | None = None,
 ) -> MotionFiles:
-    """Check whether a version can be exported to files, and read its entries below `path`.
+    """Check whether a version can be exported to the new folder `target`, and read its entries below `path`.
 
     Raises `CannotExport` if files in this format do not contain both motion and skeleton, because a file without one of
     them cannot be imported again on its own. Also raises the errors of `require_free` and `version_to_export`.

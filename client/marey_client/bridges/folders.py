@@ -1,4 +1,4 @@
-"""Folders that appear only when all their files are written, and names of the files in these folders."""
+"""New folders that appear under their names only when all files are written, and file names that all systems accept."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def require_free(target: Path) -> None:
 
 
 def file_names(paths: Sequence[str], ending: str, *, reserved: Sequence[str] = ()) -> list[str]:
-    """Return the path of a file for each entry, in order: the path of the entry with `ending`, valid on all systems.
+    """Return a file path for each entry path, in order: the path with `ending`, changed where a system refuses it.
 
     Characters that Windows refuses become `_`, and names of devices in Windows, such as `con`, get a `_` after them.
     If two files would have the same name, where upper and lower case count as equal, the later one gets a number.

@@ -37,7 +37,7 @@ LICENCES = frozenset(
         "osl-3.0", "pddl", "unlicense", "wtfpl", "zlib",
     }
 )  # fmt: skip
-"""Licences of data and software that the metadata of a dataset card can name; any other licence becomes `other`."""
+"""Identifiers of the licences that the metadata of a dataset card can name; any other licence becomes `other`."""
 
 _SIZES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M")
 
@@ -137,7 +137,7 @@ def _metadata(
 
 
 def _identifier(licence: str | None) -> str:
-    """Return the identifier of a licence in the metadata of dataset cards."""
+    """Return the Hub's identifier of a licence: `unknown` for None, `other` for a licence that `LICENCES` lacks."""
     if licence is None:
         return "unknown"
     wanted = "-".join(licence.strip().casefold().split())
@@ -178,5 +178,5 @@ def _quoted(text: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text in one line, without signs that Markdown and HTML treat as markup."""
+    """Return a text in one line, in which characters that Markdown and HTML treat as markup are escaped."""
     return "".join(f"\\{one}" if one in "\\`*_[]<>#|&" else one for one in " ".join(text.split()))

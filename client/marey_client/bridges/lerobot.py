@@ -50,14 +50,14 @@ if TYPE_CHECKING:
 
 CODEBASE_VERSION = "v3.0"
 NO_ACTION = "motion"
-"""Task of the clips whose take record names no action."""
+"""Task (a text for each episode in LeRobot) of the clips whose take record names no action."""
 RATE_TOLERANCE = 1e-4
 """Greatest relative difference of frame rates that count as equal, because files state rates with few digits."""
 NAMES_SHOWN = 10
 
 
 class CommonRig(NamedTuple):
-    """Properties that all clips of a LeRobotDataset must have in common."""
+    """Skeleton, translated joints and frame rate, which all clips of a LeRobotDataset must have in common."""
 
     hierarchy: str
     """Content digest of the skeleton's hierarchy."""
@@ -82,7 +82,7 @@ class CommonRig(NamedTuple):
         return whole if math.isclose(self.rate_hz, whole, rel_tol=RATE_TOLERANCE) else self.rate_hz
 
     def difference_to(self, other: CommonRig) -> str | None:
-        """Return a text that says how the rig `other` differs from this rig; None if they agree."""
+        """Return the first difference of `other` from this rig, as text; None if clips of both fit into one dataset."""
         if (self.hierarchy, self.joints) != (other.hierarchy, other.joints):
             return "another skeleton"
         if self.translated != other.translated:
@@ -100,7 +100,7 @@ def prepare_lerobot(
     path: str = "",
     allow_expired_consent: str | None = None,
 ) -> VersionToExport:
-    """Check whether a version can be exported to LeRobot, and read its entries below `path`.
+    """Check whether a version can be exported to LeRobot in the new folder `target`; read its entries below `path`.
 
     Raises `MissingPackage` if pyarrow is not installed; also the errors of `require_free` and `version_to_export`.
     """
@@ -133,7 +133,7 @@ def write_lerobot(version: VersionToExport, target: Path, on_progress: OnProgres
 
 @dataclass
 class _Writing:
-    """LeRobotDataset that is being written."""
+    """LeRobotDataset while it is written: its files, and what is known of the clips written so far."""
 
     version: VersionToExport
     sidecar: SidecarWriter
@@ -146,7 +146,7 @@ class _Writing:
     """Content digest of the hierarchy of each skeleton, by the content digest of the skeleton's revision."""
     tasks: dict[str, int] = field(default_factory=dict)
     made: Counter[tuple[str, tuple[str, ...]]] = field(default_factory=Counter)
-    """Number of clips, by the kind of the job that made them and the commits of this job's inputs."""
+    """Number of clips by the job that made them: by the kind of the job, and by the commits of its inputs."""
     statistics: dict[str, ColumnStatistics] = field(default_factory=dict)
     frames: int = 0
     done: int = 0

@@ -19,7 +19,7 @@ COMPRESSION = "zstd"
 
 
 class FilePlace(NamedTuple):
-    """Two numbers that identify a file: the number of its folder `chunk-...`, and its number in this folder."""
+    """Place of a Parquet file: the number of its folder `chunk-...`, and the number of the file in this folder."""
 
     chunk: int
     file: int
@@ -31,7 +31,7 @@ class FilePlace(NamedTuple):
 
     @property
     def following(self) -> FilePlace:
-        """The numbers of the next file."""
+        """The place of the next file: in the same folder, or in the next folder if this one is full."""
         last = self.file == MOST_FILES_PER_CHUNK - 1
         return FilePlace(self.chunk + 1, 0) if last else FilePlace(self.chunk, self.file + 1)
 
@@ -49,10 +49,10 @@ def import_pyarrow() -> Any:
 
 
 class ParquetFiles:
-    """Files below a folder to which tables with one schema are added, each as one row group.
+    """Writer of Parquet files below a folder; each added table becomes one row group, all with the same schema.
 
-    A table that would make the present file larger than the limit is added to the next file. Only sizes without
-    compression are compared, so that the same tables always give the same files.
+    A table that would make the present file larger than the limit is added to a new file. Sizes before compression are
+    compared, so that the same tables always give the same files.
     """
 
     def __init__(self, folder: Path, *, most_bytes: int = MOST_FILE_MB << 20) -> None:

@@ -1,4 +1,4 @@
-"""Import of folders that an export wrote: the clips get their former paths, take records and tags."""
+"""Import of folders that an export wrote: the clips get the paths, take records and tags from before the export."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ class ReturningFolder:
 
     @property
     def own_files(self) -> tuple[str, ...]:
-        """Files of the folder that describe the clips, and are not imported."""
+        """Paths of the files in the folder that only describe the clips, such as the sidecar; they are not imported."""
         return (SIDECAR, RECORDS, *((CARD, TABLE) if self.sidecar.layout == "huggingface" else ()))
 
     @property
     def unit(self) -> LengthUnit | None:
-        """The unit of length of the motion files."""
+        """The unit of length of the motion files; None if the sidecar does not name one."""
         return self.sidecar.unit
 
     @cached_property
@@ -63,7 +63,7 @@ class ReturningFolder:
 
     @cached_property
     def clips(self) -> Mapping[str, ExportedClip]:
-        """The exported clips that have a file, by the name under which the file is imported."""
+        """Descriptions of the exported clips, by the name under which the clip's file is imported."""
         return {self.name_of(file): clip for file, clip in self._by_file.items()}
 
     def name_of(self, file: str) -> str:
@@ -79,7 +79,7 @@ class ReturningFolder:
 
     @property
     def table(self) -> Path:
-        """The table of take records."""
+        """Path of the table of take records, a CSV file; it may not exist."""
         return self.folder / RECORDS
 
     @property

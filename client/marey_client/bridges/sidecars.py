@@ -19,9 +19,9 @@ from marey_schemas.wording import first_reason
 
 MOST_SIDECAR_BYTES = 1 << 30
 RECORDS = "records.csv"
-"""Table of the take records, in the form that `marey record --table` reads."""
+"""Name of the CSV table of the take records, which `marey record --table` can read."""
 CARD, TABLE = "README.md", "metadata.csv"
-"""Dataset card and table of clips in a folder for the Hugging Face Hub."""
+"""Names of the dataset card and of the table of clips in a folder for the Hugging Face Hub."""
 RECORD_FIELDS = tuple(TakeRecord.model_fields)
 
 
@@ -43,7 +43,7 @@ class SidecarWriter:
         return self
 
     def add(self, clip: ExportedClip) -> None:
-        """Add a clip to the sidecar and to the table."""
+        """Write a clip to the sidecar and to the table of take records."""
         if clip.record.licence is not None:
             self._licences.add(clip.record.licence)
         document = clip.model_dump(mode="json", by_alias=True, exclude_defaults=True)
@@ -52,12 +52,12 @@ class SidecarWriter:
         self._clips += 1
 
     def finish(self) -> None:
-        """Write the end of the sidecar."""
+        """Write the end of the sidecar, without which the file is not valid JSON."""
         self._sidecar.write(b"\n]," + canonical_json({"licences": self.licences})[1:] + b"\n")
 
     @property
     def licences(self) -> list[str]:
-        """The licences of the clips that were added."""
+        """The different licences of the clips that were added, sorted."""
         return sorted(self._licences)
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -65,14 +65,14 @@ class SidecarWriter:
 
 
 def begun_table(file: TextIO) -> Any:
-    """Write the names of the columns to a table of take records; return its CSV writer."""
+    """Write the names of the columns to a new table of take records; return a CSV writer for the rows."""
     table = csv.writer(file, lineterminator="\n")
     table.writerow(("clip", *RECORD_FIELDS))
     return table
 
 
 def write_table(file: TextIO, clips: Iterable[ExportedClip]) -> None:
-    """Write a whole table of take records."""
+    """Write the table of take records of all `clips` to a file, as CSV."""
     begun_table(file).writerows((clip.path, *record_cells(clip)) for clip in clips)
 
 
@@ -91,7 +91,10 @@ def read_sidecar(folder: Path) -> ExportedFolder | None:
     if not path.is_file():
         return None
     if path.stat().st_size > MOST_SIDECAR_BYTES:
-        raise BadSidecar(f"{path} has more than {MOST_SIDECAR_BYTES:,} bytes, so it is not the sidecar of an export")
+        raise BadSidecar(
+            f"{path} has more than {MOST_SIDECAR_BYTES:,} bytes, so it is not the sidecar of an export; rename it to "
+            "import the folder without it"
+        )
     try:
         return ExportedFolder.model_validate_json(path.read_bytes())
     except ValidationError as error:

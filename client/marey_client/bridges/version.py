@@ -1,4 +1,4 @@
-"""The version of a dataset that is being exported: its clips, with their take records and their lineage."""
+"""Reading of a version that is exported: its clips, with their take records and their lineage."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ class DatasetToExport(DatasetReader, Protocol):
         """List all entries of a version, or only the entries below a folder."""
 
     def find_ref(self, name: str) -> Ref | None:
-        """Return the branch or tag with a name, or None."""
+        """Return the branch or the tag with this name; None if there is none."""
 
 
 class ExportOptions(TypedDict, total=False):
-    """Options of every export of a version."""
+    """Keyword arguments that every export of a version accepts."""
 
     path: str
     """Folder of entries to which the export is limited; default: all entries."""
@@ -55,14 +55,14 @@ class ExportOptions(TypedDict, total=False):
 
 
 class DescribedClip(NamedTuple):
-    """Clip of a version, before its motion is read."""
+    """Clip of a version: its entry, and its description for the sidecar."""
 
     entry: Entry
     clip: ExportedClip
 
 
 class _Located(NamedTuple):
-    """Entry of a clip, and the item and revision that have the same content."""
+    """Entry of a clip, and an item of the project with the number of a revision that has the same content."""
 
     entry: Entry
     item: str
@@ -76,7 +76,7 @@ class _Located(NamedTuple):
 
 @dataclass(frozen=True)
 class VersionToExport:
-    """Version of a dataset whose clips may be exported."""
+    """Version of a dataset that may be exported: its clips, and the facts that exported folders name."""
 
     dataset: DatasetToExport
     commit: Commit

@@ -16,11 +16,11 @@ from marey_client.load.scratch import KIND, Scratch
 RESULT = "result"
 SKEW_S = 3600
 OVER = frozenset({401, 404, 409})
-"""HTTP statuses by which the server refuses requests of an attempt that no longer holds its job."""
+"""HTTP statuses with which the server may refuse a request of an attempt whose lease or job has ended."""
 
 
 class HostileAttempt:
-    """Attempt of the test, which completes one job and sends faulty requests meanwhile.
+    """Attempt to run one job of the test, which also sends faulty requests.
 
     Each method raises `MareyError` if the server answers wrongly.
     """
@@ -29,7 +29,7 @@ class HostileAttempt:
         self._scratch, self._caller, self._job, self._draw = scratch, caller, job, draw
 
     def claim(self, claim_id: str | None = None) -> dict[str, Any]:
-        """Claim the job and return its lease."""
+        """Claim the job and return its lease as a dict; a repeated `claim_id` must return the same lease."""
         wanted = {
             "worker": "chaos", "kinds": [KIND], "labels": self._scratch.labels, "job": self._job,
             "claim_id": claim_id or secrets.token_hex(16),
@@ -40,12 +40,12 @@ class HostileAttempt:
         return dict(leases[0])
 
     def post(self, lease: dict[str, Any], what: str, document: dict[str, Any]) -> LoadAnswer:
-        """Send a request of the attempt, with a wrong time in the header `Date`."""
+        """Send the request `what`, such as "complete", of the attempt, with a wrong time in the header `Date`."""
         path = f"/jobs/{lease['job']}/attempts/{lease['fence']}/{what}"
         return self._caller.post(path, document, token=lease["attempt_token"], headers=self._skewed())
 
     def lose_answer(self, lease: dict[str, Any], what: str, document: dict[str, Any]) -> None:
-        """Send a request over a connection of its own, and close the connection without reading the answer."""
+        """Send the request `what` of the attempt over a new connection, and close it without reading the answer."""
         with connection(self._scratch.url, lease["attempt_token"]) as other:
             other.send_only(f"/jobs/{lease['job']}/attempts/{lease['fence']}/{what}", document)
 

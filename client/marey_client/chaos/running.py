@@ -22,16 +22,16 @@ T = TypeVar("T")
 
 HEALTHY_WORKERS = 2
 FAULT_S = 120.0
-"""Longest time until a worker process has claimed a job and reached its fault."""
+"""Longest wait in seconds until a worker process has claimed a job and killed or stopped itself."""
 END_S = 900.0
-"""Longest time until all jobs have ended: leases of dead workers must end first."""
+"""Longest wait in seconds for the end of all jobs, which includes the end of the leases of dead workers."""
 LATE_S = 5.0
-"""Time in which workers that were paused may try to publish the results of lost attempts."""
+"""Seconds in which resumed workers may try to publish results of lost attempts, which the server must refuse."""
 MAX_ATTEMPTS = 20
-"""Greatest number of attempts of a job; more than one, because several faults can affect the same job."""
+"""Number of attempts after which a job fails; large, because several faults can affect the same job."""
 
 OnStep = Callable[[str, float, float | None], None]
-"""Function called with the present activity, the amount done, and the total amount if it is known."""
+"""Function called with a text on the present activity, the number of steps done, and their total, None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def run_chaos(marey: Marey, seed: int, faults: int, on_step: OnStep) -> Iterator
 
 
 def _drawn(cases: Sequence[T], further: int, draw: random.Random) -> list[T]:
-    """Return each of the cases once, and `further` random ones of them in addition, in random order."""
+    """Return the cases in random order: each once, and `further` randomly chosen repetitions."""
     chosen = [*cases, *(draw.choice(cases) for _ in range(further))]
     draw.shuffle(chosen)
     return chosen
@@ -106,7 +106,7 @@ def _attempt(scratch: Scratch, job: str, name: str, draw: random.Random) -> Chao
 def _await_results(
     scratch: Scratch, processes: WorkerProcesses, jobs: Sequence[str], on_step: OnStep
 ) -> Iterator[ChaosFinding]:
-    """Let healthy workers run the jobs, and wait until all have ended."""
+    """Let healthy workers run the jobs, and wait for their end; yield a finding for each job that has not ended."""
     for _ in range(HEALTHY_WORKERS):
         processes.start()
     deadline = time.monotonic() + END_S

@@ -62,7 +62,7 @@ class WorkerProcess:
         self._process.stdin.flush()
 
     def wait_for_fault(self, seconds: float) -> bool:
-        """Wait until the process has died or is stopped; return whether that happened in time."""
+        """Wait until the process has died or is stopped; return False if neither happens within `seconds`."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             if self._process.poll() is not None or self._is_stopped():
@@ -84,13 +84,13 @@ class WorkerProcess:
             self._process.stdin.close()
 
     def _is_stopped(self) -> bool:
-        """Return whether the process is stopped; `WNOWAIT` leaves the state for other readers."""
+        """Return whether the process is stopped; because of `WNOWAIT`, a later call sees this state again."""
         found = os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT)
         return found is not None and found.si_code == os.CLD_STOPPED
 
 
 class WorkerProcesses:
-    """The worker processes of a test."""
+    """Worker processes of a test, which are started one by one and killed together."""
 
     def __init__(self, scratch: Scratch, folder: Path) -> None:
         self._scratch, self._folder = scratch, folder

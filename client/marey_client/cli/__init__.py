@@ -33,7 +33,7 @@ def _run() -> None:
 
 
 def _complete() -> NoReturn:
-    """Answer a shell that asks for completion; see `marey_client.cli.completion`."""
+    """Print suggestions for a shell that requests completion, and exit; see `marey_client.cli.completion`."""
     from marey_client.cli.app import with_one_command
     from marey_client.cli.completion.running import answer_shell
 
@@ -41,7 +41,7 @@ def _complete() -> NoReturn:
 
 
 def _command_name(arguments: list[str]) -> str | None:
-    """Return the first argument that is neither a global option nor its value, or None."""
+    """Return the first argument that is neither a global option nor the value of one; None if there is none."""
     left = iter(arguments)
     for argument in left:
         if argument in GLOBAL_OPTIONS:
@@ -62,7 +62,7 @@ def _take_any_text() -> None:
 def with_global_options_first(arguments: list[str]) -> list[str]:
     """Return the arguments with the global options first, where typer needs them.
 
-    So `marey ls lab --server URL` works, too.
+    Users can therefore also write global options after the command, as in `marey ls lab --server URL`.
     """
     first, rest = apart_from_global_options(arguments)
     return first + rest

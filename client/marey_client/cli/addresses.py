@@ -1,4 +1,4 @@
-"""Addresses of projects, folders and items, such as `lab/raw/walk`, and lookup of their targets."""
+"""Addresses such as `lab/raw/walk`, and lookup of the folders and items at these addresses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ID = re.compile(r"([a-z]+)_[0-9a-hjkmnp-tv-z]{26}")
 
 @dataclass(frozen=True)
 class Address:
-    """Project and a path in it; the path may name a folder or an item, and names a folder if a `/` follows it."""
+    """Address of a folder or an item: a project, and a path in it. With a `/` at the end, it means a folder."""
 
     project: str
     path: str
@@ -104,7 +104,7 @@ def _missing(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -
 
 
 def advice(project: ProjectHandle, path: str, kinds: Iterable[Kind]) -> str:
-    """Return advice about a path at which there is neither a folder nor an item of these kinds."""
+    """Return advice for an error about a path without a folder or an item of these kinds, such as the nearest path."""
     from marey_client.listing.paths import nearest_path
 
     near = nearest_path(project.transport, project.name, path, kinds) if path and not Address("", path).has_id else None
@@ -147,7 +147,7 @@ def _existing(items: Any, item_id: str) -> ItemHandle | None:
 # -- folders and items alike --
 
 
-class Thing(Protocol):
+class FolderOrItem(Protocol):
     """Interface of folders and items for commands that organise a project."""
 
     @property
@@ -172,7 +172,7 @@ class Thing(Protocol):
 
 @dataclass(frozen=True)
 class Folder:
-    """Folder with its contents."""
+    """A folder with its contents, as the target of a command that moves, deletes or restores items or folders."""
 
     project: ProjectHandle
     collection: Collection
@@ -230,7 +230,7 @@ class SingleItem:
         return f"{self.handle.project}/{self.handle.path}"
 
     def count(self) -> int:
-        """Return 1, the number of items that `delete` removes."""
+        """Return 1: `delete` removes one item."""
         return 1
 
     def move(self, folder: str, name: str) -> Item:
@@ -248,7 +248,7 @@ class SingleItem:
         return self.handle.restore()
 
 
-def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = False) -> Thing:
+def folder_or_item(marey: Marey, text: str, kind: str | None, *, deleted: bool = False) -> FolderOrItem:
     """Return the folder or item at an address; a final `/` means a folder.
 
     With `deleted`, look for deleted folders and items; if several are found, return the one that was deleted last.
@@ -258,7 +258,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     if not address.path:
         raise WrongUsage(f"{text!r} is a project; give a folder or an item in it, or see `marey project --help`")
     wanted = FOLDER if address.is_folder else kind
-    found = list(_things(marey.project(address.project), address, wanted, deleted=deleted))
+    found = list(_folders_and_items(marey.project(address.project), address, wanted, deleted=deleted))
     kinds = list(dict.fromkeys(one.kind for one in found))
     if len(kinds) > 1:
         raise WrongUsage(f"several items are called {address}: a {' and a '.join(kinds)}; choose one with --kind")
@@ -313,10 +313,10 @@ def _last_deleted_first(items: Iterable[ItemHandle]) -> list[ItemHandle]:
     return sorted(items, key=lambda one: one.item.deleted_at or one.item.created_at, reverse=True)
 
 
-def require_apart(things: Sequence[Thing]) -> None:
+def require_apart(targets: Sequence[FolderOrItem]) -> None:
     """Raise `WrongUsage` if an address is given twice, or is inside a folder that is also given."""
-    for place, one in enumerate(things):
-        for other in (*things[:place], *things[place + 1 :]):
+    for place, one in enumerate(targets):
+        for other in (*targets[:place], *targets[place + 1 :]):
             if other.id == one.id:
                 raise WrongUsage(f"{one.place} is named twice in the command; name it once")
             if other.kind == FOLDER and one.place.startswith(f"{other.place}/"):
@@ -332,7 +332,9 @@ def _kinds_of(kind: str | None) -> Sequence[Kind]:
     return () if kind == FOLDER else tuple(Kind) if kind is None else (kind_named(kind),)
 
 
-def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:
+def _folders_and_items(
+    project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool
+) -> Iterator[FolderOrItem]:
     """Yield the folders at an address, then the items at this address.
 
     With `deleted`, yield deleted folders and items; for each kind, the most recently deleted one comes first.

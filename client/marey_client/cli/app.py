@@ -1,4 +1,4 @@
-"""Command `marey`, with the commands of all modules."""
+"""The application behind the command `marey`, with the commands of all modules and the global options."""
 
 from __future__ import annotations
 
@@ -71,11 +71,11 @@ OTHER_NAMES = {
     "version": "--version",
     "whoami": "user show",
 }
-"""Command of `marey` to suggest for a command name of another program, by this name."""
+"""Command of `marey` to suggest if a user types the name of a command of another program, by this name."""
 
 
 class CommandGroup(TyperGroup):
-    """Command group that suggests the command of `marey` if the user types a command name of another program."""
+    """Command group that suggests a command if the user types the name of a similar command of another program."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Return the name of the command, the command, and its arguments; fail if there is no such command."""
@@ -87,12 +87,12 @@ class CommandGroup(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def make_context(self, *given: Any, **more: Any) -> Any:
-        """Parse the arguments of `marey` itself."""
+        """Parse the global options of `marey`; errors are in plain words."""
         with usage_in_plain_words():
             return super().make_context(*given, **more)
 
     def invoke(self, ctx: Any) -> Any:
-        """Parse the arguments of the command, and run it."""
+        """Parse the arguments of the command, and run it; errors of usage are in plain words."""
         with usage_in_plain_words():
             return super().invoke(ctx)
 
@@ -147,9 +147,16 @@ def marey(
             envvar=list(SERVER_VARIABLES), help="Address of the server; default: the server of your last login."
         ),
     ] = None,
-    token_file: Annotated[Path | None, typer.Option(help="File that holds a token and nothing else.")] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(
+            help="File that contains a token and nothing else. Default: "
+            "MAREY_TOKEN, else the token of `marey login`, else "
+            "that of a server on this machine."
+        ),
+    ] = None,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Show details, including tracebacks of errors.")
+        bool, typer.Option("--verbose", "-v", help="Show log messages, and tracebacks of errors.")
     ] = False,
     version: Annotated[  # noqa: ARG001 - its callback does it
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
@@ -229,9 +236,10 @@ for register in (
 
 
 def with_one_command(name: str | None) -> typer.Typer:
-    """Return `app` with only the command or group of this name, or with all commands if there is no such command.
+    """Return `app` with only the command or group called `name`, or with all commands if there is none of this name.
 
-    Typer builds the parameters of all commands before it runs one; building only one takes a tenth of the time.
+    Typer builds the parameters of all commands before it runs a command; for a single command, this takes a tenth of
+    the time.
     """
     chosen = copy.copy(app)
     chosen.registered_commands = [command for command in app.registered_commands if _name(command) == name]

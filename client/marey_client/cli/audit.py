@@ -27,7 +27,7 @@ ONLY_AS_JSON = frozenset({"clips"})
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.command()(audit)
 
 
@@ -42,17 +42,21 @@ def audit(
     ] = None,
     kind: Annotated[
         str | None,
-        typer.Option(help="Kind of change, such as member.added; an unknown kind prints the list of all kinds."),
+        typer.Option(
+            help="Show only changes of this kind, such as member.added; an unknown kind prints the list of all kinds."
+        ),
     ] = None,
-    actor: Annotated[str | None, typer.Option(help="Name of the user who made the change.")] = None,
+    actor: Annotated[str | None, typer.Option(help="Show only changes that this user made.")] = None,
     subject: Annotated[
-        str | None, typer.Option(help="Name or id of the user or of the object that was changed.")
+        str | None, typer.Option(help="Show only changes of this user or object, given by name or id.")
     ] = None,
     since: Annotated[
         str | None,
-        typer.Option(help="Earliest time of the changes, in UTC, such as 2026-11-23 or 2026-11-23T15:04:05."),
+        typer.Option(
+            help="Show only changes at this time, in UTC, or later, such as 2026-11-23 or 2026-11-23T15:04:05."
+        ),
     ] = None,
-    until: Annotated[str | None, typer.Option(help="Time before which the changes were made, in UTC.")] = None,
+    until: Annotated[str | None, typer.Option(help="Show only changes before this time, in UTC.")] = None,
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Greatest number of entries to list.")] = 50,
     as_json: AsJson = False,
 ) -> None:

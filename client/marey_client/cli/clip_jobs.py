@@ -38,7 +38,7 @@ SQUARE_CM = 1e4  # in a square metre
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, retarget, params=RETARGET, job=JOB)
     add_command(app, align, params=ALIGN, job=JOB)
     add_command(app, cut, params=CUT, job=JOB)
@@ -47,7 +47,9 @@ def add_to(app: typer.Typer) -> None:
 def retarget(
     context: typer.Context,
     sources: Sources,
-    to: Annotated[str, typer.Option(help="The skeleton: project/folder/name, or project/id.")],
+    to: Annotated[
+        str, typer.Option(help="The skeleton to which the motion is transferred: project/folder/name, or project/id.")
+    ],
     into: Into,
     params: Chosen,
     job: Chosen,
@@ -90,7 +92,7 @@ def align(
 ) -> None:
     """Align clips of one action with each other, as a job.
 
-    `--reference` also accepts the address or the path of the clip with which all other clips are aligned.
+    `--reference` also accepts the address (project/folder/name) or the path (folder/name) of a clip.
     """
     from marey_schemas.kinds import Kind
 

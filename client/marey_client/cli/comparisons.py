@@ -1,4 +1,4 @@
-"""Command `compare`."""
+"""Command `compare`: what changed between evaluations."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PRINTED_METRICS = (
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     add_command(app, compare, params=COMPARE, job=FINDINGS_JOB)
 
 
@@ -41,17 +41,23 @@ def compare(
     others: Annotated[
         list[str],
         typer.Argument(
-            help="The evaluation after the change, or several evaluations of other sets of clips, with the same "
-            "trials. Create them with `marey evaluate --normaliser BEFORE`."
+            help="Evaluation to compare with BEFORE; or several, each of another set of clips. All must have the "
+            "same trials as BEFORE, and its scaling of features: create them with `marey evaluate "
+            "--normaliser BEFORE`."
         ),
     ],
     params: Chosen,
     job: Chosen,
-    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "--output", "-o", help="Also write the report of the comparison, an HTML page, to this file."
+        ),
+    ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Show what changed between two evaluations, trial by trial, or compare several sets of clips with the first."""
+    """Compare two evaluations trial by trial, or compare several evaluations with the first one."""
     if out is not None and not wait:
         raise WrongUsage(
             "--out writes the result of the job, but --no-wait does not wait for the result; leave out one of "

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from marey_client.marey import Marey
 
 Finding = tuple[str, str, str]
-"""Check, state (ok, warning or fault), and detail, which says what to do."""
+"""Result of a check: name of the check; state (ok, warning or fault); and a detail, which says what to do."""
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(doctor)
 
 
@@ -33,14 +33,16 @@ def doctor(
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
     local: Annotated[
-        bool, typer.Option("--local/--no-local", help="Check the data folder and the database on this machine.")
+        bool,
+        typer.Option("--local/--no-local", help="Check the data folder and the database of a server on this machine."),
     ] = True,
     remote: Annotated[bool, typer.Option("--remote/--no-remote", help="Check the running server.")] = True,
     chaos: Annotated[
         bool,
         typer.Option(
             "--chaos",
-            help="Inject faults into the running server instead, in a scratch project that is removed at the end.",
+            help="Instead of the checks, inject faults into the running server, in a scratch project that is "
+            "removed at the end.",
         ),
     ] = False,
     seed: Annotated[

@@ -1,4 +1,4 @@
-"""Commands `evaluate` and `report`."""
+"""Commands `evaluate`, which measures locomotion clips, and `report`, which writes the report of a result."""
 
 from __future__ import annotations
 
@@ -41,7 +41,11 @@ Loops = Annotated[
 ]
 Trims = Annotated[
     list[str] | None,
-    typer.Option("--trim", help="Frames of a clip to use, as project/folder/clip=first:stop; may be repeated."),
+    typer.Option(
+        "--trim",
+        help="Range of frames to use of a clip, as project/folder/clip=first:stop, without "
+        "the frame stop; may be repeated. Default: the whole clip.",
+    ),
 ]
 Normaliser = Annotated[
     str | None,
@@ -53,7 +57,7 @@ Normaliser = Annotated[
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, evaluate, params=EVALUATE, job=JOB)
     app.command()(report)
 
@@ -68,7 +72,12 @@ def evaluate(
     trim: Trims = None,
     normaliser: Normaliser = None,
     metric: MetricName = None,
-    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "--output", "-o", help="Also write the report of the evaluation, an HTML page, to this file."
+        ),
+    ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
@@ -120,7 +129,7 @@ def add_clip_options(marey: Marey, params: Chosen, loop: Sequence[str] | None, t
 
 
 def _place_beside(path: str) -> tuple[str, str]:
-    """Return a folder and a name for results of `path`: for `lab/gaits@v1/raw`, the folder `lab` and `gaits-v1-raw`."""
+    """Return the folder and the name of a result from the address of its input, such as `lab/gaits@v1/raw`."""
     named, at, version = path.partition("@")
     folder, _, last = named.rpartition("/")
     return folder, f"{last}{at}{version}".replace("@", "-").replace("/", "-")
@@ -133,13 +142,14 @@ def report(
         "report.html"
     ),
     figures: Annotated[
-        Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
+        Path | None,
+        typer.Option(help="Also write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
     ] = None,
     walk_graph: Annotated[
         Path | None,
         typer.Option(
-            help="Write the displayed frames of an evaluation and the jumps between them, as a graph, to this file: "
-            ".graphml or .json."
+            help="Also write the frames that the trials of an evaluation displayed, and the jumps between them, "
+            "as a graph to this file, which ends in .graphml or .json."
         ),
     ] = None,
     trial: Annotated[
@@ -185,7 +195,7 @@ def clips_in(marey: Marey, address: Address) -> list[Any]:
 
 
 def _trim(marey: Marey, text: str) -> tuple[str, tuple[int, int]]:
-    """Return the id of a clip and the range of its frames to use."""
+    """Parse `project/folder/clip=first:stop`; return the id of the clip and the range of frames."""
     from marey_schemas.kinds import Kind
 
     place, _, frames = text.rpartition("=")
@@ -224,7 +234,7 @@ def _print_evaluation(found: EvaluationHandle, as_json: bool) -> None:
 
 
 def perceived_text(perceived: Mapping[str, Any]) -> str:
-    """Return a sentence about the perceptual distances of transitions."""
+    """Return a sentence about the number and the perceptual distances of the transitions between clips."""
     if not perceived["transitions"]:
         return f"There are no transitions to measure by the metric {perceived['metric']}."
     return (

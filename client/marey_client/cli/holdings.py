@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from marey_schemas.items import Staleness
 
 FEW = 50
-"""Greatest number of items that are examined by one request each; for more, whole folders are examined."""
+"""Greatest number of items that are examined one by one; for more items, one request examines a whole folder."""
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     for command in (df, stale):
         app.command()(command)
 
@@ -67,7 +67,7 @@ def size_text(size_bytes: int) -> str:
 
 def stale(
     context: typer.Context,
-    place: Annotated[str, typer.Argument(help="Project or folder: project[/folder].")],
+    place: Annotated[str, typer.Argument(help="Project or folder whose results are examined: project[/folder].")],
     as_json: AsJson = False,
 ) -> None:
     """List the results in a folder and below that are outdated, each with the inputs that have newer revisions."""

@@ -1,4 +1,4 @@
-"""Commands `suggest`, `optimise` and `sweep`."""
+"""Commands `suggest`, `optimise` and `sweep`, which show how to improve a set of clips."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ From = Annotated[
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, suggest, params=SUGGEST, job=FINDINGS_JOB)
     add_command(app, optimise, params=OPTIMISE, job=FINDINGS_JOB)
     add_command(app, sweep, params=SWEEP, job=FINDINGS_JOB)
@@ -58,8 +58,8 @@ def suggest(
     remove_out: Annotated[
         Path | None,
         typer.Option(
-            help="Write the paths of the clips whose removal has no effect on the trials to this file, one path per "
-            "line."
+            help="Also write the paths of the clips whose removal has no effect on the trials to this file, one "
+            "path per line."
         ),
     ] = None,
     metric: MetricName = None,
@@ -192,7 +192,7 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
 
 
 def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unused: Mapping[str, Any]) -> None:
-    """Print lists of suggestions with reasons; after a list of unused data, print the effect of removing all of it."""
+    """Print lists of suggestions with reasons; below a list of unused clips, print the effect of removing them all."""
     for heading, entries in sections:
         if not entries:
             continue
@@ -208,7 +208,7 @@ def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
 
 
 def _print_similarity(similarity: Mapping[str, Any]) -> None:
-    """Print the share of poses that can be blended; the limit of the distance is in metres, or that of the metric."""
+    """Print the share of poses that can be blended, and the distance up to which they can, in metres or by a metric."""
     if similarity["share"] is None:
         return
     limit = f"{similarity['threshold_m']:.2f} m" if "threshold_m" in similarity else f"{similarity['threshold']:.2f}"
@@ -261,7 +261,7 @@ def _chance_in_words(refused: Mapping[str, Any]) -> str:
 
 
 def _change(change: Mapping[str, Any]) -> str:
-    """Return a change as text, followed by the interval of repetitions if there is one."""
+    """Return a change as text, followed by its confidence interval if there is one."""
     low, high = change["again_low"], change["again_high"]
     interval = "" if low is None else f" ({low:+.4f} to {high:+.4f})"
     return f"{change['change']:+.4f}{interval}"

@@ -23,7 +23,7 @@ PICTURES = ("svg", "png", "dot")
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     add_command(app, lineage, params=OptionsOf("marey_schemas.lineage:LineageOptions"))
 
 

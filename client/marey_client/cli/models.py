@@ -1,4 +1,4 @@
-"""Commands `model` and `sample`."""
+"""Commands `model`, which trains a generative model, and `sample`, which draws motions from it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MODEL = OptionsOf(
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, model, params=MODEL, job=SEEDED_JOB)
     app.command()(sample)
 
@@ -45,7 +45,9 @@ def model(
     ],
     params: Chosen,
     job: Chosen,
-    into: Annotated[str | None, typer.Option(help="Folder of the model; default: the folder of the clips.")] = None,
+    into: Annotated[
+        str | None, typer.Option(help="Folder that receives the model; default: the folder of the clips.")
+    ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
@@ -72,14 +74,14 @@ def sample(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the random numbers; the same seed gives the same motions.")
     ] = 0,
-    format: Annotated[str, typer.Option(help=f"{one_of(SAMPLE_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
+    format: Annotated[str, typer.Option(help=f"Format of the files: {one_of(SAMPLE_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
     out: Annotated[
         Path | None, typer.Option("--out", "--output", "-o", help="Folder of the files; default: the current folder.")
     ] = None,
     into: Annotated[
         str | None, typer.Option(help="Create clips in this folder of the model's project, instead of files.")
     ] = None,
-    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m. Default: cm.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Draw motions from a model, and write the motions to files or create clips from them."""

@@ -12,11 +12,11 @@ from marey_client.cli.addresses import (
     FOLDER,
     REQUESTS_AT_ONCE,
     Address,
+    FolderOrItem,
     SingleItem,
-    Thing,
+    folder_or_item,
     items_selected,
     require_apart,
-    the_thing,
 )
 from marey_client.cli.revisions import require_revision
 from marey_client.cli.terminal.confirming import ask
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from marey_client.marey import Marey
     from marey_schemas.items import ItemChange
 
-AnyThing = TypeVar("AnyThing", bound=Thing)
+AnyFolderOrItem = TypeVar("AnyFolderOrItem", bound=FolderOrItem)
 Places = Annotated[
     list[str], typer.Argument(help="One or more items or folders: project/folder/name, project/folder/ or project/id.")
 ]
@@ -59,7 +59,7 @@ Preview = Annotated[bool, typer.Option("--preview", help="List what the command 
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     for command in (mv, rm, restore, revert, tag):
         app.command()(command)
 
@@ -77,26 +77,26 @@ def mv(
     as_json: AsJson = False,
 ) -> None:
     """Move or rename items and folders within a project. Ids and history do not change."""
-    *sources, target = places
+    *sources, destination = places
     if not sources:
         raise WrongUsage("give the items to move and the destination, such as: marey mv lab/raw/walk lab/raw/stroll")
-    to = Address.parse(target)
+    to = Address.parse(destination)
     for source in sources:
         if Address.parse(source).project != to.project:
             raise WrongUsage(f"{source} cannot be moved to another project; download it, and upload it to {to.project}")
     with connect(context) as marey:
         into_folder = to.is_folder or not to.path or len(sources) > 1 or _is_folder(marey, to)
-        things = [the_thing(marey, source, kind) for source in sources]
-        require_apart(things)
+        targets = [folder_or_item(marey, source, kind) for source in sources]
+        require_apart(targets)
         folder, name = (to.path, None) if into_folder else _parted(to.path)
 
-        def move(thing: Thing) -> Any:
-            was = thing.place
-            moved = thing.move(folder, name or was.rpartition("/")[2])
+        def move(target: FolderOrItem) -> Any:
+            was = target.place
+            moved = target.move(folder, name or was.rpartition("/")[2])
             print_message(f"{was} is moved to {to.project}/{moved.path}")
             return moved
 
-        _do_each(things, move, "moved", as_json)
+        _do_each(targets, move, "moved", as_json)
 
 
 def rm(
@@ -114,20 +114,20 @@ def rm(
     somebody has changed the item since it was selected, the other requests are still sent, and the exit status is 1.
     """
     with connect(context) as marey:
-        things = _named_or_selected(marey, places, kind, query)
-        count = sum(thing.count() for thing in things)
+        targets = _named_or_selected(marey, places, kind, query)
+        count = sum(target.count() for target in targets)
         if preview:
-            return _preview(("name", "kind"), [(one.place, one.kind) for one in things], things, "removed", as_json)
+            return _preview(("name", "kind"), [(one.place, one.kind) for one in targets], targets, "removed", as_json)
         if (count > 1 or query is not None) and not yes:
-            ask(f"remove {counted(count, 'item')} ({_named(things)})?", otherwise="nothing was removed")
+            ask(f"remove {counted(count, 'item')} ({_named(targets)})?", otherwise="nothing was removed")
 
-        def remove(thing: Thing) -> Any:
-            thing.delete()
+        def remove(target: FolderOrItem) -> Any:
+            target.delete()
             if query is None:
-                print_message(f"{thing.place} is removed; to undo this, run marey restore {_typed(thing)}")
-            return _identified(thing)
+                print_message(f"{target.place} is removed; to undo this, run marey restore {_typed(target)}")
+            return _identified(target)
 
-        return _do_each(things, remove, "removed", as_json, selected=query is not None)
+        return _do_each(targets, remove, "removed", as_json, selected=query is not None)
 
 
 def restore(
@@ -151,34 +151,34 @@ def restore(
     if preview and query is None:
         raise WrongUsage("--preview lists the items that a query selects; add --query, or leave out --preview")
     with connect(context) as marey:
-        things = _named_or_selected(marey, places, kind, query, deleted=True)
+        targets = _named_or_selected(marey, places, kind, query, deleted=True)
         if query is not None:
-            things = _last_at_each_path(things)
+            targets = _last_at_each_path(targets)
         if preview:
-            return _preview(("name", "kind"), [(one.place, one.kind) for one in things], things, "restored", as_json)
+            return _preview(("name", "kind"), [(one.place, one.kind) for one in targets], targets, "restored", as_json)
 
-        def bring_back(thing: Thing) -> Any:
+        def bring_back(target: FolderOrItem) -> Any:
             try:
-                restored = thing.restore()
+                restored = target.restore()
             except Conflict as error:
                 error.add_note("first move or rename the item that has this address now, with marey mv")
                 raise
             if query is None:
-                print_message(f"{thing.place} is restored")
+                print_message(f"{target.place} is restored")
             return restored
 
-        return _do_each(things, bring_back, "restored", as_json, selected=query is not None)
+        return _do_each(targets, bring_back, "restored", as_json, selected=query is not None)
 
 
-def _last_at_each_path(things: Sequence[Thing]) -> list[Thing]:
-    """Return, for each path, the item or folder that was removed last; print how many others are left out.
+def _last_at_each_path(targets: Sequence[FolderOrItem]) -> list[FolderOrItem]:
+    """Return the item or folder that was removed last at each path; print how many earlier ones are left out.
 
-    In `things`, the one that was removed last must come before all others with the same path.
+    Among the `targets` with the same path, the one that was removed last must be the first.
     """
-    chosen: dict[str, Thing] = {}
-    for one in things:
+    chosen: dict[str, FolderOrItem] = {}
+    for one in targets:
         chosen.setdefault(one.place, one)
-    if others := len(things) - len(chosen):
+    if others := len(targets) - len(chosen):
         print_message(
             f"left out {counted(others, 'item')} with the path of one that was removed later; restore them by their ids"
         )
@@ -188,7 +188,12 @@ def _last_at_each_path(things: Sequence[Thing]) -> list[Thing]:
 def revert(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="Item and earlier revision: project/folder/name@revision.")],
-    message: Annotated[str, typer.Option("--message", "-m", help="Message of the new revision.")] = "",
+    message: Annotated[
+        str,
+        typer.Option(
+            "--message", "-m", help="Message of the new revision. Default: a sentence that names the earlier revision."
+        ),
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Create a revision of an item with the content of an earlier revision. Name, folder and tags do not change."""
@@ -235,13 +240,13 @@ def tag(
         raise WrongUsage("no tags to change; give them with --add NAME or --remove NAME")
     ItemChange(tags=added)  # an invalid tag is refused before anything changes
     with connect(context) as marey:
-        things = _named_or_selected(marey, places, kind, query)
-        wanted = {one.id: _with_tags(one, added, removed) for one in things}
-        items = [one for one in things if isinstance(one, SingleItem)]
+        targets = _named_or_selected(marey, places, kind, query)
+        wanted = {one.id: _with_tags(one, added, removed) for one in targets}
+        items = [one for one in targets if isinstance(one, SingleItem)]
         if query is not None:
             items = [one for one in items if wanted[one.id].tags != one.handle.item.tags]
-            if len(items) < len(things):
-                print_message(f"{len(things) - len(items):,} of {counted(len(things), 'item')} need no change")
+            if len(items) < len(targets):
+                print_message(f"{len(targets) - len(items):,} of {counted(len(targets), 'item')} need no change")
         if preview:
             rows = [(one.place, " ".join(one.handle.item.tags), " ".join(wanted[one.id].tags or ())) for one in items]
             return _preview(("name", "tags", "new tags"), rows, items, "changed", as_json)
@@ -255,7 +260,7 @@ def tag(
         return _do_each(items, put_tags, "changed", as_json, selected=query is not None)
 
 
-def _with_tags(thing: Thing, added: Sequence[str], removed: Set[str]) -> ItemChange:
+def _with_tags(target: FolderOrItem, added: Sequence[str], removed: Set[str]) -> ItemChange:
     """Return the change that adds and removes tags of an item.
 
     Raises `WrongUsage` for a folder, and for more tags than an item can have.
@@ -264,44 +269,44 @@ def _with_tags(thing: Thing, added: Sequence[str], removed: Set[str]) -> ItemCha
 
     from marey_schemas.items import ItemChange
 
-    if not isinstance(thing, SingleItem):
-        raise WrongUsage(f"{thing.place} is a folder, and folders have no tags; give the items in it")
-    tags = dict.fromkeys(one for one in (*thing.handle.item.tags, *added) if one not in removed)
+    if not isinstance(target, SingleItem):
+        raise WrongUsage(f"{target.place} is a folder, and folders have no tags; give the items in it")
+    tags = dict.fromkeys(one for one in (*target.handle.item.tags, *added) if one not in removed)
     try:
         return ItemChange(tags=tuple(tags))
     except ValidationError as error:
         reason = plain_reason(error.errors(include_url=False)[0])
         raise WrongUsage(
-            f"{thing.place} cannot have {counted(len(tags), 'tag')}: {reason}; nothing was changed"
+            f"{target.place} cannot have {counted(len(tags), 'tag')}: {reason}; nothing was changed"
         ) from None
 
 
 def _named_or_selected(
     marey: Marey, places: Sequence[str], kind: str | None, query: str | None, *, deleted: bool = False
-) -> Sequence[Thing]:
+) -> Sequence[FolderOrItem]:
     """Return the folders and items at addresses. With `query`, return the items in these places that the query selects.
 
     With `deleted`, these are deleted folders and items.
     """
     if query is not None:
         return items_selected(marey, places, query, kind, deleted=deleted)
-    things = [the_thing(marey, place, kind, deleted=deleted) for place in places]
-    require_apart(things)
-    return things
+    targets = [folder_or_item(marey, place, kind, deleted=deleted) for place in places]
+    require_apart(targets)
+    return targets
 
 
-def _identified(thing: Thing) -> dict[str, str]:
-    return {"id": thing.id, "kind": thing.kind, "place": thing.place}
+def _identified(target: FolderOrItem) -> dict[str, str]:
+    return {"id": target.id, "kind": target.kind, "place": target.place}
 
 
 def _preview(
-    columns: Sequence[str], rows: Sequence[Sequence[object]], things: Sequence[Thing], done: str, as_json: bool
+    columns: Sequence[str], rows: Sequence[Sequence[object]], targets: Sequence[FolderOrItem], done: str, as_json: bool
 ) -> None:
     """Print what a command would change."""
     if as_json:
-        return print_json({"preview": list(map(_identified, things))})
+        return print_json({"preview": list(map(_identified, targets))})
     print_table(columns, rows)
-    count = sum(thing.count() for thing in things)
+    count = sum(target.count() for target in targets)
     return print_message(f"{counted(count, 'item')} would be {done}; nothing was changed")
 
 
@@ -314,47 +319,52 @@ def _parted(path: str) -> tuple[str, str]:
     return folder, name
 
 
-def _typed(thing: Thing) -> str:
+def _typed(target: FolderOrItem) -> str:
     """Return the address of a folder or item as users type it; the address of a folder ends with a slash."""
-    place = f"{thing.place}/" if thing.kind == FOLDER else thing.place
+    place = f"{target.place}/" if target.kind == FOLDER else target.place
     return place if place.isascii() and " " not in place else f"'{place}'"
 
 
-def _named(things: Sequence[Thing]) -> str:
-    first, others = _typed(things[0]), len(things) - 1
+def _named(targets: Sequence[FolderOrItem]) -> str:
+    first, others = _typed(targets[0]), len(targets) - 1
     return f"{first} and {others} more" if others else first
 
 
 def _do_each(
-    things: Sequence[AnyThing], do: Callable[[AnyThing], Any], done: str, as_json: bool, *, selected: bool = False
+    targets: Sequence[AnyFolderOrItem],
+    do: Callable[[AnyFolderOrItem], Any],
+    done: str,
+    as_json: bool,
+    *,
+    selected: bool = False,
 ) -> None:
     """Apply `do` to each folder or item, and print refusals. Raises `Refused` at the end if there was a refusal.
 
-    `done` is the past participle for messages, such as "moved". `selected` says that a query selected the items. There
-    may be many, and they do not depend on each other, so several requests are sent at a time, and the number of items
-    is printed.
+    `done` is the past participle for messages, such as "moved". With `selected`, a query selected the items: several
+    requests are then sent at a time, because the items do not depend on each other, and the number of changed items is
+    printed.
     """
     from marey_client.errors import RequestFailed
 
-    def attempt(thing: AnyThing) -> tuple[Any, str | None]:
+    def attempt(target: AnyFolderOrItem) -> tuple[Any, str | None]:
         try:
-            return do(thing), None
+            return do(target), None
         except RequestFailed as error:
             if error.status >= 500 or error.status == 401:
                 raise
-            print_message(f"{thing.place}: {sentence(error)}")
+            print_message(f"{target.place}: {sentence(error)}")
             return None, sentence(error)
 
     results: list[Any] = []
     refused: dict[str, str] = {}
     with progress() as advance, ThreadPoolExecutor(REQUESTS_AT_ONCE if selected else 1) as pool:
-        for number, (thing, (result, refusal)) in enumerate(zip(things, pool.map(attempt, things), strict=True), 1):
+        for number, (target, (result, refusal)) in enumerate(zip(targets, pool.map(attempt, targets), strict=True), 1):
             if refusal is None:
                 results.append(result)
             else:
-                refused[thing.place] = refusal
+                refused[target.place] = refusal
             if selected:
-                advance(f"items {done}", number, len(things))
+                advance(f"items {done}", number, len(targets))
     if selected:
         print_message(f"{counted(len(results), 'item')} {done}" + (f", {len(refused)} refused" if refused else ""))
     if as_json:

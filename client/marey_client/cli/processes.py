@@ -35,7 +35,7 @@ READY_TIMEOUT_S = 10.0
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.command()(serve)
     app.add_typer(workers, name="worker")
     app.command()(ready)
@@ -82,7 +82,9 @@ def worker(
     slots: Annotated[
         int, typer.Option(min=1, help="Number of jobs that run at the same time, each in its own process.")
     ] = 1,
-    kind: Annotated[list[str] | None, typer.Option(help="Run only jobs of this kind; may be repeated.")] = None,
+    kind: Annotated[
+        list[str] | None, typer.Option(help="Run only jobs of this kind; may be repeated. Default: all kinds.")
+    ] = None,
     label: Annotated[
         list[str] | None,
         typer.Option(
@@ -92,7 +94,13 @@ def worker(
     name: Annotated[
         str | None, typer.Option(help="Name of the worker, shown to people; default: host and process id.")
     ] = None,
-    cache: Annotated[Path | None, typer.Option(help="Folder for a cache of downloaded inputs.")] = None,
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a cache of downloaded inputs, which later jobs "
+            "read again. Default: marey/inputs below ~/.cache."
+        ),
+    ] = None,
     cache_mb: Annotated[
         int | None, typer.Option(min=16, help="Greatest size of the cache, in MiB; default: 2048.")
     ] = None,
@@ -100,9 +108,16 @@ def worker(
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
     ] = None,
     job: Annotated[
-        str | None, typer.Option(help="Run only this job, then end; used by pods that the server starts for one job.")
+        str | None,
+        typer.Option(
+            help="Id of the only job to run; then the worker ends. Pods that the server "
+            "starts for one job use this option."
+        ),
     ] = None,
-    task: Annotated[int | None, typer.Option(min=0, help="Run only the task of --job that has this position.")] = None,
+    task: Annotated[
+        int | None,
+        typer.Option(min=0, help="With --job: run only the task of the job that has this position, counted from 0."),
+    ] = None,
 ) -> None:
     """Run a worker, which runs the jobs of a server until you stop the worker. The token must have the scope `work`."""
     if context.invoked_subcommand is not None:
@@ -171,7 +186,7 @@ def demo(
     motion: Annotated[Path | None, typer.Argument(help="A folder of motion files; default: generated walks.")] = None,
     data: Annotated[Path, typer.Option(help="Data folder of the demonstration's server.")] = Path("marey-demo"),
     serve_on: Annotated[
-        bool, typer.Option("--serve", help="Keep the server running when the demonstration has ended.")
+        bool, typer.Option("--serve", help="Keep the server running after the demonstration, until you stop it.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

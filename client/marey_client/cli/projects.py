@@ -1,4 +1,4 @@
-"""Commands `project` and `member`."""
+"""Commands of the groups `project` and `member`: projects, quotas, members and roles."""
 
 from __future__ import annotations
 
@@ -22,22 +22,27 @@ member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage t
 MemberName = Annotated[
     str, typer.Argument(help="Name of the user; with `--folder`, '*' stands for all members except owners.")
 ]
-ItemLimit = Annotated[int | None, typer.Option("--items", min=0, help="Set the maximum number of items.")]
+ItemLimit = Annotated[
+    int | None, typer.Option("--items", min=0, help="Set the maximum number of items. Default: unchanged.")
+]
 ByteLimit = Annotated[
-    int | None, typer.Option("--stored-bytes", min=0, help="Set the maximum total size of all revisions, in bytes.")
+    int | None,
+    typer.Option(
+        "--stored-bytes", min=0, help="Set the maximum total size of all revisions, in bytes. Default: unchanged."
+    ),
 ]
 DefaultLimits = Annotated[
     bool,
     typer.Option(
         "--defaults",
-        help="Use the limits in the server's settings, and no limit of running jobs, except for limits that other "
-        "options give.",
+        help="Remove the limits set for this project or user: the limits in the server's settings apply, and "
+        "jobs have no limit. Other options of the same command still set their limits.",
     ),
 ]
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(project, name="project")
     app.add_typer(member, name="member")
 
@@ -46,7 +51,7 @@ def add_to(app: typer.Typer) -> None:
 def create_project(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the project: lower-case letters, digits, - and _.")],
-    title: Annotated[str | None, typer.Option(help="Title of the project.")] = None,
+    title: Annotated[str | None, typer.Option(help="Title of the project, shown beside its name.")] = None,
     description: Annotated[str, typer.Option(help="Purpose of the project.")] = "",
     public: Annotated[
         bool, typer.Option("--public", help="Make the project public: everybody who can reach the server may read it.")
@@ -80,7 +85,7 @@ def list_projects(context: typer.Context, as_json: AsJson = False) -> None:
 
 @project.command("show")
 def show_project(context: typer.Context, name: ProjectName, as_json: AsJson = False) -> None:
-    """Show a project."""
+    """Show a project: its title, purpose and visibility, and your role in it."""
     with connect(context) as marey:
         found = marey.project(name).read()
     if as_json:
@@ -92,9 +97,15 @@ def show_project(context: typer.Context, name: ProjectName, as_json: AsJson = Fa
 def change_project(
     context: typer.Context,
     name: ProjectName,
-    title: Annotated[str | None, typer.Option(help="Title of the project.")] = None,
-    description: Annotated[str | None, typer.Option(help="Purpose of the project.")] = None,
-    visibility: Annotated[str | None, typer.Option(help="Visibility: private or public.")] = None,
+    title: Annotated[str | None, typer.Option(help="New title of the project. Default: unchanged.")] = None,
+    description: Annotated[str | None, typer.Option(help="New purpose of the project. Default: unchanged.")] = None,
+    visibility: Annotated[
+        str | None,
+        typer.Option(
+            help="New visibility. private: only members may read the project; public: everybody who can reach "
+            "the server may. Default: unchanged."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Change the title, the description and the visibility of a project."""
@@ -116,7 +127,10 @@ def project_quota(
     items: ItemLimit = None,
     stored_bytes: ByteLimit = None,
     running_jobs: Annotated[
-        int | None, typer.Option("--running-jobs", min=0, help="Set the maximum number of jobs that run at once.")
+        int | None,
+        typer.Option(
+            "--running-jobs", min=0, help="Set the maximum number of jobs that run at once. Default: unchanged."
+        ),
     ] = None,
     defaults: DefaultLimits = False,
     as_json: AsJson = False,
@@ -134,7 +148,7 @@ def project_quota(
 
 
 def changed_limits(defaults: bool, **given: int | None) -> dict[str, int | None]:
-    """Return the limits that the options change; None stands for the limit of the settings, or for no limit."""
+    """Return the limits that options change, by name; None means the limit in the server's settings, or no limit."""
     return {name: limit for name, limit in given.items() if defaults or limit is not None}
 
 
@@ -160,7 +174,7 @@ def delete_project(context: typer.Context, name: ProjectName) -> None:
 
 @project.command("restore")
 def restore_project(context: typer.Context, name: ProjectName) -> None:
-    """Restore a deleted project."""
+    """Restore the project of this name that was deleted last."""
     with connect(context) as marey:
         marey.project(name).restore()
     print_message(f"project {name} is restored")

@@ -24,7 +24,7 @@ MOST_SHOWN = 100
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(purge)
 
 
@@ -48,7 +48,11 @@ def purge(
     query: QueryText = None,
     older_than: Annotated[
         int | None,
-        typer.Option("--older-than", min=0, help="Purge only items that were removed at least this many days ago."),
+        typer.Option(
+            "--older-than",
+            min=0,
+            help="Purge only items that were removed at least this many days ago. Default: all removed items.",
+        ),
     ] = None,
     dataset: Annotated[
         str | None,
@@ -136,7 +140,7 @@ def _named(project: str, items: Sequence[PurgedItem]) -> str:
 def _request(
     project: ProjectHandle, place: str, kind: str | None, query: str | None, older_than: int | None
 ) -> PurgeRequest:
-    """Return the request for the items at an address: an id, a folder, or a path that removed items had."""
+    """Return the request to purge the removed items at an address: an item's id, a folder, or their former path."""
     from marey_schemas.purges import PurgeRequest
 
     address = Address.parse(place)

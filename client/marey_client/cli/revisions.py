@@ -44,7 +44,7 @@ def require_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> t
 
 
 def find_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tuple[ItemHandle, int | None] | None:
-    """Return the item at an address, with the revision number after `@` or None; return None if there is no item."""
+    """Return the item at an address, and the number after `@`, if any; None instead of the pair if there is no item."""
     found = find_item(marey, address, kinds)
     if found is not None or address.is_folder:
         return None if found is None else (found, None)

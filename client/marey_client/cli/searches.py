@@ -1,4 +1,4 @@
-"""Commands `search`, `tree`, `index` and `similar`."""
+"""Commands `search` and `tree` for motions of models, `index` and `similar` for moments of clips."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Many = list[str] | None
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, tree, params=TREE, job=SEEDED_JOB)
     add_command(app, search, params=SEARCH)
     add_command(app, index, params=INDEX, job=FINDINGS_JOB)
@@ -79,12 +79,16 @@ def search(
     at: Annotated[
         Many,
         typer.Option(
-            help="Require a position of a joint, in metres: WHEN:JOINT=x,y,z, such as end:left_wrist=0.2,_,1; _ leaves "
-            "a coordinate free."
+            help="Require a position of a joint in the world, in metres: WHEN:JOINT=x,y,z, such as "
+            "end:left_wrist=0.2,_,1; _ leaves a coordinate free."
         ),
     ] = None,
     turned: Annotated[
-        Many, typer.Option(help="Require a global rotation of a joint: WHEN:JOINT=w,x,y,z, such as end:head=1,0,0,0.")
+        Many,
+        typer.Option(
+            help="Require a rotation of a joint in the world, as a quaternion: "
+            "WHEN:JOINT=w,x,y,z, such as end:head=1,0,0,0."
+        ),
     ] = None,
     look: Annotated[
         Many,
@@ -107,8 +111,18 @@ def search(
         Many,
         typer.Option(help="Require a heading of the body: WHEN=degrees from +z, positive to the left, such as end=90."),
     ] = None,
-    time: Annotated[Many, typer.Option(help="Require a time of a keyframe, in seconds: KEYFRAME=seconds.")] = None,
-    start: Annotated[str | None, typer.Option(help="Position and heading of the motion's start: x,z,degrees.")] = None,
+    time: Annotated[
+        Many,
+        typer.Option(
+            help="Require that a keyframe is reached at a time after the beginning of the motion: KEYFRAME=seconds."
+        ),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            help="Position on the ground, in metres, and heading where the motion starts: x,z,degrees. Default: 0,0,0."
+        ),
+    ] = None,
     tolerance_cm: Annotated[
         float | None, typer.Option(help="Tolerance of positions, in centimetres; default: 1.")
     ] = None,
@@ -122,9 +136,17 @@ def search(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "--output", "-o", help="File or folder to which the motion is written.")
+        Path | None,
+        typer.Option(
+            "--out",
+            "--output",
+            "-o",
+            help="File or folder to which the motion is also "
+            "written. Default: only the errors of the "
+            "constraints are printed.",
+        ),
     ] = None,
-    format: Annotated[str, typer.Option(help=f"{one_of(MOTION_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
+    format: Annotated[str, typer.Option(help=f"Format of the file: {one_of(MOTION_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
     as_json: AsJson = False,
 ) -> None:
     """Find the motion that meets constraints best, among all motions of a model.
@@ -240,7 +262,7 @@ def similar(
 
 
 def _index_of(marey: Marey, project: str, index: str) -> str:
-    """Return the id of the index of a search, given by its address or its id.
+    """Return the id of the index to search, which is given as an address or as an id.
 
     Raises `WrongUsage` if there is none, or if it is of another project.
     """
@@ -255,7 +277,7 @@ def _index_of(marey: Marey, project: str, index: str) -> str:
 
 
 def _metric_of(marey: Marey, project: str, metric: str) -> str:
-    """Return the name or id of the metric of a search. Raises `WrongUsage` if it is stored in another project."""
+    """Return the name or the id of the metric of a search. Raises `WrongUsage` if another project has the metric."""
     from marey_schemas.documents.metrics import is_built_in
 
     if not is_built_in(metric) and (other := Address.parse(metric).project) != project:

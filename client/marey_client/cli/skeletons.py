@@ -21,7 +21,7 @@ skeleton = typer.Typer(
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(skeleton, name="skeleton")
 
 
@@ -31,7 +31,10 @@ def map_joints(
     place: Annotated[str, typer.Argument(help="The skeleton: project/folder/name, or project/id.")],
     assignments: Annotated[
         list[str] | None,
-        typer.Argument(help="Mapping of a joint: standard_joint=JointName to set it, standard_joint= to clear it."),
+        typer.Argument(
+            help="Mapping of a joint: standard_joint=JointName to set it, standard_joint= to clear "
+            "it. Default: show the mapping."
+        ),
     ] = None,
     confirm: Annotated[
         bool, typer.Option("--confirm", help="Confirm the recognised mapping, even if it was uncertain.")
@@ -66,9 +69,12 @@ def joint_axes(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="The skeleton: project/folder/name, or project/id.")],
     joint: Annotated[str | None, typer.Argument(help="The joint to change; default: show all joints.")] = None,
-    twist: Annotated[str | None, typer.Option(help="Axis along the bone, in the joint's frame: x,y,z.")] = None,
+    twist: Annotated[
+        str | None, typer.Option(help="New axis along the bone, in the joint's frame: x,y,z. Default: unchanged.")
+    ] = None,
     swing: Annotated[
-        str | None, typer.Option(help="Axis orthogonal to the bone's axis, in the joint's frame: x,y,z.")
+        str | None,
+        typer.Option(help="New swing axis, orthogonal to the bone, in the joint's frame: x,y,z. Default: unchanged."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -106,16 +112,21 @@ def merge(
         typer.Argument(help="A project, or several skeletons of one rig: project/folder/name, or project/id."),
     ],
     keep: Annotated[
-        str | None, typer.Option(help="The skeleton that remains: project/folder/name, or project/id.")
+        str | None,
+        typer.Option(
+            help="The skeleton that remains: project/folder/name, or project/id. Default: "
+            "for each rig, a skeleton with an edited joint mapping, else the most used "
+            "one."
+        ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be merged, and change nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Merge skeletons of one rig, for example if an earlier version created a skeleton for each take.
 
-    Skeletons are of one rig if they differ only in the offset of the root, in offsets that the motions replace, or by
-    rounding. Clips and models get a new revision with the remaining skeleton and the same motion; the other skeletons
-    are deleted.
+    Skeletons are of one rig if they differ only in the offset of the root, in offsets that motions replace by
+    translations, or by rounding. Clips and models get a new revision with the remaining skeleton and the same motion;
+    the other skeletons are deleted.
     """
     from marey_schemas.kinds import Kind
 
@@ -145,7 +156,7 @@ def merge(
 
 
 def _assigned(assignments: list[str], known: set[str], mapped: Mapping[str, str]) -> dict[str, str]:
-    """Parse texts such as `hips=Pelvis`; return the joint by standard joint, empty to clear the mapping.
+    """Parse texts such as `hips=Pelvis`; return the joint by standard joint, an empty text to clear the mapping.
 
     A name in `mapped` can be cleared even if it is not a standard joint.
     """

@@ -38,7 +38,7 @@ _REDIRECT = '<!doctype html><meta charset="utf-8"><title>Marey</title><meta http
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(view)
 
 
@@ -53,7 +53,10 @@ def view(
     ],
     beside: Annotated[
         str | None,
-        typer.Option(help="Another clip of the project to show beside it, or `source`: the clip it was made from."),
+        typer.Option(
+            help="Another clip of the project to show beside the clip, or `source`: the clip from which "
+            "the clip was made."
+        ),
     ] = None,
     revision: RevisionNumber = None,
     beside_revision: Annotated[
@@ -75,14 +78,20 @@ def view(
             "server or network, if it ends in .html.",
         ),
     ] = None,
-    frames: Annotated[str | None, typer.Option(help="With --out: frames of the clip, such as 100:200.")] = None,
-    moments: Annotated[int, typer.Option(min=1, help="In a picture: number of poses in a row.")] = DEFAULT_MOMENTS,
-    n: Annotated[int, typer.Option("-n", min=1, help="With --out: number of samples or trials.")] = DEFAULT_ROWS,
+    frames: Annotated[
+        str | None, typer.Option(help="With --out: frames of the clip, such as 100:200. Default: all frames.")
+    ] = None,
+    moments: Annotated[
+        int, typer.Option(min=1, help="With --out and a picture: number of poses in a row.")
+    ] = DEFAULT_MOMENTS,
+    n: Annotated[
+        int, typer.Option("-n", min=1, help="With --out: number of samples of a model, or of trials of an evaluation.")
+    ] = DEFAULT_ROWS,
     seed: Annotated[int, typer.Option(min=0, help="With --out: seed of the samples of a model.")] = 0,
 ) -> None:
     """Show a clip in a browser, or draw it; --out also draws samples of a model, and worst trials of an evaluation.
 
-    The address that is printed signs one browser in, once, within two minutes.
+    Prints the address of the page. The first browser that opens the address within two minutes is signed in, once.
     """
     from marey_schemas.sign_ins import VIEW_PATH
 
@@ -115,7 +124,7 @@ def view(
 
 
 def page_address(marey: Marey, project: str, path: str, query: Mapping[str, str]) -> str:
-    """Return the address of a page about a project, with the code of a new link that signs one browser in."""
+    """Return the address of a page about a project, with a new code that signs in the first browser that opens it."""
     link = marey.project(project).browser_link()
     return f"{marey.transport.url}{path}?{urlencode(query, safe='/@')}#{quote(link.code)}"
 
@@ -153,7 +162,11 @@ def _source_of(marey: Marey, clip: ItemHandle, revision: int | None) -> tuple[It
 
 @dataclass(frozen=True)
 class Drawing:
-    """Picture or page to write: file `out`, poses per row, and number of samples or trials, drawn with `seed`."""
+    """Picture or page to write to the file `out`.
+
+    `moments` is the number of poses in a row, and `rows` the number of samples or trials; samples are drawn with
+    `seed`.
+    """
 
     out: Path
     moments: int
@@ -224,7 +237,7 @@ def read_frames(text: str) -> slice:
 
 
 def _open(url: str) -> None:
-    """Open an address in the browser by way of a file, because other users could see it as a program's argument."""
+    """Open an address in the browser through a file, because arguments of programs are visible to other users."""
     with tempfile.NamedTemporaryFile("w", prefix="marey-view-", suffix=".html", delete=False) as file:
         file.write(_REDIRECT.format(url=html.escape(url)))
     if webbrowser.open(Path(file.name).as_uri()):

@@ -1,4 +1,4 @@
-"""Commands `webhook`, which notify other programs of events in a project."""
+"""Commands of the group `webhook`: addresses to which a server sends the events of a project."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from marey_schemas.event_kinds import ProjectEventKind
     from marey_schemas.webhooks import DeliveryState, Webhook, WebhookDelivery
 
-webhook = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Notify other programs of events in a project.")
+webhook = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Send the events of a project to the addresses of other programs."
+)
 
 WebhookId = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook; `marey webhook ls` lists the ids.")]
 Url = Annotated[str, typer.Argument(help="Address to which requests are sent, such as https://ci.example.org/marey.")]
@@ -35,7 +37,7 @@ Description = Annotated[str | None, typer.Option(help="Purpose of the webhook.")
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(webhook, name="webhook")
 
 
@@ -107,12 +109,14 @@ def change(
     context: typer.Context,
     project: ProjectName,
     webhook_id: WebhookId,
-    url: Annotated[str | None, typer.Option(help="New address to which requests are sent.")] = None,
+    url: Annotated[str | None, typer.Option(help="New address to which requests are sent. Default: unchanged.")] = None,
     kind: Kinds = None,
     description: Description = None,
     pause: Annotated[
         bool | None,
-        typer.Option("--pause/--resume", help="Pause deliveries, or resume them and send the waiting events."),
+        typer.Option(
+            "--pause/--resume", help="Pause deliveries, or resume them and send the waiting events. Default: unchanged."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -161,7 +165,10 @@ def deliveries(
     project: ProjectName,
     webhook_id: WebhookId,
     state: Annotated[
-        str | None, typer.Option(help="List only deliveries in this state: waiting, retrying, delivered or dead.")
+        str | None,
+        typer.Option(
+            help="List only deliveries in this state: waiting, retrying, delivered or dead. Default: in any state."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

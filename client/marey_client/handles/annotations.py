@@ -1,4 +1,4 @@
-"""Annotations of clips: read them, and change them by commands."""
+"""Handles of annotations, which read the segments and keyframes of clips and change them by commands."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class AnnotationHandle(ItemHandle):
     """Handle of an annotation: one layer of segments and keyframes over a clip."""
 
     def document(self, *, revision: int | None = None) -> Annotation:
-        """Return the annotation's clip, segments and keyframes."""
+        """Return the part `annotation`: the annotated clip, segments and keyframes; default: of the newest revision."""
         return Annotation.model_validate(self.part("annotation", revision=revision))
 
     def apply(self, commands: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, message: str = "") -> Item:
@@ -34,5 +34,8 @@ class AnnotationHandle(ItemHandle):
         return self._renewed(read_model(Item, response))
 
     def put(self, annotation: Annotation, *, message: str | None = None) -> Item:
-        """Replace the segments and keyframes; the item gets a new revision."""
+        """Replace the segments and keyframes; the item gets a new revision.
+
+        Raises `PreconditionFailed` if the annotation was changed since it was read.
+        """
         return self.put_part("annotation", annotation.model_dump(mode="json", by_alias=True), message=message)

@@ -15,10 +15,10 @@ IsBad = Callable[[Commit], bool | None]
 
 
 class VersionReader(Protocol):
-    """Dataset whose versions are searched."""
+    """Methods of `DatasetHandle` that the search for a version needs."""
 
     def at(self, version: str, /) -> Commit:
-        """Return the commit that a version names."""
+        """Return the commit that a version (a branch, a tag or a digest) names."""
 
     def log(self, version: str, /) -> Iterable[Commit]:
         """List a version and the versions before it, newest first; of a merge, only the first parent is followed."""
@@ -145,7 +145,7 @@ def bisect(among: VersionRange, is_bad: IsBad, on_step: OnStep | None = None) ->
 
 
 def _plain(listed: Commit) -> Commit:
-    """Return a listed commit without the fields that only lists of commits contain."""
+    """Return a commit from a list as a `Commit`, without the fields that only lists contain."""
     return Commit.model_validate(listed.model_dump(include=set(Commit.model_fields)))
 
 

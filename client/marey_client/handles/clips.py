@@ -1,4 +1,4 @@
-"""Clips: their poses, their description and their annotations."""
+"""Handles of clips, which read and change poses, descriptions and annotations."""
 
 from __future__ import annotations
 
@@ -24,14 +24,17 @@ from marey_schemas.kinds import Kind
 
 
 class ClipHandle(PosesHandle):
-    """Handle of a clip."""
+    """Handle of a clip: poses, description (the part `info`) and annotations of the clip."""
 
     def info(self) -> ClipInfo:
         """Return the part `info`: descriptions of the clip by users and importers."""
         return ClipInfo.model_validate(self.part("info"))
 
     def put_info(self, info: ClipInfo) -> Item:
-        """Replace the description of the clip; the item gets a new revision, in which the poses are unchanged."""
+        """Replace the description of the clip; the item gets a new revision, in which the poses are unchanged.
+
+        Raises `PreconditionFailed` if the clip was changed since it was read.
+        """
         return self.put_part("info", info.model_dump(mode="json", by_alias=True, exclude_none=True))
 
     def put_motion(self, motion: MotionDocument, *, message: str | None = None) -> Item:

@@ -25,14 +25,14 @@ ROOT_COLUMNS = 3
 
 @dataclass(frozen=True)
 class CoverageStreams:
-    """Coverage streams of a project."""
+    """Coverage streams of a project: each measures which motions a performance has covered, while it is recorded."""
 
     transport: Transport
     project: str
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the streams, relative to the API's root."""
         return f"/projects/{self.project}/coverage-streams"
 
     def begin(
@@ -62,11 +62,11 @@ class CoverageStreams:
 
 
 class CoverageStreamHandle:
-    """Handle of a coverage stream. `offset` is the number of frames sent so far."""
+    """Handle of a coverage stream, to which the frames of a performance are sent."""
 
     transport: Transport
     url: str
-    """The path of the resource, relative to the API's root."""
+    """The path of the stream, relative to the API's root."""
     stream: CoverageStream
     """The stream in the state in which it was read."""
     offset: int

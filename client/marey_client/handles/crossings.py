@@ -226,12 +226,17 @@ def _checked_limit(among: VersionRange, evaluations: VersionEvaluations, limit: 
     values = f"{evaluations.metric} is {good:.6g} at the good version and {bad:.6g} at the bad one"
     if limit is None:
         if good == bad:
-            raise CannotBisect(f"{values}, so no value is half-way between them")
+            raise CannotBisect(f"{values}, so no value is half-way between them; give a limit")
         limit = Limit((good + bad) / 2, above=bad > good)
     if limit.exceeded_by(good):
-        raise CannotBisect(f"{values}; values {limit} are bad, so both versions are bad")
+        raise CannotBisect(
+            f"{values}; values {limit} are bad, so both versions are bad; give another limit, or an earlier good "
+            "version"
+        )
     if not limit.exceeded_by(bad):
-        raise CannotBisect(f"{values}; values {limit} are bad, so both versions are good")
+        raise CannotBisect(
+            f"{values}; values {limit} are bad, so both versions are good; give another limit, or a later bad version"
+        )
     return limit
 
 

@@ -36,14 +36,14 @@ class ImportedVersion(NamedTuple):
 
 @dataclass(frozen=True)
 class Datasets:
-    """Datasets of a project."""
+    """Datasets of a project, and imports of versions into them."""
 
     transport: Transport
     project: str
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the datasets, relative to the API's root."""
         return f"/projects/{self.project}/datasets"
 
     def create(self, name: str, *, collection: str | None = None, description: str = "") -> DatasetHandle:

@@ -1,4 +1,4 @@
-"""Edits: lists of commands saved as items, previewed, and applied to clips."""
+"""Handles of edits: saved lists of commands, which are previewed on clips and applied to clips."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_schemas.items import Item
 
 
 class EditHandle(ItemHandle):
-    """Handle of an edit."""
+    """Handle of an edit: a saved list of commands with a title."""
 
     def document(self, *, revision: int | None = None) -> EditDocument:
         """Return the edit's title and commands."""
@@ -37,7 +37,7 @@ Commands = EditHandle | EditDocument | Command | Sequence[Command]
 
 
 class Edits(Items[EditHandle]):
-    """Edits of a project."""
+    """Edits (saved lists of commands) of a project."""
 
     def save(
         self,
@@ -48,7 +48,7 @@ class Edits(Items[EditHandle]):
         collection: str = "",
         message: str = "",
     ) -> EditHandle:
-        """Save commands as an edit: a new one, or a new revision of the edit with this name in the collection."""
+        """Save commands as an edit; an edit of this name in the folder `collection` gets a new revision."""
         edit = as_edit(commands, title=title)
         held = next(self.list(path=f"{collection}/{name}".lstrip("/"), page_size=1), None)
         if held is not None:
@@ -59,7 +59,7 @@ class Edits(Items[EditHandle]):
 
 
 def as_edit(commands: EditDocument | Command | Sequence[Command], *, title: str = "") -> EditDocument:
-    """Return commands as the document of an edit. Raises `BadArgument`, which names the faulty command."""
+    """Return commands as the document of an edit. Raises `BadArgument`, which names the first faulty command."""
     if isinstance(commands, EditDocument):
         return commands if not title else commands.model_copy(update={"title": title})
     return checked(EditDocument, {"title": title, "commands": several(commands)})

@@ -33,7 +33,7 @@ TRIAL_VERDICT = ("followed", "worst_rank", "beyond_limits")
 
 
 class EvaluationHandle(ReportedHandle):
-    """Handle of an evaluation."""
+    """Handle of an evaluation of locomotion clips: trials, use of the clips, report, and jobs to improve the clips."""
 
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
         """Return options, provenance, metrics, usage and coverage of the evaluation, without the record of each tick.

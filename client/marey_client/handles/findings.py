@@ -1,4 +1,4 @@
-"""Findings: results of jobs, with numbers and a document; some kinds of jobs also make a report."""
+"""Findings: results of jobs that measure, with numbers and a document; some kinds of jobs also make a report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_schemas.encoding.codecs import JSON, decode_tree
 from marey_schemas.queue.jobs import Job
 
 FILES = ("document", "report", "maps", "figures", "fitted", "table")
-"""Members of a result that refer to files."""
+"""Names of members of a job's result that refer to files, such as a report, instead of numbers."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Findings:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The main numbers of the result."""
+        """The main numbers of the job's result, by name."""
         return {name: value for name, value in (self.job.result or {}).items() if name not in FILES}
 
     def document(self) -> dict[str, Any]:
-        """Return all results; arrays are numpy arrays."""
+        """Return the document with all results of the job; arrays are numpy arrays."""
         return dict(decode_tree(Blobs(self.transport).fetch(self._blob("document")), JSON))
 
     def report(self) -> bytes:
@@ -53,7 +53,7 @@ class Findings:
 
     @sends_nothing
     def figures(self) -> tuple[StoredFigure, ...]:
-        """Return the figures of the report; without a report, there are none."""
+        """Return the figures of the report; an empty result without a report."""
         return tuple(StoredFigure.model_validate(figure) for figure in (self.job.result or {}).get("figures", ()))
 
     def save_figures(self, folder: str | Path) -> list[Path]:
@@ -77,11 +77,11 @@ class Quality(Findings):
 
     @property
     def conditions(self) -> QualityConditions:
-        """Conditions that must be equal in two results whose numbers are compared."""
+        """The conditions of the measurement; the numbers of two results can be compared only if these are equal."""
         return QualityConditions.model_validate((self.job.result or {})["conditions"])
 
     def measured(self) -> QualityDocument:
-        """Return all numbers, by clip and in total."""
+        """Return all measurements, for each clip and in total."""
         return QualityDocument.model_validate(self.document())
 
     def changes_since(self, earlier: Quality) -> Mapping[str, tuple[float, float]]:
@@ -91,11 +91,11 @@ class Quality(Findings):
         under different conditions; the text contains the command that measures under the earlier conditions.
         """
         if different := differing_conditions(earlier.conditions, self.conditions):
-            told = ", ".join(f"{name} is {before} and {now}" for name, (before, now) in different.items())
+            reasons = ", ".join(f"{name} is {before} and {now}" for name, (before, now) in different.items())
             advice = "measure both sets of clips again" if "code" in different else "measure these clips again"
             raise NotComparable(
                 f"the results of {earlier.job.id} and {self.job.id} cannot be compared, because their numbers mean "
-                f"different things: {told}; {advice}, with `{command_with(earlier.conditions)}`"
+                f"different things: {reasons}; {advice}, with `{command_with(earlier.conditions)}`"
             )
         before, now = (one.summary["totals"] for one in (earlier, self))
         return {

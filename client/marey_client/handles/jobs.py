@@ -82,5 +82,5 @@ class JobHandle(Job):
         return self._jobs.log(self.id, follow=follow)
 
     def cancel(self) -> JobHandle:
-        """Ask the job to stop; a queued job is cancelled at once."""
+        """Ask the job to stop; a job that does not run yet is cancelled at once."""
         return self.of(self._jobs.cancel(self.id), self._items)

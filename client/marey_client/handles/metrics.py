@@ -1,4 +1,4 @@
-"""Perceptual metrics, and distances of clips measured by a perceptual metric."""
+"""Handles of perceptual metrics, and of distances between clips that a job has measured by one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_schemas.queue.jobs import ItemInput
 
 
 class MetricHandle(ItemHandle):
-    """Handle of a perceptual metric."""
+    """Handle of a stored perceptual metric."""
 
     def document(self, *, revision: int | None = None) -> MetricDocument:
         """Return weights, conventions and origin of the metric."""
@@ -30,7 +30,7 @@ Metric: TypeAlias = MetricHandle | str
 
 
 class PerceptualMetrics(Items[MetricHandle]):
-    """The perceptual metrics of a project."""
+    """Stored perceptual metrics of a project."""
 
     def store(self, metric: MetricDocument | str, name: str, *, collection: str = "") -> MetricHandle:
         """Store a metric as an item, so that versions of datasets can contain the metric.
@@ -43,7 +43,7 @@ class PerceptualMetrics(Items[MetricHandle]):
 
 
 def metric_choice(metric: Metric | None) -> tuple[dict[str, ItemInput], dict[str, Any]]:
-    """Return the inputs and the parameters of a job that select a metric; both are empty without a metric."""
+    """Return the inputs and the parameters with which a job uses a metric; both are empty if `metric` is None."""
     if metric is None:
         return {}, {}
     if isinstance(metric, str):
@@ -53,14 +53,16 @@ def metric_choice(metric: Metric | None) -> tuple[dict[str, ItemInput], dict[str
 
 @dataclass(frozen=True)
 class Distances(Findings):
-    """Perceptual distances of clips."""
+    """Result of a job of the kind `distances`: perceptual distances between clips."""
 
     def table(self) -> NDArray[np.float64]:
         """Return the distances (N, N) of all pairs, in the order of the document's `clips`."""
         return np.asarray(self.document()["distances"])
 
     def maps(self) -> dict[str, NDArray[Any]]:
-        """Return arrays of motion maps and registration curves, for the only pair or the nearest and farthest pair.
+        """Return the motion maps and registration curves of the only pair, or of the nearest and the farthest pair.
+
+        The result contains arrays by name.
 
         The names begin with `pair0_` or `pair1_`. The name of a map ends with the measurement or with `combined`; rows
         are frames of the first clip, columns frames of the second clip. The name of the frame rate of both ends with

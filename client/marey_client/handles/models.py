@@ -1,4 +1,4 @@
-"""Generative models of motion: their quality, and motions drawn from them."""
+"""Handles of generative models of motion: their quality, and motions drawn from them."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ class Samples:
 
 
 class ModelHandle(SearchableHandle):
-    """Handle of a model."""
+    """Handle of a generative model of one action: its quality, its report, and motions drawn from it."""
 
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
         """Return the whole model, with numpy arrays: functions, mixture, options, examples and training report."""
         return self.part("model", revision=revision)
 
     def training(self) -> dict[str, Any]:
-        """Return the measures of the model's quality: errors, likelihoods, examples, foot contacts, warnings."""
+        """Return the measured quality of the model: errors, likelihoods, examples, foot contacts and warnings."""
         return dict(self.document()["training"] or {})
 
     def sample(self, n: int = 1, seed: int = 0, *, revision: int | None = None) -> Samples:
-        """Draw `n` motions. The same seed gives the same motions; with a greater `n`, further motions follow them."""
+        """Draw `n` motions. The same seed gives the same motions; a greater `n` adds motions after them."""
         tree = self._samples(n, seed, revision)
         motions = tuple(MotionArrays.model_validate(motion) for motion in tree["motions"])
         return Samples(tree["latents"], tree["log_densities"], motions)

@@ -18,7 +18,7 @@ OnProgress = Callable[[Mapping[str, Job]], None]
 
 LOOK_EVERY_S = 1.0
 SHORTEST_PAUSE_S = 0.2
-"""Least time in seconds between two requests for the state of the jobs."""
+"""Shortest time in seconds from one request for the state of the jobs to the next."""
 
 
 class PipelineRun:
@@ -69,7 +69,7 @@ class PipelineRun:
                 pause(max(0.0, min(left_s, asked + SHORTEST_PAUSE_S - time.monotonic())))
 
     def outputs(self, step: str) -> Iterator[JobOutput]:
-        """Return the revisions created by a step."""
+        """Return the revisions that the job of a step created."""
         return self._jobs.outputs(self._steps[step].id)
 
     def cancel(self) -> Mapping[str, Job]:
@@ -81,7 +81,7 @@ class PipelineRun:
         return self.refresh()
 
     def _look(self, wait_s: float) -> Mapping[str, Job]:
-        """Request the state of each unfinished job, and return all jobs by step.
+        """Request the state of each unfinished job; return all jobs by the names of their steps.
 
         The request for the first unfinished job waits up to `wait_s` seconds for the end of this job.
         """
@@ -103,7 +103,7 @@ class PipelineRun:
 
 
 def _only_followed(job: Job) -> bool:
-    """Return whether a job failed only because one of its dependencies failed."""
+    """Return whether a job failed only because a job on which it depends failed."""
     return job.failure is not None and job.failure.reason is FailureReason.DEPENDENCY_FAILED
 
 

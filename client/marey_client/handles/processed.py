@@ -1,4 +1,4 @@
-"""Aligned clips: canonical frames, time functions (the source frame of each canonical frame) and sources."""
+"""Handles of aligned clips: canonical frames, time functions (the source frame of each canonical frame), sources."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class ProcessedHandle(PosesHandle):
     """
 
     def info(self, *, revision: int | None = None) -> AlignmentInfo:
-        """Return the alignment: its keyframes, cost and options, and the source frame of each canonical frame."""
+        """Return the part `info`: keyframes, cost and options of the alignment, and the time function."""
         return AlignmentInfo.model_validate(self.part("info", revision=revision))
 
     def time_function(self) -> NDArray[np.float64]:
-        """Return the fractional source frame of each canonical frame, (N,).
+        """Return the source frame of each canonical frame, as an array (N,) of fractional frame numbers.
 
         Source frames are counted at the rate of the aligned clip.
         """

@@ -28,7 +28,7 @@ from marey_schemas.kinds import Kind
 
 @dataclass(frozen=True)
 class Proposals:
-    """Proposals of a dataset."""
+    """Proposals to merge versions into branches of a dataset."""
 
     transport: Transport
     url: str

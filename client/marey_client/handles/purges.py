@@ -9,7 +9,7 @@ from marey_schemas.purges import PurgeAnswer, PurgeRequest
 
 
 def purge_step_by_step(transport: Transport, project: str, request: PurgeRequest) -> Iterator[PurgeAnswer]:
-    """Send all requests of a purge, and yield each answer; each request continues where the previous one ended."""
+    """Send the requests of a purge until no items are left, and yield each answer."""
     wanted = request
     while True:
         answer = transport.post(PurgeAnswer, f"/projects/{project}/purges", wanted)
@@ -25,7 +25,7 @@ def purge_items(transport: Transport, project: str, request: PurgeRequest) -> Pu
 
 
 def without_contained(previews: Sequence[PurgeAnswer]) -> list[int]:
-    """Return the indices, in ascending order, of previews that together contain all items.
+    """Return the indices, in ascending order, of previews that together contain the items of all previews.
 
     Previews whose items all occur in larger previews are left out; otherwise the same bytes would be counted twice, and
     the purge of the same items would be requested twice.

@@ -1,4 +1,4 @@
-"""Items with a report: a page for people, and its figures."""
+"""Handles of items that have a report: an HTML page with figures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from marey_schemas.documents.reports import StoredFigure
 
 
 class ReportedHandle(ItemHandle):
-    """Handle of an evaluation or a model: an item that has a verdict, and may have a part `report`."""
+    """Handle of an evaluation or a model, which has a verdict in words and may have a part `report`."""
 
     @property
     def verdict(self) -> str:
@@ -24,7 +24,7 @@ class ReportedHandle(ItemHandle):
         return dict(self.item.summary)
 
     def figures(self) -> tuple[StoredFigure, ...]:
-        """Return the figures of the report."""
+        """Return the figures of the report, with the formats in which each is stored."""
         return tuple(StoredFigure.model_validate(figure) for figure in self.part("report")["figures"])
 
     def report(self) -> bytes:
@@ -39,7 +39,7 @@ class ReportedHandle(ItemHandle):
         trial: str | None = None,
         table: str | None = None,
     ) -> bytes:
-        """Return a figure as png or svg, its data as json, or one `table` of its data as csv.
+        """Return a figure as bytes: as png or svg, its data as json, or one `table` of its data as csv.
 
         Figures of single trials need the name of the `trial`.
         """

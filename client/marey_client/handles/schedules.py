@@ -15,14 +15,14 @@ from marey_schemas.queue.schedules import Schedule, ScheduleChange, ScheduleCrea
 
 @dataclass(frozen=True)
 class Schedules:
-    """Schedules of a project."""
+    """Schedules of a project, each of which submits a job at the times of a cron expression."""
 
     transport: Transport
     project: str
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the schedules, relative to the API's root."""
         return f"/projects/{self.project}/schedules"
 
     def create(

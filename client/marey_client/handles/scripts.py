@@ -17,18 +17,18 @@ from marey_schemas.queue.scripts import Script, ScriptCreate, ScriptRun, ScriptR
 
 @dataclass(frozen=True)
 class Scripts:
-    """Scripts of a project."""
+    """Scripts of a project: commands of pinned Git commits, which run as jobs."""
 
     transport: Transport
     project: str
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the scripts, relative to the API's root."""
         return f"/projects/{self.project}/scripts"
 
     def register(self, script: ScriptCreate) -> Script:
-        """Register a script.
+        """Register a script, so that members of the project can run it.
 
         Raises `Forbidden` if the server runs no scripts or the caller is no maintainer, `Conflict` if the name is
         taken, and `Invalid` if the server does not allow the repository.

@@ -1,4 +1,4 @@
-"""Skeletons: joints, rest pose, and the mapping to standard joints."""
+"""Handles of skeletons: joints, rest pose, and the joint mapping."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ from marey_schemas.items import Item
 
 
 class SkeletonHandle(ItemHandle):
-    """Handle of a skeleton."""
+    """Handle of a skeleton: its hierarchy of joints, and its joint mapping."""
 
     def hierarchy(self) -> SkeletonHierarchy:
-        """Return joints, offsets and rest pose."""
+        """Return the part `hierarchy`: joints, offsets and rest pose."""
         return SkeletonHierarchy.model_validate(self.part("hierarchy"))
 
     def mapping(self) -> SkeletonMapping:
-        """Return the mapping of standard joints to joints, and the axes of joints."""
+        """Return the part `mapping`: the joint for each standard joint, and the anatomical axes of joints."""
         return SkeletonMapping.model_validate(self.part("mapping"))
 
     def put_mapping(self, mapping: SkeletonMapping) -> Item:
-        """Replace the mapping of joints; the item gets a new revision."""
+        """Replace the joint mapping; the item gets a new revision.
+
+        Raises `PreconditionFailed` if the skeleton was changed since it was read.
+        """
         return self.put_part("mapping", mapping.model_dump(mode="json", by_alias=True))

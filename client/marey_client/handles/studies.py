@@ -1,4 +1,4 @@
-"""Studies: links for participants, progress, judgements, and the analysis."""
+"""Handles of perceptual studies: links for participants, progress, judgements and analysis."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PAIR_COLUMNS = ("participant", "index", "nearer_1", "nearer_2", "farther_1", "fa
 
 
 class StudyHandle(ItemHandle):
-    """Handle of a study."""
+    """Handle of a perceptual study: its design, participants, judgements and analysis."""
 
     def design(self, *, revision: int | None = None) -> StudyDocument:
         """Return the design: motions, trials, seed and consent."""
@@ -61,7 +61,7 @@ class StudyHandle(ItemHandle):
         self.transport.send("DELETE", f"{self.url}/participants/{participant}", repeatable=True)
 
     def progress(self) -> StudyProgress:
-        """Return numbers of participants and trials."""
+        """Return the numbers of participants and answered trials, over all revisions of the study."""
         return self.transport.get(StudyProgress, f"{self.url}/progress")
 
     def judgements(self, *, revision: int | None = None) -> Iterator[JudgingParticipant]:
@@ -81,13 +81,13 @@ class StudyHandle(ItemHandle):
         return Findings(self.transport, Jobs(self.transport).run(self.project, request, on_progress=on_progress))
 
     def analyse_request(self, **options: Unpack[AnalyseStudyKeywords]) -> JobCreate:
-        """Return the job request of `analyse`."""
+        """Return the job request that `analyse` submits; `options` are those of `AnalyseStudyParams`."""
         params = checked(AnalyseStudyParams, options)
         return job_request("analyse_study", {"study": self.as_input()}, params)
 
 
 class Studies(Items[StudyHandle]):
-    """Studies of a project."""
+    """Perceptual studies of a project."""
 
     def design(
         self,

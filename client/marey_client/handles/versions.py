@@ -31,18 +31,18 @@ if TYPE_CHECKING:
 
 
 class PickOptions(TypedDict, total=False):
-    """Options of `DatasetHandle.cherry_pick` and `DatasetHandle.revert`."""
+    """Keyword arguments of `DatasetHandle.cherry_pick` and `DatasetHandle.revert`."""
 
     into: str
     """Branch that gets the changes; default: main."""
     parent: Literal[1, 2]
-    """For a merge commit: number of a parent; the changes of the commit are the differences from this parent."""
+    """For a merge commit: number of the parent (1 or 2) from which the changes of the commit are counted."""
     message: str
-    """Message of the commit."""
+    """Message of the commit; default: a sentence that names the commit."""
     resolutions: tuple[Resolution, ...]
-    """Decisions for conflicts."""
+    """Decisions for conflicts, which the commit applies."""
     preview: bool
-    """Whether the result is only computed, not recorded."""
+    """Whether the result is only computed, so that no commit is made. Default: False."""
     expected: str
     """Commit that must be the newest commit of the branch."""
 
@@ -69,11 +69,11 @@ class DatasetHandle:
         return self.url.rpartition("/datasets/")[0]
 
     def read(self) -> Dataset:
-        """Return the dataset."""
+        """Read the dataset: its folder, its description, and the version that is checked out."""
         return self.transport.get(Dataset, self.url)
 
     def delete(self) -> None:
-        """Delete the dataset; its items stay."""
+        """Delete the dataset with its versions; the items of the project stay."""
         self.transport.send("DELETE", self.url, headers=ANY_STATE)
 
     @property
@@ -115,7 +115,7 @@ class DatasetHandle:
         return pages(self.transport, ListedCommit, f"{self.url}/commits", {"version": version, "path": path})
 
     def at(self, version: str = MAIN) -> Commit:
-        """Return the commit that a version names."""
+        """Return the commit that a version names: a branch, a tag or a digest."""
         return self.transport.get(Commit, f"{self.url}/commits/{version}")
 
     def has(self, commit: str) -> bool:
@@ -314,14 +314,14 @@ class DatasetHandle:
         return pages(self.transport, Ref, f"{self.url}/refs")
 
     def find_ref(self, name: str) -> Ref | None:
-        """Return the branch or tag with a name; None if there is none, or if there is no such dataset."""
+        """Return the branch or the tag with this name; None if there is none, or if the dataset does not exist."""
         try:
             return self.ref(name)
         except NotFound:
             return None
 
     def create_branch(self, name: str, at: str = MAIN) -> Ref:
-        """Create a branch at a version."""
+        """Create a branch that begins at the version `at`. Raises `Conflict` if the name is taken."""
         return self._create(checked(RefCreate, name=name, kind=RefKind.BRANCH, at=at))
 
     def create_tag(self, name: str, at: str = MAIN) -> Ref:
@@ -341,7 +341,10 @@ class DatasetHandle:
         return read_model(Ref, self.transport.send("PATCH", f"{self.url}/refs/{name}", content=body, headers=state))
 
     def ref(self, name: str) -> Ref:
-        """Return a branch with its protection, or a tag."""
+        """Return the branch or the tag with this name, a branch with its protection.
+
+        Raises `NotFound` if there is none.
+        """
         return self.transport.get(Ref, f"{self.url}/refs/{name}")
 
     def protect(self, branch: str, rule: ProtectionRule) -> Ref:

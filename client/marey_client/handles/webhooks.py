@@ -1,4 +1,4 @@
-"""Webhooks of a project, and their deliveries."""
+"""Handles of webhooks, which send the events of a project to addresses, and of their deliveries."""
 
 from __future__ import annotations
 

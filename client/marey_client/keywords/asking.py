@@ -13,7 +13,7 @@ from marey_schemas.search import SearchStep, StartPlacement
 
 
 class ImportKeywords(TypedDict, total=False):
-    """Fields of `ImportOptions`."""
+    """Keyword arguments, one for each field of `ImportOptions`."""
 
     collection: str
     """Folder of the project that receives the clips."""
@@ -23,7 +23,7 @@ class ImportKeywords(TypedDict, total=False):
     unit: Literal["mm", "cm", "inch", "cmu", "dm", "ft", "m"] | None
     """Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."""
     unit_scale_m: float | None
-    """Metres per unit of length, for units without a name."""
+    """Metres per unit of length, for units without a name; an alternative to `unit`. Absent: inferred."""
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | None
     """Axis that points up in the files. Absent: inferred."""
     handedness: Literal["right", "left"]
@@ -36,9 +36,9 @@ class ImportKeywords(TypedDict, total=False):
     """Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise, files with a
     contradiction are refused."""
     end_index: Literal["inclusive", "exclusive"] | None
-    """Whether a section of an annotation in a file of Marey's predecessor includes its frame `end_idx`, as in the
-    predecessor's editor, or ends before this frame, as in its time warping. Absent: exclusive if sections would overlap
-    otherwise, else inclusive."""
+    """Meaning of `end_idx`, the last index of a section in annotation files of Marey's predecessor. inclusive: the
+    section includes this frame, as in the predecessor's editor; exclusive: it ends before this frame, as in the
+    predecessor's time warping. Absent: exclusive if sections would overlap otherwise, else inclusive."""
     replace_skeleton: bool
     """Make a new revision of a clip or model of the same name, even if the file has another skeleton; otherwise, a file
     with another skeleton is refused."""
@@ -47,7 +47,7 @@ class ImportKeywords(TypedDict, total=False):
     tags: list[str] | tuple[str, ...]
     """Tags that every clip gets."""
     subject: str | None
-    """The performer."""
+    """Performer, under a pseudonym."""
     licence: str | None
     """Licence of the data."""
     capture_system: str | None
@@ -55,7 +55,7 @@ class ImportKeywords(TypedDict, total=False):
 
 
 class DifferenceKeywords(TypedDict, total=False):
-    """Fields of `DifferenceOptions`."""
+    """Keyword arguments, one for each field of `DifferenceOptions`."""
 
     threshold_deg: float
     """Threshold in degrees: the times at which a joint's rotation changed by more than this are listed."""
@@ -64,7 +64,7 @@ class DifferenceKeywords(TypedDict, total=False):
 
 
 class LineageKeywords(TypedDict, total=False):
-    """Fields of `LineageOptions`."""
+    """Keyword arguments, one for each field of `LineageOptions`."""
 
     direction: Literal["inputs", "results", "both"]
     """`inputs`: the revisions from which the revision was made; `results`: the revisions that were made from it;
@@ -74,7 +74,7 @@ class LineageKeywords(TypedDict, total=False):
 
 
 class EditPreviewKeywords(TypedDict, total=False):
-    """Fields of `EditPreviewRequest`."""
+    """Keyword arguments, one for each field of `EditPreviewRequest`."""
 
     revision: int | None
     """Revision of the clip; absent: the newest."""
@@ -85,7 +85,7 @@ class EditPreviewKeywords(TypedDict, total=False):
 
 
 class SearchKeywords(TypedDict, total=False):
-    """Fields of `SearchRequest`."""
+    """Keyword arguments, one for each field of `SearchRequest`."""
 
     likelihood_weight: float | None
     """Weight of the motion's likelihood; smaller values bring the motion closer to the targets. Absent: 0.01, or 0 if
@@ -116,7 +116,7 @@ class SearchKeywords(TypedDict, total=False):
 
 
 class SimilarKeywords(TypedDict, total=False):
-    """Fields of `SimilarOptions`."""
+    """Keyword arguments, one for each field of `SimilarOptions`."""
 
     results: int
     """Greatest number of moments to return."""
@@ -129,10 +129,10 @@ class SimilarKeywords(TypedDict, total=False):
 
 
 class PurgeKeywords(TypedDict, total=False):
-    """Fields of `PurgeRequest`."""
+    """Keyword arguments, one for each field of `PurgeRequest`."""
 
     item: str | None
-    """Id of one deleted item."""
+    """Id of one deleted item; absent: the other conditions select the items."""
     path: str | None
     """Path, made of folder and name, that deleted items had."""
     collection: str | None
@@ -141,10 +141,10 @@ class PurgeKeywords(TypedDict, total=False):
     kind: Kind | str | None
     """Kind of the items; absent: all kinds."""
     query: str | None
-    """Query that the items meet, such as `subject = 02`."""
+    """Query that the items meet, such as `subject = 02`; absent: any items."""
     older_than_days: int | None
-    """Only items that were deleted at least this number of days ago."""
+    """Only items that were deleted at least this number of days ago; absent: all."""
     preview: bool
     """Report what a purge would do, but change nothing."""
     after: str | None
-    """Value of `next` in the last answer, to continue a purge of many items."""
+    """Value of `next` in the previous answer, to continue a purge of many items; absent: the purge begins."""

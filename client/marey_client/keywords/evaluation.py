@@ -14,7 +14,7 @@ from marey_schemas.options.verdict import VerdictLimits
 
 
 class FeatureWeightsKeywords(TypedDict, total=False):
-    """Fields of `FeatureWeights`."""
+    """Keyword arguments, one for each field of `FeatureWeights`."""
 
     left_foot_position: float
     """Weight of the position of the left foot in the cost of a match; 0 leaves it out."""
@@ -36,14 +36,15 @@ class FeatureWeightsKeywords(TypedDict, total=False):
 
 
 class DatabaseKeywords(TypedDict, total=False):
-    """Fields of `DatabaseOptions`."""
+    """Keyword arguments, one for each field of `DatabaseOptions`."""
 
     mirroring: Literal["none", "add", "only"]
     """Mirrored copies of the clips. none: the clips alone; add: every clip and its mirrored copy; only: the mirrored
     copies alone."""
     end_policy: Literal["clamp", "trim", "loop"]
-    """Trajectory features near a clip's end. clamp: the last frame is repeated, and the last 1/3 s is not selected;
-    trim: the last second is not selected; loop: the clip's beginning follows, for clips marked as loops."""
+    """Handling of the end of a clip, where its future trajectory is unknown. clamp: the last frame is repeated, and the
+    last 1/3 s is not selected; trim: the last second is not selected; loop: the beginning of the clip follows, for
+    clips marked as loops."""
     root_mode: Literal["simulated", "bone"]
     """Source of the character's motion on the ground. simulated: the smoothed position and heading of the body; bone:
     the root joint, for data whose root joint moves as the character does."""
@@ -60,13 +61,14 @@ class DatabaseKeywords(TypedDict, total=False):
 
 
 class ControllerKeywords(TypedDict, total=False):
-    """Fields of `ControllerOptions`."""
+    """Keyword arguments, one for each field of `ControllerOptions`."""
 
     follow: Literal["time", "path", "open_loop"]
-    """Desired trajectory of the character. time: the reference at the same time; path: the reference, beginning at the
-    point nearest to the character; open_loop: only the speed and turn rate of the reference."""
+    """Trajectory that each search asks for, from the reference (the trajectory to follow). time: where the reference is
+    at the same time; path: the reference from the point nearest to the character; open_loop: only the speed and turn
+    rate of the reference."""
     search_every_s: float
-    """Seconds between two searches."""
+    """Seconds from one search of the database to the next."""
     continuing_bias: float
     """Value added to the cost of continuing the current clip; negative values favour continuing."""
     switch_margin: float
@@ -75,21 +77,22 @@ class ControllerKeywords(TypedDict, total=False):
     """Seconds around the current frame that a search does not select, so that the character does not tread on the spot;
     0 allows all frames."""
     half_life_s: float
-    """Half-life in seconds of the offset from the old motion after a switch."""
+    """Half-life, in seconds, with which the difference between the old and the new motion decays after a switch."""
     root_inertialisation: bool
     """Whether the blend after a switch also includes the root's velocity."""
     selection: Literal["features", "pose_distance"]
     """Cost of the search. features: the weighted features; pose_distance: the published cost, the summed distance of
     joints in metres."""
     root_adjustment: float
-    """Rate, per second, at which the character is pulled to the reference: within a second, the distance shrinks by the
-    factor exp(-rate). This hides tracking errors."""
+    """Rate, per second, at which the character is pulled to the trajectory that it follows: within a second, the
+    distance shrinks by the factor exp(-rate). This hides tracking errors. 0: it is not pulled."""
     root_clamp_m: float | None
-    """Greatest distance of the character from the reference, in metres; this hides tracking errors."""
+    """Greatest distance of the character from the trajectory that it follows, in metres; this hides tracking errors.
+    Absent: no limit."""
 
 
 class VerdictLimitsKeywords(TypedDict, total=False):
-    """Fields of `VerdictLimits`."""
+    """Keyword arguments, one for each field of `VerdictLimits`."""
 
     lag_s: float
     """Greatest mean distance from the desired position, given as the time in seconds to cover the distance at the mean
@@ -100,14 +103,14 @@ class VerdictLimitsKeywords(TypedDict, total=False):
     turn_deg_s: float
     """Greatest error of the mean turn rate, in degrees per second."""
     heading_deg: float
-    """Greatest root mean square error of the heading, in degrees; the baseline reaches 12."""
+    """Greatest root mean square error of the heading, in degrees; the baseline of generated clips reaches 12."""
     speed_wobble_share: float
     """Greatest standard deviation of the speed, as a share of the desired speed. In a switching trial, it is measured
     away from the switches, as a share of the faster speed, because the character catches up after a switch. The
-    baseline reaches 0.19."""
+    baseline of generated clips reaches 0.19."""
     turn_wobble_deg_s: float
-    """Greatest standard deviation of the turn rate, in degrees per second; the sway of the steps of the baseline
-    reaches 21."""
+    """Greatest standard deviation of the turn rate, in degrees per second. The heading sways with each step: the
+    baseline of generated clips reaches 21."""
     response_s: float
     """Greatest median time in which the character responds to a switch of the speed, in seconds. Switches without a
     response count as longer than all others."""
@@ -115,28 +118,31 @@ class VerdictLimitsKeywords(TypedDict, total=False):
     """Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more. The default is
     the greatest speed of a foot that counts as standing."""
     skate_ratio: float
-    """Greatest ratio of the mean speed of feet in contact to the same speed in the clips shown."""
+    """Greatest ratio of the mean speed of feet in contact to the same speed in the clips that the trial shows."""
     sinking_m: float
-    """Greatest depth of the feet below the floor of the clips shown, in metres, of which the deepest 5 % of the time
-    are left out; the baseline reaches 0.006."""
+    """Greatest depth of the feet below the floor of the clips that the trial shows, in metres; the deepest 5 % of the
+    time are left out. The baseline of generated clips reaches 0.006."""
     step_ratio: float
-    """Greatest ratio between the contacts per metre of the trial and of the clips shown, in either direction; the ratio
-    of the baseline is between 0.97 and 1.05."""
+    """Greatest ratio between the contacts per metre of the trial and of the clips that it shows, in either direction.
+    The ratio of the baseline of generated clips is between 0.97 and 1.05."""
     steps_per_m: float
-    """Fewest contacts per metre; a sprinter has 0.4, so fewer show that the character glides."""
+    """Least number of foot contacts per metre; a sprinter has 0.4, so fewer show that the character glides."""
     pose_cost_ratio: float
-    """Greatest ratio of the mean pose cost to the mean change of pose in the clips shown; the baseline reaches 1.5."""
+    """Greatest ratio of the mean pose cost (change of pose from frame to frame) to its mean in the clips that the trial
+    shows. The baseline of generated clips reaches 1.5."""
     pose_cost_p95_ratio: float
-    """Greatest ratio of the 95th percentile of the pose cost to the mean change of pose in the clips shown."""
+    """Greatest ratio of the 95th percentile of the pose cost (change of pose from frame to frame) to its mean in the
+    clips that the trial shows."""
     transitions_per_s: float
-    """Greatest number of transitions per second; 95 % of the trials of the baseline have fewer than 5."""
+    """Greatest number of transitions per second; 95 % of the trials with the baseline of generated clips have fewer
+    than 5."""
     treading_per_s: float
-    """Greatest number of transitions per second to a frame of the same clip at most 1/3 s away; the baseline has
-    none."""
+    """Greatest number of transitions per second to a frame of the same clip at most 1/3 s away; the baseline of
+    generated clips has none."""
 
 
 class EvaluateKeywords(TypedDict, total=False):
-    """Fields of `EvaluateParams`."""
+    """Keyword arguments, one for each field of `EvaluateParams`."""
 
     tags: list[str] | tuple[str, ...]
     """Tags that the results get."""
@@ -151,8 +157,8 @@ class EvaluateKeywords(TypedDict, total=False):
     of `strafe_angles_deg`, while the character keeps facing ahead; takes: the paths of clips of the set, each of which
     is left out of the set in its own trial."""
     most_takes: int
-    """Greatest number of `takes` trials. Clips are chosen evenly from those that last at least 4 s and move at least 2
-    m. Long clips are asked for up to `duration_s`."""
+    """Greatest number of `takes` trials. Their clips are chosen evenly from those that last at least 4 s and move at
+    least 2 m. Of a long clip, the character follows at most `duration_s` seconds."""
     corner_angles_deg: Sequence[float]
     """Angles of the corners of `corners` trials in degrees, positive to the left; each is combined with each speed."""
     strafe_angles_deg: Sequence[float]
@@ -170,15 +176,17 @@ class EvaluateKeywords(TypedDict, total=False):
     replicates: int
     """Number of replicates of each trial. The first one is the trial itself; each further one has another phase of the
     stride at the start, and an approach that is up to one second longer. Results are means with 95 % intervals. 1: only
-    the trial itself, as published, without intervals."""
+    the trial itself, as in the published method, without intervals."""
     seed: int
     """Seed of the random differences between the replicates of a trial."""
     window: Literal["circle", "all"]
-    """Part of a trial that is measured. circle: the circle only; all: also the approach."""
+    """Part of a trial that is measured. circle: the course after the approach; all: also the approach (the straight
+    path before it)."""
     coverage_least_s: float
-    """Seconds of data that a cell of speed and turn rate needs to count as covered."""
+    """Seconds of data that a cell of the coverage map (a speed and a turn rate) needs to count as covered."""
     literal_formulas: bool
-    """Also compute the measures by the published formulas, taken literally."""
+    """Also compute errors by the formulas exactly as the paper prints them, to compare results with those of the
+    paper."""
     database: DatabaseOptions | DatabaseKeywords
     """Options of the database that is built from the clips."""
     controller: ControllerOptions | ControllerKeywords
@@ -190,9 +198,10 @@ class EvaluateKeywords(TypedDict, total=False):
     loops: list[str] | tuple[str, ...]
     """Clips that are loops, in addition to those tagged `loop`."""
     trims: Mapping[str, tuple[int, int]]
-    """Half-open range of frames to use, by the id of the clip."""
+    """Range of frames to use, as first frame and the frame after the last, by the id of the clip; other clips are used
+    whole."""
     baseline: bool
-    """For comparison, also measure a set of generated clips that covers every cell."""
+    """For comparison, also run the trials with a baseline: generated clips that contain every speed and turn rate."""
     report: bool
     """Write the report and its figures."""
     trial_figures: list[str] | tuple[str, ...]
@@ -200,7 +209,7 @@ class EvaluateKeywords(TypedDict, total=False):
 
 
 class CompareKeywords(TypedDict, total=False):
-    """Fields of `CompareParams`."""
+    """Keyword arguments, one for each field of `CompareParams`."""
 
     title: str
     """Title of the report; default: the names of the two evaluations."""
@@ -209,10 +218,10 @@ class CompareKeywords(TypedDict, total=False):
 
 
 class ObjectiveKeywords(TypedDict, total=False):
-    """Fields of `ObjectiveOptions`."""
+    """Keyword arguments, one for each field of `ObjectiveOptions`."""
 
     offset: float
-    """Weight of the mean distance between the character and its reference."""
+    """Weight of the mean distance between the character and the path that it follows."""
     abs_se_v: float
     """Metres that a speed error of 1 m/s adds to the objective."""
     abs_se_omega_deg: float
@@ -220,12 +229,12 @@ class ObjectiveKeywords(TypedDict, total=False):
     pose_cost: float
     """Metres that a pose cost of 1 m adds to the objective."""
     seconds: float
-    """Metres that each second of data adds to the objective. A clip is removed if it lowers the other terms by less
-    than its duration adds."""
+    """Metres that each second of data adds to the objective. A clip is worth removing if it lowers the other terms by
+    less than its duration adds."""
 
 
 class SuggestKeywords(TypedDict, total=False):
-    """Fields of `SuggestParams`."""
+    """Keyword arguments, one for each field of `SuggestParams`."""
 
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
@@ -241,7 +250,8 @@ class SuggestKeywords(TypedDict, total=False):
     """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
     replicates."""
     removals: int
-    """Number of clips whose removal is planned, in addition to the unused clips; 0: none."""
+    """Greatest number of removals to plan, in addition to the clips that no trial uses. Each step removes the clip
+    whose removal harms least per second of data. 0: none."""
     simulated_additions: int
     """Number of suggested additions whose effect on the trials is simulated: the first ones that have the skeleton of
     the set. Each simulation takes as long as an evaluation with `confirmation_replicates`."""
@@ -257,12 +267,12 @@ class SuggestKeywords(TypedDict, total=False):
     """With a metric, instead of `blendable_m`: greatest perceptual distance between poses that can be blended; absent:
     the median over the transitions of the trials."""
     lost_pose: float
-    """With a metric: weight of lost poses in the harm of a removal, in metres per second of these poses. A pose is lost
-    if it looks like no pose of the remaining clips."""
+    """With a metric: metres that each second of lost poses adds to the harm of a removal. A pose is lost if it looks
+    like no pose of the remaining clips."""
 
 
 class OptimiseKeywords(TypedDict, total=False):
-    """Fields of `OptimiseParams`."""
+    """Keyword arguments, one for each field of `OptimiseParams`."""
 
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
@@ -291,7 +301,7 @@ class OptimiseKeywords(TypedDict, total=False):
 
 
 class SweepKeywords(TypedDict, total=False):
-    """Fields of `SweepParams`."""
+    """Keyword arguments, one for each field of `SweepParams`."""
 
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""

@@ -13,7 +13,7 @@ from marey_schemas.queue.jobs import ItemInput
 
 
 class AnnotateKeywords(TypedDict, total=False):
-    """Fields of `AnnotateParams`."""
+    """Keyword arguments, one for each field of `AnnotateParams`."""
 
     tags: list[str] | tuple[str, ...]
     """Tags that the results get."""
@@ -22,7 +22,7 @@ class AnnotateKeywords(TypedDict, total=False):
 
 
 class CutKeywords(TypedDict, total=False):
-    """Fields of `CutParams`."""
+    """Keyword arguments, one for each field of `CutParams`."""
 
     tags: list[str] | tuple[str, ...]
     """Tags that the results get."""
@@ -37,27 +37,27 @@ class CutKeywords(TypedDict, total=False):
     shortest_s: float
     """Shortest segment to cut out, in seconds."""
     longest_s: float | None
-    """Longest segment to cut out, in seconds."""
+    """Longest segment to cut out, in seconds; absent: no limit."""
     name: str
     """Pattern of the pieces' names; {number:2} counts the segments of a label in a clip from 1, with two digits."""
     by_label: bool
-    """Put the pieces of each label into a folder of their own."""
+    """Put the pieces of each label into a separate subfolder, which has the name of the label."""
 
 
 class IndexKeywords(TypedDict, total=False):
-    """Fields of `IndexParams`."""
+    """Keyword arguments, one for each field of `IndexParams`."""
 
     name: str
     """Name of the index; an index with this name is replaced."""
 
 
 class AlignKeywords(TypedDict, total=False):
-    """Fields of `AlignParams`."""
+    """Keyword arguments, one for each field of `AlignParams`."""
 
     tags: list[str] | tuple[str, ...]
     """Tags that the results get."""
     suffix: str
-    """Text that is appended to the names of the results."""
+    """Text that is appended to the name of each input to form the name of its result."""
     cost: Literal["turned", "plain"]
     """Cost of a pair of poses. turned: the distance after the best rotation about the vertical and the best shift on
     the ground; plain: the distance without rotation and shift."""
@@ -72,8 +72,8 @@ class AlignKeywords(TypedDict, total=False):
     """Rate of the canonical frames, in hertz; absent: the frame rate of the reference if a clip is given as reference,
     else the most common frame rate of the clips."""
     slope_limit: int | None
-    """Greatest number of consecutive steps of the path that advance only one of the two clips. With the limit n, a
-    frame is matched with at most n + 1 frames. null: no limit."""
+    """Greatest number of consecutive steps of the alignment path that advance only one of the two clips. With the limit
+    n, a frame is matched with at most n + 1 frames. null: no limit."""
     weights: Mapping[str, float]
     """Weight of each joint in the cost, by its own or its standard name; default 1, and 0 for joints that move no part
     of the body."""
@@ -89,18 +89,18 @@ class AlignKeywords(TypedDict, total=False):
 
 
 class EditKeywords(TypedDict, total=False):
-    """Fields of `EditParams`."""
+    """Keyword arguments, one for each field of `EditParams`."""
 
     tags: list[str] | tuple[str, ...]
     """Tags that the results get."""
     suffix: str
-    """Text that is appended to the names of the results."""
+    """Text that is appended to the name of each input to form the name of its result."""
     in_place: bool
     """Make each result a new revision of its clip; otherwise each result is a new clip."""
 
 
 class DistancesKeywords(TypedDict, total=False):
-    """Fields of `DistancesParams`."""
+    """Keyword arguments, one for each field of `DistancesParams`."""
 
     cycles: Literal["cut", "whole"]
     """cut: cut a loop of one cycle out of each clip that is no loop, and compare the loops, as people saw them in the
@@ -114,25 +114,28 @@ class DistancesKeywords(TypedDict, total=False):
 
 
 class QualityKeywords(TypedDict, total=False):
-    """Fields of `QualityParams`."""
+    """Keyword arguments, one for each field of `QualityParams`."""
 
     rate_hz: float
     """Frame rate in hertz at which clips are measured. Clips of a higher rate are resampled; clips of a lower rate are
     refused."""
     floor: Literal["planted", "zero"]
     """Reference from which the heights of feet are measured. planted: the height of the joint while the foot stands on
-    the floor, which is the 5th percentile of the heights of the joint in the clip; zero: height 0, as published.
-    Penetration is always measured from height 0."""
+    the floor, which is the 5th percentile of the heights of the joint in the clip; zero: height 0, as in the
+    publications of the measures. Penetration is always measured from height 0."""
     weighted_height_m: float
-    """Height in metres at which the weight of the weighted foot skate has fallen to 0."""
+    """Height in metres from which the speed of a toe does not count in the measure `skate_weighted_m_s`; below, its
+    weight grows from 0 to 1 at the floor."""
     near_height_m: float
-    """Height in metres below which a toe counts as near the floor, for foot skate by height."""
+    """Height in metres below which a toe counts as near the floor, in the measures `skate_height_m_s` and
+    `skate_ratio`."""
     skate_speed_m_s: float
-    """Speed in metres per second above which a toe near the floor counts as skating, for the ratio."""
+    """Speed in metres per second above which a toe near the floor counts as skating, in the measure `skate_ratio`."""
     contact_height_m: float
-    """Height in metres below which a slow joint counts as touching the floor, for the consistency."""
+    """Height in metres below which a slow joint counts as touching the floor, in the measure `contact_consistency`."""
     contact_speed_m_s: float
-    """Speed in metres per second below which a low joint counts as touching the floor, for the consistency."""
+    """Speed in metres per second below which a low joint counts as touching the floor, in the measure
+    `contact_consistency`."""
     knee_least_deg: float
     """Least bend of a knee in degrees; negative: bent forwards."""
     knee_most_deg: float
@@ -140,7 +143,7 @@ class QualityKeywords(TypedDict, total=False):
     elbow_most_deg: float
     """Greatest bend of an elbow in degrees."""
     draws: int
-    """Number of times that takes are drawn with replacement, for intervals."""
+    """Number of bootstrap samples of the takes, from which the confidence intervals are computed."""
     title: str
     """Title of the report; default: the number of clips."""
     report: bool
@@ -148,7 +151,7 @@ class QualityKeywords(TypedDict, total=False):
 
 
 class ModelKeywords(TypedDict, total=False):
-    """Fields of `ModelParams`."""
+    """Keyword arguments, one for each field of `ModelParams`."""
 
     tags: list[str] | tuple[str, ...]
     """Tags that the results get."""
@@ -182,7 +185,7 @@ class ModelKeywords(TypedDict, total=False):
     spatial_share: float
     """Share of the variance that the spatial components explain."""
     spatial_components: int | None
-    """Exact number of spatial components, instead of the share."""
+    """Exact number of spatial components, instead of the share of the variance; absent: the share determines it."""
     spatial_coefficients: int | None
     """Number of coefficients of each channel's spline; absent: a fifth of the frames, at least 7."""
     temporal_share: float
@@ -207,7 +210,7 @@ class ModelKeywords(TypedDict, total=False):
 
 
 class TreeKeywords(TypedDict, total=False):
-    """Fields of `TreeParams`."""
+    """Keyword arguments, one for each field of `TreeParams`."""
 
     samples: int
     """Number of samples drawn from the model."""
@@ -223,18 +226,18 @@ class TreeKeywords(TypedDict, total=False):
 
 
 class AnalyseStudyKeywords(TypedDict, total=False):
-    """Fields of `AnalyseStudyParams`."""
+    """Keyword arguments, one for each field of `AnalyseStudyParams`."""
 
     title: str
     """Title of the report; default: the title of the study."""
     report: bool
     """Write the report, a self-contained HTML page."""
     draws: int
-    """Number of times that participants are drawn with replacement, for intervals of the weights."""
+    """Number of bootstrap samples of the participants, from which the intervals of the weights are computed."""
 
 
 class ModelPlanKeywords(TypedDict, total=False):
-    """Fields of `ModelPlan`."""
+    """Keyword arguments, one for each field of `ModelPlan`."""
 
     into: str
     """The collection of the model; everything else is stored below it."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, Protocol
 
-from marey_client.extras import room
+from marey_client.extras import import_optional
 from marey_schemas.items import Item
 
 TABLES_EXTRA = "notebook"
-"""Extra of the package that installs pandas, pyarrow and xarray."""
+"""Extra of the package `marey` that installs pandas, pyarrow and xarray."""
 
 
 class HasItem(Protocol):
-    """Handle of an item."""
+    """Object with an item, such as a handle."""
 
     item: Item
 
@@ -23,7 +23,7 @@ def summary_table(handles: Iterable[HasItem]) -> Any:
 
     The index is the id. Raises `MissingPackage` if pandas is not installed.
     """
-    pandas = room("pandas", TABLES_EXTRA)
+    pandas = import_optional("pandas", TABLES_EXTRA)
     rows = [_row(one.item) for one in handles]
     if not rows:
         return pandas.DataFrame(columns=["path", "name", "collection", "revision", "tags"])

@@ -22,12 +22,12 @@ JOBS_OF_A_WORKER = 10
 FEWEST_JOBS = 60
 
 OnDrain = Callable[[str], None]
-"""Function called with the present activity."""
+"""Function called with a text on the present round of the measurement."""
 
 
 @dataclass(frozen=True)
 class Drain:
-    """Measured drain of a backlog: jobs per second, and the durations of the requests in seconds."""
+    """Measurement of a backlog that workers completed: jobs per second, and the durations of requests in seconds."""
 
     per_s: float
     claims_s: tuple[float, ...]
@@ -36,7 +36,7 @@ class Drain:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Costs of a job on one server, and the jobs per second of the checked numbers of workers.
+    """Costs of a job on one server, and the measured jobs per second by number of workers, in `checked`.
 
     `claim_s` and `complete_s` are the mean durations of the two requests of a single worker, in seconds; `variation` is
     the standard deviation of these durations divided by the mean. `busy_s` is the time per job when `CROWDED` workers
@@ -57,9 +57,9 @@ class Calibration:
 
 
 def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
-    """Submit a backlog of jobs, then let simulated workers run it. Raises `MareyError` if a request fails.
+    """Submit a backlog of jobs, then let simulated workers run all of its jobs.
 
-    The jobs per second are counted from the first completion to the last one.
+    The jobs per second are counted from the first completion to the last one. Raises `MareyError` if a request fails.
     """
     load = OfferedLoad(scratch, own_workers=True)
     load.submit_backlog(backlog_of(workers))
@@ -110,10 +110,10 @@ def calibrate(marey: Marey, checked: Sequence[int], *, rounds: int, work_s: floa
 
 
 def _together(drains: Sequence[Drain]) -> float:
-    """Return the mean jobs per second of several drains with the same number of jobs: all jobs over the total time."""
+    """Return the mean jobs per second of drains with equal numbers of jobs: all jobs divided by the total time."""
     return statistics.harmonic_mean([one.per_s for one in drains])
 
 
 def backlog_of(workers: int) -> int:
-    """Return the number of jobs that a drain by this number of workers submits."""
+    """Return the number of jobs in the backlog for this number of workers."""
     return max(FEWEST_JOBS, workers * JOBS_OF_A_WORKER)

@@ -36,7 +36,7 @@ class Estimate:
         return cls(statistics.fmean(values), margin)
 
     def shown(self, digits: int = 1) -> str:
-        """Return the mean, and the margin after "±"."""
+        """Return the mean as text, followed by "±" and the margin if there is one."""
         margin = "" if self.margin is None else f" ± {self.margin:,.{digits}f}"
         return f"{self.value:,.{digits}f}{margin}"
 
@@ -72,7 +72,7 @@ class Replicate:
 
 @dataclass(frozen=True)
 class RateFigures:
-    """Figures of all replicates at one rate; times in milliseconds."""
+    """Figures of all replicates at one rate of submissions, in jobs per second; times are in milliseconds."""
 
     rate: float
     submitted: int

@@ -91,7 +91,7 @@ def _run(
 
 
 def _ticking(use: ServerUse | None, report: Callable[[float], None]) -> Callable[[float], None]:
-    """Return a function that reports progress, and samples the metrics about once a second."""
+    """Return a function that reports the progress of a run, and reads the server's metrics about once a second."""
     sampled = time.monotonic()
 
     def tick(seconds: float) -> None:

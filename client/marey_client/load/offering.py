@@ -33,7 +33,7 @@ Tick = Callable[[float], None]
 
 
 class OfferedLoad:
-    """Run of a load test: planned and actual times of its jobs, by the monotonic clock, and numbers of errors."""
+    """Jobs of one run of a load test: planned and actual times, by the monotonic clock, and numbers of errors."""
 
     def __init__(self, scratch: Scratch, *, own_workers: bool) -> None:
         self._scratch = scratch
@@ -83,7 +83,7 @@ class OfferedLoad:
 
     @contextmanager
     def workers(self, count: int, work_s: float) -> Iterator[None]:
-        """Run simulated workers while the `with` block runs; each needs `work_s` seconds for a job."""
+        """Run `count` simulated workers while the `with` block runs; each works `work_s` seconds on a job."""
         for number in range(count):
             self._thread(self._work, f"simulated-{number}", work_s)
         try:
@@ -94,7 +94,7 @@ class OfferedLoad:
                 thread.join()
 
     def _thread(self, function: Callable[..., None], *arguments: object) -> threading.Thread:
-        """Run a function in a thread; an exception of the function is raised again by `_follow`."""
+        """Run a function in a thread; `_follow`, which waits for the run, raises an exception of the function again."""
 
         def work() -> None:
             try:

@@ -75,7 +75,7 @@ class Scratch:
         return {LABEL: self.project.name}
 
     def job(self, *, own_workers: bool, into: str = "") -> dict[str, Any]:
-        """Return the request for a job that imports the clip into a folder.
+        """Return the request for a job that imports the clip into the folder `into`, as a dict.
 
         With `own_workers`, only the workers of this test claim the job; otherwise, the server's other workers do.
         """

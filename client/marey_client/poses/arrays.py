@@ -1,4 +1,4 @@
-"""Items with poses, and their arrays. Only the requested frames and joints are read."""
+"""Handles of items with poses, which read only the requested frames and joints as arrays."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_client.arguments import several
-from marey_client.extras import room
+from marey_client.extras import import_optional
 from marey_client.listing.tables import TABLES_EXTRA
 from marey_client.poses.arrays import Joints, PosedItem
 from marey_client.poses.kinematics import read_positions
@@ -18,7 +18,7 @@ AXES = ("x", "y", "z")
 
 def to_dataframe(clip: PosedItem, joints: Joints, frames: slice | None) -> Any:
     """Return positions as a pandas table with the times as index, and the joints and axes as columns."""
-    pandas = room("pandas", TABLES_EXTRA)
+    pandas = import_optional("pandas", TABLES_EXTRA)
     names, positions = _named_positions(clip, joints, frames)
     table = pandas.DataFrame(
         positions.reshape(len(positions), -1),
@@ -31,7 +31,7 @@ def to_dataframe(clip: PosedItem, joints: Joints, frames: slice | None) -> Any:
 
 def to_arrow(clip: PosedItem, joints: Joints, frames: slice | None) -> Any:
     """Return positions as a table of pyarrow, with one column of three numbers for each joint."""
-    arrow = room("pyarrow", TABLES_EXTRA)
+    arrow = import_optional("pyarrow", TABLES_EXTRA)
     names, positions = _named_positions(clip, joints, frames)
     first = _first(frames)
     columns = {
@@ -47,7 +47,7 @@ def to_arrow(clip: PosedItem, joints: Joints, frames: slice | None) -> Any:
 
 def to_xarray(clip: PosedItem, joints: Joints, frames: slice | None) -> Any:
     """Return positions and local rotations as a dataset of xarray."""
-    xarray = room("xarray", TABLES_EXTRA)
+    xarray = import_optional("xarray", TABLES_EXTRA)
     names, positions = _named_positions(clip, joints, frames)
     return xarray.Dataset(
         {

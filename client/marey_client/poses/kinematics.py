@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from marey_client.arguments import several
 from marey_client.errors import NoSuchJoint
-from marey_client.extras import room
+from marey_client.extras import import_optional
 from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.items import ItemHandle
 from marey_client.poses.arrays import Joints, PosedItem, frames_text
@@ -39,7 +39,7 @@ FEET = tuple((f"{side}_toe", f"{side}_ankle") for side in ("left", "right"))
 
 @dataclass(frozen=True)
 class PosedSkeleton:
-    """Revision of a skeleton: its handle, and the hierarchy that positions are computed from."""
+    """Skeleton at one revision: its handle, and its hierarchy, from which positions are computed."""
 
     handle: SkeletonHandle
     hierarchy: SkeletonHierarchy
@@ -64,7 +64,7 @@ class PosedSkeleton:
         return sorted(needed)
 
     def part_with(self, places: list[int]) -> SkeletonHierarchy:
-        """Return the hierarchy of the joints with the indices `places`, among which are the parents of all of them."""
+        """Return the hierarchy of only the joints with the indices `places`, which must include their parents."""
         new = {old: place for place, old in enumerate(places)} | {-1: -1}
         kept = [self.hierarchy.joints[place] for place in places]
         return SkeletonHierarchy(joints=tuple(Joint(**(dict(joint) | {"parent": new[joint.parent]})) for joint in kept))
@@ -99,14 +99,14 @@ def read_rig(clip: ItemHandle, reference: RevisionRef) -> PosedSkeleton:
 
 def read_positions(clip: PosedItem, joints: Joints, frames: slice | None) -> NDArray[np.float32]:
     """Return the positions of joints in the world, (frames, joints, 3) in metres."""
-    motion = room("marey_motion", MOTION_EXTRA)
+    motion = import_optional("marey_motion", MOTION_EXTRA)
     rig = rig_of(clip)
     names = tuple(joint.name for joint in rig.hierarchy.joints) if joints is None else several(joints)
     places = rig.chains(names)
     chain = [rig.hierarchy.joints[place].name for place in places]
     whole = len(chain) == len(rig.hierarchy.joints)
     poses = clip.motion(frames=frames, joints=None if whole else chain, revision=clip.item.revision)
-    skeleton = room("marey_motion.documents", MOTION_EXTRA).skeleton_from_document(rig.part_with(places))
+    skeleton = import_optional("marey_motion.documents", MOTION_EXTRA).skeleton_from_document(rig.part_with(places))
     ordered = _in_order(poses.poses, poses.joints, chain)
     found: NDArray[np.float32] = motion.forward_kinematics(
         skeleton,
@@ -127,15 +127,15 @@ def _in_order(poses: NDArray[np.float32], given: tuple[str, ...], wanted: list[s
 def read_velocities(clip: PosedItem, joints: Joints, frames: slice | None) -> NDArray[np.float32]:
     """Return the velocities of joints in the world, (frames, joints, 3) in metres per second."""
     wider, kept = _widened(clip, frames, DIFFERENCE_FRAMES)
-    found: NDArray[np.float32] = room("marey_motion", MOTION_EXTRA).velocities(
+    found: NDArray[np.float32] = import_optional("marey_motion", MOTION_EXTRA).velocities(
         read_positions(clip, joints, wider), clip.frame_rate_hz
     )
     return found[kept]
 
 
 def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
-    """Return whether each foot touches the ground, (frames, 2)."""
-    motion: Any = room("marey_motion.kinematics", MOTION_EXTRA)
+    """Return whether the left and the right foot touch the ground, as booleans (frames, 2)."""
+    motion: Any = import_optional("marey_motion.kinematics", MOTION_EXTRA)
     mapped = rig_of(clip).handle.mapping().joints
     feet = [next((mapped[name] for name in names if name in mapped), None) for names in FEET]
     if None in feet:
@@ -151,7 +151,7 @@ def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
 
 
 def _widened(clip: PosedItem, frames: slice | None, more: int) -> tuple[slice | None, slice]:
-    """Return a range extended by `more` frames on both sides, and the slice of the given range in the extended one."""
+    """Return a range of frames extended by `more` on both sides, and the slice of the given range in it."""
     frames_text(frames)  # refuses other steps and negative bounds
     if frames is None:
         return None, slice(None)

@@ -10,7 +10,7 @@ import numpy as np
 
 from marey_client.asynchronous.interruption import CallPool
 from marey_client.errors import BadArgument
-from marey_client.extras import room
+from marey_client.extras import import_optional
 from marey_client.poses.arrays import PosedItem, frames_text
 from marey_client.poses.kinematics import rig_of
 
@@ -46,8 +46,8 @@ def draw_poses(clip: PosedItem, frames: slice | None, moments: int) -> MotionPic
     chosen = range(*(frames or slice(None)).indices(clip.frames))
     if not chosen:
         raise BadArgument(f"frames: {clip.path!r} has {clip.frames} frames; the range contains none of them")
-    drawing = room("marey_reports.drawing.strips", FIGURES_EXTRA)
-    documents = room("marey_motion.documents", FIGURES_EXTRA)
+    drawing = import_optional("marey_reports.drawing.strips", FIGURES_EXTRA)
+    documents = import_optional("marey_motion.documents", FIGURES_EXTRA)
     skeleton = documents.skeleton_from_document(rig_of(clip).hierarchy)
     picked = [chosen[round(place)] for place in np.linspace(0, len(chosen) - 1, min(moments, len(chosen)))]
 

@@ -28,7 +28,7 @@ _PLACE = b'<script type="application/json" id="motion"></script>'
 
 @dataclass(frozen=True)
 class ShownMotion:
-    """A motion with its skeleton, and the name under which a page shows it."""
+    """A motion with its skeleton, and the name that a page shows beside it."""
 
     name: str
     motion: MotionDocument
@@ -107,7 +107,7 @@ def _read_clip(clip: ClipHandle, revision: int | None, frames: slice | None, *, 
 
 
 def motions_of_samples(model: ModelHandle, revision: int | None, n: int, seed: int) -> list[ShownMotion]:
-    """Draw samples of a model."""
+    """Draw `n` samples of a model, and return them as motions for a page."""
     drawn = model.sample(n, seed, revision=revision)
     return [
         shown_motion(model, f"sample {number} of {model.path}, seed {seed}", motion)

@@ -1,4 +1,4 @@
-"""Strips of poses as files: of clips and their revisions, samples of models, and trials of evaluations."""
+"""Pictures of poses in rows: of clips and their revisions, samples of models, and trials of evaluations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from marey_client.asynchronous.interruption import CallPool
 from marey_client.errors import BadArgument
-from marey_client.extras import room
+from marey_client.extras import import_optional
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.evaluations import EvaluationHandle, trial_rows, worst_rows_first
 from marey_client.handles.models import ModelHandle
@@ -86,7 +86,7 @@ def draw_clips(first: ClipOfStrip, second: ClipOfStrip | None, moments: int, fil
     """
     frames = first.chosen(moments)
     poses = first.poses(frames)
-    strips = room("marey_reports.drawing.strips", FIGURES_EXTRA)
+    strips = import_optional("marey_reports.drawing.strips", FIGURES_EXTRA)
     rows = [strips.PoseRow(first.clip.name, f"revision {first.number}", poses)]
     same_clip = second is not None and second.clip.id == first.clip.id
     if second is not None:
@@ -106,7 +106,7 @@ def draw_clips(first: ClipOfStrip, second: ClipOfStrip | None, moments: int, fil
 
 
 def _side_by_side(first: ClipOfStrip, second: ClipOfStrip, moments: int, file_type: str) -> bytes:
-    sheets = room("marey_reports.drawing.contact_sheet", FIGURES_EXTRA)
+    sheets = import_optional("marey_reports.drawing.contact_sheet", FIGURES_EXTRA)
     if file_type != "png" or moments > sheets.MAX_MOMENTS:
         raise BadArgument(
             f"{first.clip.path!r} and {second.clip.path!r} have different joints; draw them to a .png file, at "
@@ -123,7 +123,7 @@ def draw_samples(model: ModelHandle, revision: int | None, n: int, seed: int, mo
     """Draw samples of a model, one per row, at equally spaced fractions of their durations, as PNG or SVG."""
     _require_rows(n)
     drawn = model.sample(n, seed, revision=revision)
-    strips = room("marey_reports.drawing.strips", FIGURES_EXTRA)
+    strips = import_optional("marey_reports.drawing.strips", FIGURES_EXTRA)
     rows = []
     for number, motion in enumerate(drawn.motions, 1):
         reference = motion.skeleton
@@ -150,7 +150,7 @@ def draw_worst_trials(
     _require_rows(count)
     document = evaluation.document(revision=revision)
     ranked = ranked_trials(evaluation, document)
-    strips = room("marey_reports.drawing.strips", FIGURES_EXTRA)
+    strips = import_optional("marey_reports.drawing.strips", FIGURES_EXTRA)
     records = evaluation.records(revision=revision)
     shown = DisplayedFrames(evaluation, document)
     rows, times = [], []
@@ -179,7 +179,7 @@ def ranked_trials(evaluation: EvaluationHandle, document: dict[str, Any]) -> lis
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """Frame of a revision of a clip, and whether its mirrored copy was displayed instead of the frame itself."""
+    """Frame of a recorded clip that a character displayed. `mirrored`: the character displayed its mirrored copy."""
 
     clip: ClipHandle
     revision: int
@@ -188,7 +188,7 @@ class RecordedFrame:
 
 
 class DisplayedFrames:
-    """Frames of recorded clips, by their rows in the database of an evaluation."""
+    """Lookup of the recorded frame from which a row of an evaluation's motion matching database was computed."""
 
     def __init__(self, evaluation: EvaluationHandle, document: dict[str, Any]) -> None:
         self.rate_hz = float(document["options"]["database"]["rate_hz"])
@@ -198,7 +198,7 @@ class DisplayedFrames:
         self._handles: dict[str, ClipHandle] = {}
 
     def pose(self, row: int) -> Any:
-        """Return the recorded pose of a row as a clip of one frame, mirrored if the row is part of a mirrored copy."""
+        """Return the recorded pose of a row of the database as a clip of one frame, mirrored if the row is mirrored."""
         found = self.place(row)
         (pose,) = ClipOfStrip(found.clip, found.revision).poses([found.frame])
         return mirrored(pose) if found.mirrored else pose
@@ -222,9 +222,9 @@ class DisplayedFrames:
 
 def mirrored(clip: Any) -> Any:
     """Return the mirrored copy of a clip of `marey_motion`."""
-    rigs = room("marey_motion.rigs", FIGURES_EXTRA)
+    rigs = import_optional("marey_motion.rigs", FIGURES_EXTRA)
     partners = rigs.symmetric_joints(clip.skeleton, rigs.map_joints(clip.skeleton))
-    return room("marey_motion.mirroring", FIGURES_EXTRA).mirror_clip(clip, partners)
+    return import_optional("marey_motion.mirroring", FIGURES_EXTRA).mirror_clip(clip, partners)
 
 
 def _spread(frames: range, moments: int, name: str) -> list[int]:
@@ -253,12 +253,12 @@ def _frame_of(motion: MotionDocument, frame: int) -> MotionDocument:
 
 
 def _posed(motion: MotionDocument, rig: PosedSkeleton) -> Any:
-    documents = room("marey_motion.documents", FIGURES_EXTRA)
+    documents = import_optional("marey_motion.documents", FIGURES_EXTRA)
     return documents.clip_from_document(motion, documents.skeleton_from_document(rig.hierarchy))
 
 
 def _written(figure: Any, file_type: str, title: str) -> bytes:
-    paper = room("marey_reports.drawing.paper", FIGURES_EXTRA)
+    paper = import_optional("marey_reports.drawing.paper", FIGURES_EXTRA)
     if file_type == "svg":
         return str(paper.to_svg(figure, title)).encode()
     data: bytes = paper.to_png(figure)

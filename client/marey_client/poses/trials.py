@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_client.errors import BadArgument
-from marey_client.extras import room
+from marey_client.extras import import_optional
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.poses.pictures import FIGURES_EXTRA
@@ -70,9 +70,9 @@ class _RecordedClips:
 
 def _moved(skeleton: Any, poses: Floats, positions: Floats, headings: Floats) -> NDArray[np.float32]:
     """Turn poses (T, 3 + 4·joints) to headings (T,) in radians, and move the pelvis to x and z (T, 2) in metres."""
-    kinematics = room("marey_motion.kinematics", FIGURES_EXTRA)
-    quaternions = room("marey_motion.quaternions", FIGURES_EXTRA)
-    body = room("marey_reports.drawing.stick_figures", FIGURES_EXTRA).body_of(skeleton)
+    kinematics = import_optional("marey_motion.kinematics", FIGURES_EXTRA)
+    quaternions = import_optional("marey_motion.quaternions", FIGURES_EXTRA)
+    body = import_optional("marey_reports.drawing.stick_figures", FIGURES_EXTRA).body_of(skeleton)
     points = kinematics.forward_kinematics(skeleton, poses.astype(np.float32)).astype(np.float64)
     ahead = kinematics.forward_directions(points, *body.facing)
     angles = headings - np.arctan2(ahead[:, 0], ahead[:, 1])

@@ -16,7 +16,7 @@ SplitBy = Literal["subject", "take", "clip"]
 
 
 class MotionWindow(NamedTuple):
-    """Range of frames of a clip, from `first` on."""
+    """Window of frames of a clip, which begins at the frame `first`."""
 
     clip: PosesHandle
     first: int
@@ -130,8 +130,8 @@ def _require_one(what: str, values: Mapping[str, float], remedy: str) -> None:
     """Raise `BadArgument` if the values, by path of the clip, are not all equal; `what` names the values."""
     examples = {value: path for path, value in reversed(list(values.items()))}
     if len(examples) > 1:
-        told = ", ".join(f"{value:g} in {path!r}" for value, path in sorted(examples.items())[:4])
-        raise BadArgument(f"the clips have more than one {what}: {told}; {remedy}")
+        listed = ", ".join(f"{value:g} in {path!r}" for value, path in sorted(examples.items())[:4])
+        raise BadArgument(f"the clips have more than one {what}: {listed}; {remedy}")
 
 
 def _group_of(clip: PosesHandle, by: SplitBy) -> str:

@@ -63,18 +63,18 @@ from marey_schemas.queue.model_pipelines import model_pipeline
 from marey_schemas.queue.pipelines import PipelineCreate
 
 CommitTo = OutputsCommit | str | None
-"""Branch and folder to which a job commits its results, as `OutputsCommit` or as `dataset[@branch][/folder]`."""
+"""Branch and folder to which a job commits its results: an `OutputsCommit`, or a text `dataset[@branch][/folder]`."""
 
 
 class JobSubmission(ProjectItems):
-    """Items of a project, and the jobs that make items of them.
+    """Items of a project, and methods that submit jobs, which make new items from items.
 
     Methods that submit a job take `commit`: if the job succeeds, its results are committed to a branch of a dataset.
     For example, "gaits@main/studio" is the folder `studio` on the branch `main` of the dataset `gaits`.
     """
 
     def submit(self, job: JobCreate) -> JobHandle:
-        """Submit a job."""
+        """Submit a job of any kind to the project; return its handle."""
         return JobHandle.of(Jobs(self.transport).submit(self.name, job), self)
 
     def _submit(self, request: JobCreate, *, into: str, priority: int, cache: CacheMode, commit: CommitTo) -> JobHandle:
@@ -83,7 +83,7 @@ class JobSubmission(ProjectItems):
         return self.submit(request.model_copy(update=chosen))
 
     def job(self, job_id: str) -> JobHandle:
-        """Return a job of the project by its id."""
+        """Return a handle of the job of the project with this id. Raises `NotFound` if there is none."""
         return JobHandle.of(Jobs(self.transport).get(job_id), self)
 
     def pipeline(self, pipeline: PipelineCreate) -> PipelineRun:

@@ -63,7 +63,7 @@ def retarget_request(
 
 
 def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams) -> JobCreate:
-    """Return the job request to annotate clips."""
+    """Return the job request to annotate clips by the method that `params` name."""
     clips = resolved(project.clips, clips)
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     if edited := project.edited_rigs(items_at(project.clips, clips)):
@@ -178,7 +178,7 @@ def distances_request(
 def quality_request(
     project: ProjectItems, clips: Clips, reference: Clips | None, contacts: Annotations | None, params: QualityParams
 ) -> JobCreate:
-    """Return the job request to measure the quality of clips, beside that of a reference if it is given.
+    """Return the job request to measure the quality of clips, and of `reference` clips if they are given.
 
     `contacts` are annotations of all clips; if they are None, contacts are detected.
     """
@@ -247,7 +247,10 @@ def _of_clips(project: ProjectItems, clips: Clips, layer: str | None) -> dict[st
         return known
     annotations = _annotations_of(project, found, layer)
     if not annotations:
-        raise NoAnnotations(f"none of these clips has an annotation in the layer {layer!r}")
+        raise NoAnnotations(
+            f"none of these clips has an annotation in the layer {layer!r}; name another layer, or annotate the clips "
+            "first"
+        )
     return {**known, "annotations": annotations}
 
 

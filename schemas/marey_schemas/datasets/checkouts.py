@@ -36,13 +36,17 @@ class CheckoutRequest(Request):
     version: Version = MAIN
     query: Annotated[str, StringConstraints(min_length=1, max_length=MOST_CHARACTERS)] | None = Field(
         None,
-        description="Query that selects entries, as in lists of items. The fields `path`, `folder`, `name` and `tag` "
-        "refer to the entry in the folder of the dataset, all other fields to the content of the entry.",
+        description="Query that selects entries, as in lists of items. The fields `path`, `folder`, `name` and "
+        "`tag` refer to the entry in the folder of the dataset, all other fields to the content of "
+        "the entry. Null: all entries.",
     )
     paths: Annotated[tuple[EntryPath, ...], AfterValidator(_not_too_long)] = Field(
         (), max_length=MOST_PATHS, description="Entries, or folders whose entries are selected; empty: all entries."
     )
-    discard: bool = Field(False, description="Discard changes in the folder that no commit has recorded.")
+    discard: bool = Field(
+        False,
+        description="Discard changes in the folder that no commit has recorded; otherwise, such changes are an error.",
+    )
 
     @property
     def partial(self) -> bool:
@@ -55,12 +59,14 @@ class CheckoutAnswer(Answer):
 
     commit: str = Field(description="Digest of the commit that is checked out in the folder now.")
     taken: int | None = Field(
-        None, description="Number of entries that the folder has now. Null: the server is too old."
+        None,
+        description="Number of entries that the folder has now. Null: the server has an earlier version, "
+        "which does not report it.",
     )
     entries: int | None = Field(
         None,
-        description="Number of entries of the whole version, including those that were "
-        "not selected. Null: the server is too old.",
+        description="Number of entries of the whole version, including those that were not selected. Null: the "
+        "server has an earlier version, which does not report it.",
     )
     added: int
     removed: int

@@ -35,7 +35,7 @@ class PutEntry(Tagged):
     change: Literal["put"] = "put"
     path: EntryPath
     item: ItemId
-    revision: int | None = Field(None, ge=1, le=(1 << 31) - 1, description="Revision; null: the newest.")
+    revision: int | None = Field(None, ge=1, le=(1 << 31) - 1, description="Number of the revision; null: the newest.")
 
 
 class RemoveEntry(Tagged):
@@ -61,7 +61,7 @@ EntryChange = Annotated[PutEntry | RemoveEntry | MoveEntry, Field(discriminator=
 
 
 class CommitCreate(Request):
-    """Request to record a new version on a branch."""
+    """Request to record a new version of a dataset on a branch."""
 
     branch: RefName = MAIN
     message: Message = Field(min_length=1)
@@ -76,8 +76,8 @@ class CommitCreate(Request):
     )
     write_id: Annotated[str, StringConstraints(min_length=8, max_length=64)] | None = Field(
         None,
-        description="Name that the client chooses for this commit; a repeated request with the same name gets the "
-        "same commit.",
+        description="Name that the client chooses for this commit, if any; a repeated request with the same name "
+        "gets the same commit.",
     )
 
     @model_validator(mode="after")
@@ -88,7 +88,7 @@ class CommitCreate(Request):
 
 
 class Commit(Answer):
-    """One version of a dataset."""
+    """Commit: one version of a dataset, with its author, time, message and parents."""
 
     digest: str
     tree: str = Field(description="Digest of the entries; versions with the same entries have the same digest.")
@@ -103,7 +103,7 @@ class Commit(Answer):
 
 
 class Entry(Answer):
-    """An entry of a version."""
+    """Entry of a version of a dataset: a path, and the content that an item had when the version was recorded."""
 
     path: str
     kind: Kind
@@ -111,7 +111,9 @@ class Entry(Answer):
         description="Content digest of each part. Equal parts have the same digest on every server."
     )
     tags: tuple[str, ...]
-    item: str | None = Field(description="Item of this project that has a revision with this content.")
+    item: str | None = Field(
+        description="Item of this project that has a revision with this content; null: no item has one."
+    )
     revision: int | None
 
 

@@ -20,7 +20,7 @@ MOST_CONTENTS = 256
 MOST_CHECKED = 500
 """Greatest number of revisions in one request to check whether revisions may be exported."""
 MOST_RECEIVED_FACETS = 1000
-"""Greatest number of facets of one received revision."""
+"""Greatest number of facets (published numbers) of one received revision."""
 MOST_RECEIVED_CHANGES = 200_000
 """Greatest number of entries that a commit from an archive or another server may change."""
 
@@ -56,7 +56,9 @@ class ContentsRequest(Request):
     revisions: tuple[Digest, ...] = Field((), max_length=MOST_CONTENTS)
     documents: tuple[RequestedDocument, ...] = Field((), max_length=MOST_CONTENTS)
     tiles: tuple[PartOfContent, ...] = Field(
-        (), max_length=MOST_CONTENTS, description="Documents whose arrays are requested as digests of their tiles."
+        (),
+        max_length=MOST_CONTENTS,
+        description="Documents of whose arrays only the digests of the tiles (compressed pieces) are requested.",
     )
 
 
@@ -69,7 +71,7 @@ class ExportCheck(ConsentOverride):
 
 
 class ExportPermission(Answer):
-    """Permission to export revisions."""
+    """Answer to a check of consents: the revisions may be exported."""
 
     ended: tuple[str, ...] = Field(
         description="Ids of the items whose consent has ended, but whose export the request allows."
@@ -77,7 +79,7 @@ class ExportPermission(Answer):
 
 
 class ReceivedRevision(Request):
-    """Revision from an archive or another server."""
+    """Revision that is sent from an archive or another server: kind, documents and facets."""
 
     content: Digest = Field(
         description="Content digest of the revision, which the server compares with the digest of the documents."
@@ -97,8 +99,8 @@ class ReceivedRevision(Request):
     facets: dict[FacetName, FacetValue] = Field(
         default_factory=dict,
         max_length=MOST_RECEIVED_FACETS,
-        description="Numbers that jobs have published about the revision. They are added to all revisions with this "
-        "content, but do not replace numbers that the project already has.",
+        description="Facets: numbers that jobs have published about the revision, by name. They are added to all "
+        "revisions with this content, but do not replace facets that the project already has.",
     )
 
 

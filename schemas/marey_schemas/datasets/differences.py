@@ -26,24 +26,26 @@ class ListedCommit(Commit):
     )
     moved_from: str | None = Field(
         None,
-        description="If the commit moved a single entry to the path of the list: the path of the entry before the "
-        "move.",
+        description="If the commit moved a single entry to the path of the list: the path of the entry before "
+        "the move; otherwise null.",
     )
     moved_to: str | None = Field(
         None,
-        description="If the commit moved a single entry away from the path of the list: the path of the entry after "
-        "the move.",
+        description="If the commit moved a single entry away from the path of the list: the path of the entry "
+        "after the move; otherwise null.",
     )
 
 
 class EntryDifference(Answer):
-    """Difference of one entry between two versions."""
+    """Entry that differs between two versions, with the kind of its change."""
 
     path: str
     kind: Kind
     change: ChangeKind
-    was: str | None = Field(None, description="Path before the entry was moved.")
-    parts: dict[str, ChangeKind] = Field(default_factory=dict, description="Parts that differ.")
+    was: str | None = Field(None, description="Path of the entry in the earlier version, if it was moved.")
+    parts: dict[str, ChangeKind] = Field(
+        default_factory=dict, description="Kind of change of each part that differs, by the name of the part."
+    )
     tags_added: tuple[str, ...] = ()
     tags_removed: tuple[str, ...] = ()
     before: Entry | None = None
@@ -51,7 +53,7 @@ class EntryDifference(Answer):
 
 
 class DatasetDifference(Answer):
-    """Difference of two versions of a dataset."""
+    """Difference between two versions of a dataset: the entries that differ, and their numbers."""
 
     before: Commit
     after: Commit

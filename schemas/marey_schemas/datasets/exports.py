@@ -22,7 +22,7 @@ class ExportedRecord(RecordingFacts):
 
 
 class ExportedSource(Answer):
-    """File from which a clip was imported."""
+    """File from which an exported clip was imported: its name, digest and format."""
 
     name: str | None = None
     digest: str
@@ -39,7 +39,7 @@ class ExportedInput(Answer):
 
 
 class ExportedJob(Answer):
-    """Job that made a clip."""
+    """Job that made an exported clip, with its inputs."""
 
     id: str
     kind: str
@@ -50,7 +50,7 @@ class ExportedJob(Answer):
 
 
 class ExportedClip(Answer):
-    """Clip of an exported version."""
+    """Clip of an exported version, with its file, its take record and its origin."""
 
     path: str = Field(description="Path of the entry in the version.")
     content: str = Field(
@@ -61,8 +61,10 @@ class ExportedClip(Answer):
         description="Path of the clip's file in the exported folder; null: an episode of the dataset contains "
         "the clip's frames.",
     )
-    digest: str | None = Field(None, description="Digest of the bytes of `file`.")
-    episode: int | None = Field(None, description="Index of the clip's episode.")
+    digest: str | None = Field(None, description="Digest of the bytes of `file`; null if the clip has no file.")
+    episode: int | None = Field(
+        None, description="Index of the clip's episode in a LeRobotDataset; null in other layouts."
+    )
     tags: tuple[str, ...] = ()
     record: ExportedRecord = ExportedRecord()
     source: ExportedSource | None = None
@@ -84,11 +86,11 @@ class ExportedIdentity(Answer):
 
 
 class ExportedFolder(ExportedIdentity):
-    """The sidecar `marey.json`."""
+    """The sidecar `marey.json` of an exported folder: the version, the files, and the description of each clip."""
 
     schema_: Literal["marey/export@1"] = Field(alias="schema")
     layout: Layout
-    format: str | None = Field(None, description="Format of the motion files.")
-    unit: str | None = Field(None, description="Unit of length in the motion files.")
-    licences: tuple[str, ...] = Field((), description="Licences in the take records.")
+    format: str | None = Field(None, description="Format of the motion files; null in a LeRobotDataset.")
+    unit: str | None = Field(None, description="Unit of length in the motion files; null in a LeRobotDataset.")
+    licences: tuple[str, ...] = Field((), description="Different licences in the take records of the clips.")
     clips: tuple[ExportedClip, ...] = ()

@@ -53,7 +53,7 @@ class Resolution(Request):
 
 
 class CombineRequest(Request):
-    """Base of requests that apply changes of other commits to a branch, or undo changes on it."""
+    """Base of requests that apply changes of other commits to a branch, or undo changes of commits on a branch."""
 
     into: RefName = Field(MAIN, description="Branch that gets the changes.")
     message: Message = Field("", description="Message of the commit; empty: a sentence that names the versions.")
@@ -64,8 +64,8 @@ class CombineRequest(Request):
     )
     write_id: Annotated[str, StringConstraints(min_length=8, max_length=64)] | None = Field(
         None,
-        description="Name that the client chooses for this change; a repeated request with the same name gets the "
-        "same commit.",
+        description="Name that the client chooses for this change, if any; a repeated request with the same name "
+        "gets the same commit.",
     )
 
 
@@ -105,7 +105,7 @@ class ConflictingSegments(Answer):
 
 
 class EntryConflict(Answer):
-    """Entry that both sides have changed in ways that cannot be combined."""
+    """Conflict of a merge: an entry that both sides have changed in ways that cannot be combined."""
 
     path: str
     kind: Kind

@@ -31,12 +31,14 @@ With `~n` at the end, the name refers to the version n commits earlier.
 
 
 class DatasetCreate(Request):
-    """Request to create a dataset."""
+    """Request to create a dataset, whose commits may record a folder of the project."""
 
     name: DatasetName
     description: str = Field("", max_length=10_000)
     collection: CollectionPath | None = Field(
-        None, description="Folder of the project whose content the commits of this dataset record."
+        None,
+        description="Folder of the project whose content the commits of this dataset record; null: each "
+        "commit lists its changes.",
     )
 
 
@@ -87,7 +89,7 @@ class RefMove(Request):
 
 
 class Ref(Answer):
-    """A branch or a tag."""
+    """Branch or tag of a dataset: a name for a commit."""
 
     name: str
     kind: RefKind

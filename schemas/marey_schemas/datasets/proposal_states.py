@@ -12,7 +12,7 @@ class ProposalState(StrEnum):
 
 
 class Verdict(StrEnum):
-    """Verdict of a review of a proposal."""
+    """Verdict of a review of a proposal: `approve`, `request-changes`, or `comment` without a decision."""
 
     APPROVE = "approve"
     REQUEST_CHANGES = "request-changes"
@@ -20,7 +20,7 @@ class Verdict(StrEnum):
 
 
 class CheckState(StrEnum):
-    """State of a check of a proposal."""
+    """State of a check of a proposal: `pending`, `succeeded` or `failed`."""
 
     PENDING = "pending"
     SUCCEEDED = "succeeded"

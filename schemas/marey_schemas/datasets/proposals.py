@@ -17,7 +17,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.names import LINE, ItemId, Message, form
 
 MOST_TEXT = 10_000
-"""Greatest length of a description, a comment or the text of a review."""
+"""Greatest length, in characters, of a description, a comment or the text of a review."""
 WITH_FRAMES = (Kind.CLIP, Kind.ANNOTATION)
 """Kinds of entries that have frames on which somebody can comment."""
 
@@ -43,9 +43,11 @@ class CommentCreate(Request):
 
     text: Text
     path: EntryPath | None = Field(None, description="Path of the entry; null: the comment concerns the proposal.")
-    kind: Kind | None = Field(None, description="Kind of the entry.")
+    kind: Kind | None = Field(None, description="Kind of the entry; required with `path`.")
     frames: tuple[Frame, Frame] | None = Field(
-        None, description="First frame, and the frame after the last one, of a clip or an annotation."
+        None,
+        description="First frame, and the frame after the last one, of a clip or an annotation; null: the "
+        "comment concerns the whole entry.",
     )
 
     @model_validator(mode="after")
@@ -88,17 +90,18 @@ class CheckReport(Request):
     )
     job: ItemId | None = Field(
         None,
-        description="Job of the project that carries out the check. The state `succeeded` is refused unless this job "
-        "has succeeded. A job whose inputs are versions of datasets must also have read the newest commit.",
+        description="Job of the project that carries out the check. The state `succeeded` is refused unless this "
+        "job has succeeded. A job whose inputs are versions of datasets must also have read the "
+        "newest commit. Null: no job.",
     )
     link: Annotated[str, StringConstraints(max_length=2000, pattern=_LINK)] | None = Field(
-        None, description="Address of a page about the check."
+        None, description="Address of a page about the check; null: there is none."
     )
     text: str = Field("", max_length=MOST_TEXT, description="Result of the check, as text.")
 
 
 class ProposalMerge(Request):
-    """Request to merge a proposal."""
+    """Request to merge a proposal now, or as soon as all requirements are met."""
 
     message: Message = Field("", description="Message of the commit; empty: the number and title of the proposal.")
     resolutions: tuple[Resolution, ...] = Field((), max_length=10_000)
@@ -137,7 +140,7 @@ class Proposal(Answer):
     )
     target_commit: str | None = Field(
         description="Digest of the newest commit of the target branch. After the end of the proposal: the commit "
-        "that was the newest just before the end."
+        "that was the newest just before the end. Null: the branch has no commit."
     )
     merged: str | None = Field(
         description="Digest of the commit that the merge made; null if the proposal is not merged."
@@ -146,7 +149,7 @@ class Proposal(Answer):
         description="User on whose behalf the proposal is merged as soon as no requirement is missing; null: nobody "
         "has requested this."
     )
-    ended_by: str | None = Field(description="User who merged or closed the proposal.")
+    ended_by: str | None = Field(description="User who merged or closed the proposal; null while it is open.")
     created_at: datetime
     updated_at: datetime
     ended_at: datetime | None
@@ -182,7 +185,7 @@ class Review(Answer):
 
 
 class ProposalCheck(Answer):
-    """A check of one commit of a proposal."""
+    """Check of one commit of a proposal by a program, such as a job: its state and result."""
 
     name: str
     state: CheckState
@@ -195,14 +198,14 @@ class ProposalCheck(Answer):
 
 
 class Missing(Answer):
-    """Reason why a proposal cannot be merged yet."""
+    """Requirement for the merge of a proposal that is not met yet."""
 
     code: str
     detail: str
 
 
 class Mergeability(Answer):
-    """Result of a merge of the proposal, if it were merged now."""
+    """Whether a proposal could be merged now, and what the merge would change."""
 
     missing: tuple[Missing, ...] = Field(
         description="Reasons why the proposal cannot be merged yet; empty: it can be merged."
@@ -216,9 +219,13 @@ class Mergeability(Answer):
 
 
 class ProposalDetail(Proposal):
-    """A proposal with its reviews and checks, and with the expected result of a merge."""
+    """A proposal with its reviews and checks, and with what a merge now would do."""
 
     comments: int = Field(description="Number of comments.")
     reviews: tuple[Review, ...] = Field(description="The newest approval or request for changes of each reviewer.")
     checks: tuple[ProposalCheck, ...] = Field(description="Checks of the newest proposed commit, by name.")
-    mergeability: Mergeability | None = Field(description="Result of a merge now; null after the end of the proposal.")
+    mergeability: Mergeability | None = Field(
+        description="Whether the proposal could be merged now, and what "
+        "the merge would change; null after the end of the "
+        "proposal."
+    )

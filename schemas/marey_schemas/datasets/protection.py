@@ -11,7 +11,7 @@ from marey_schemas.base import Request
 from marey_schemas.names import USER
 
 MOST_REQUIRED = 20
-"""Greatest number of approvals that a rule can require, and greatest number of checks."""
+"""Greatest number of approvals, and of checks, that the rule of a branch can require."""
 
 CheckName = Annotated[str, StringConstraints(pattern=USER)]
 """Name of a check of a proposal, such as `evaluation`."""
@@ -54,6 +54,6 @@ class ProtectionRule(Request):
 
 
 class Protection(ProtectionRule):
-    """Rule of a protected branch, in answers about the branch."""
+    """Rule of a protected branch, as answers about the branch contain it."""
 
     model_config = ConfigDict(extra="ignore")

@@ -19,7 +19,7 @@ Metres = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ExampleRef(Request):
-    """Reference to an example: a revision of a clip, used as it is or mirrored."""
+    """Reference to an example of an action: a revision of a clip, used as it is or mirrored."""
 
     item: str
     revision: int = Field(ge=1)
@@ -37,7 +37,7 @@ class AlignedPlacement(Request):
     y: Metres = Field(0.0, allow_inf_nan=False, description="Height that was subtracted from the clip, in metres.")
     z: Metres = 0.0
     joint: JointName | None = Field(
-        None, description="The joint whose position on the ground `x` and `z` state; default: the root."
+        None, description="The joint whose position on the ground is (x, z); default: the root."
     )
 
 
@@ -62,19 +62,19 @@ class AlignmentInfo(Request):
     take: str | None = Field(
         None,
         max_length=300,
-        description="The recording that the clip comes from, for example the id of the clip that it was cut from; "
-        "examples with the same value are never used to test each other.",
+        description="The recording that the clip comes from, for example the id of the clip that it was cut "
+        "from; examples with the same value are never used to test each other. Absent: unknown.",
     )
-    subject: str | None = Field(None, description="Performer, under a pseudonym.")
+    subject: str | None = Field(None, description="Performer, under a pseudonym; absent: not recorded.")
     reference: ExampleRef | None = Field(
         None,
-        description="The reference example. Its time is the canonical time, to which the time of all other examples "
-        "is mapped.",
+        description="The reference example. Its time is the canonical time, to which the time of all other "
+        "examples is mapped. Absent: unknown.",
     )
     set: Digest | None = Field(
         None,
-        description="Digest of the options and of all clips that were aligned together; "
-        "it identifies the set of examples.",
+        description="Digest of the options and of all clips that were aligned together; it identifies the set of "
+        "examples. Absent: unknown.",
     )
     frame_rate_hz: float = Field(
         gt=0, allow_inf_nan=False, description="Rate of the canonical frames and of `source_frames`, in hertz."
@@ -97,7 +97,7 @@ class AlignmentInfo(Request):
     metric: MetricIdentity | None = Field(
         None,
         description="Perceptual metric whose distance of poses was the cost of the alignment. Costs under "
-        "different metrics are not comparable.",
+        "different metrics are not comparable. Absent: the cost is a geometric distance.",
     )
     options: AlignParams | None = Field(None, description="Options of the alignment; absent if unknown.")
     predecessor: PredecessorAlignedOrigin | None = None

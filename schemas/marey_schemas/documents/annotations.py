@@ -14,7 +14,7 @@ from marey_schemas.documents.references import RevisionRef as RevisionRef
 
 
 class SegmentDocument(Request):
-    """A labelled half-open range of frames."""
+    """Segment: a half-open range of frames with a label."""
 
     label: Annotated[str, StringConstraints(min_length=1, max_length=255)]
     start: int = Field(ge=0)
@@ -30,7 +30,7 @@ class SegmentDocument(Request):
 
 
 class KeyframeDocument(Request):
-    """A labelled frame."""
+    """Keyframe: a frame with a label."""
 
     label: Annotated[str, StringConstraints(min_length=1, max_length=255)]
     frame: int = Field(ge=0)
@@ -45,7 +45,9 @@ class Annotation(Request):
     made_by: Literal["person", "algorithm"] = "person"
     segments: tuple[SegmentDocument, ...] = Field((), description="Segments in the order of their frames.")
     keyframes: tuple[KeyframeDocument, ...] = Field((), description="Keyframes in the order of their frames.")
-    original: StoredOriginal | None = Field(None, description="The file that the annotation was imported from.")
+    original: StoredOriginal | None = Field(
+        None, description="The file that the annotation was imported from; absent: it was not imported."
+    )
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:

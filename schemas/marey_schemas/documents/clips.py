@@ -43,7 +43,9 @@ class MotionDocument(Request):
         description="[frames, 3 + 4*joints]: root translation (m), then local quaternions."
     )
     translations: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=3, columns=3)] | None = Field(
-        None, description="[frames, k, 3] local translations (m) that replace offsets."
+        None,
+        description="[frames, k, 3]: local translations (m) of the joints `translated_joints`, which "
+        "replace their offsets.",
     )
     translated_joints: tuple[JointName, ...] = ()
 
@@ -79,7 +81,7 @@ class MotionDocument(Request):
 
 
 class Check(Request):
-    """Finding of the importer about a motion: a stable code, a message, and the joints and frames concerned."""
+    """Warning of an import about a motion: a stable code, a message, and the joints and frames concerned."""
 
     code: Annotated[
         str, StringConstraints(pattern=form(r"^[a-z0-9-]{1,64}$", "have 1 to 64 lower-case letters, digits and -"))
@@ -95,10 +97,14 @@ class Check(Request):
 class ClipSource(Request):
     """Origin of a clip, and the changes made by the importer."""
 
-    file: Digest | None = Field(None, description="The imported file, byte for byte.")
+    file: Digest | None = Field(
+        None, description="Digest of the blob with the imported file, byte for byte; absent if the file is not stored."
+    )
     file_name: str | None = Field(None, description="Name of the file without its folders.")
     companion: Digest | None = Field(
-        None, description="A second file that the format needs, such as the ASF of an AMC."
+        None,
+        description="Digest of the blob with a second file that the format needs, such as the ASF of an "
+        "AMC; absent: there is none.",
     )
     companion_name: str | None = None
     content: Digest | None = Field(
@@ -125,7 +131,7 @@ def _require_day(value: object) -> object:
     is_day = _DAY.fullmatch(value) if isinstance(value, str) else type(value) is date
     if is_day:
         return value
-    raise ValueError("write the day as in 2026-11-23")
+    raise ValueError("a day must be written as in 2026-11-23")
 
 
 Day = Annotated[date, BeforeValidator(_require_day)]
@@ -135,15 +141,19 @@ Day = Annotated[date, BeforeValidator(_require_day)]
 class TakeRecord(Request):
     """Facts about the recording that a clip comes from; lists of clips show them, and queries can filter by them."""
 
-    subject: str | None = Field(None, description="Performer, under a pseudonym.")
-    action: str | None = Field(None, description="What the performer does.")
-    take: str | None = Field(None, max_length=64, description="Take, as the studio numbers it.")
-    shoot_day: Day | None = Field(None, description="Day of the recording.")
-    select: Literal["best", "good", "no good"] | None = Field(None, description="Rating of the take by the director.")
-    licence: str | None = Field(None, description="Licence of the recording.")
-    capture_system: str | None = Field(None, description="System that recorded the motion.")
+    subject: str | None = Field(None, description="Performer, under a pseudonym; absent: not recorded.")
+    action: str | None = Field(None, description="What the performer does, such as `walk`; absent: not recorded.")
+    take: str | None = Field(None, max_length=64, description="Take, as the studio numbers it; absent: not recorded.")
+    shoot_day: Day | None = Field(None, description="Day of the recording; absent: not recorded.")
+    select: Literal["best", "good", "no good"] | None = Field(
+        None, description="Rating of the take by the director; absent: not rated."
+    )
+    licence: str | None = Field(None, description="Licence of the recording; absent: not recorded.")
+    capture_system: str | None = Field(None, description="System that recorded the motion; absent: not recorded.")
     consent_until: Day | None = Field(
-        None, description="Last day of the performer's consent; clips are not exported after this day, in UTC."
+        None,
+        description="Last day of the performer's consent; clips are not exported after this day, in UTC. Absent: "
+        "no last day is recorded.",
     )
 
 

@@ -41,7 +41,7 @@ class DifferenceOptions(Options):
 
 
 class DifferenceRequest(DifferenceOptions):
-    """Query of a difference: the two revisions, and what the answer contains."""
+    """Query parameters of a request for a difference: the two revisions, and what the answer contains."""
 
     from_: int | None = Field(
         None,
@@ -69,7 +69,7 @@ class ComparedRevision(Answer):
 
 
 class FrameRun(Answer):
-    """Run of frames that correspond to each other in both revisions, or that only one revision has."""
+    """Range of successive frames that correspond to each other in both revisions, or that only one revision has."""
 
     change: Literal["matched", "removed", "inserted"]
     before: Range = Field(description="Range of frames in the revision `before`; empty for inserted frames.")
@@ -79,7 +79,9 @@ class FrameRun(Answer):
 class Exceeding(Answer):
     """Size of a change over the matched frames, and the times at which the change exceeds the threshold."""
 
-    mean: float = Field(description="Mean size of the change over all matched frames.")
+    mean: float = Field(
+        description="Mean size of the change over all matched frames, in degrees or centimetres, as the threshold."
+    )
     largest: float
     largest_at: int = Field(description="Frame of the revision `after` with the largest change.")
     spans: tuple[Range, ...] = Field(
@@ -107,7 +109,7 @@ class PathMove(Answer):
 
 
 class PathChange(Exceeding):
-    """Change of the path of the body: distances in centimetres."""
+    """Change of the path of the body on the ground and in height; distances are in centimetres."""
 
     joint: str = Field(
         description="Joint whose path is compared: the root, or the first joint that moves if the root stands still."
@@ -120,12 +122,12 @@ class PathChange(Exceeding):
 
 
 class RestChange(Answer):
-    """Changes of a joint in the rest pose."""
+    """Changes of a joint of the skeleton: its parent, its offset, or its rest rotation."""
 
     joint: str = Field(description="Name of the joint in the revision `after`.")
     parent: tuple[str | None, str | None] | None = Field(None, description="Names of the parents, if they differ.")
-    offset_cm: float = Field(0.0, description="Length of the change of the offset.")
-    rotation_deg: float = Field(0.0, description="Angle of the change of the rest rotation.")
+    offset_cm: float = Field(0.0, description="Length of the difference between the two offsets.")
+    rotation_deg: float = Field(0.0, description="Angle between the two rest rotations.")
 
 
 class SkeletonDifference(Answer):
@@ -143,7 +145,7 @@ class SkeletonDifference(Answer):
 
 
 class MotionDifference(Answer):
-    """Differences between two motions."""
+    """Differences between two motions: skeleton, timing, joints, and the path of the body."""
 
     frames: tuple[int, int]
     frame_rate_hz: tuple[float, float]
@@ -208,7 +210,7 @@ class MappedJoint(Answer):
 
 
 class MappingDifference(Answer):
-    """Differences between two mappings of joints."""
+    """Differences between the joint mappings of two skeletons."""
 
     joints: tuple[MappedJoint, ...] = ()
     axes: tuple[str, ...] = Field((), description="Joints whose anatomical axes differ.")
@@ -272,7 +274,9 @@ class Difference(Answer):
     annotation: AnnotationDifference | None = None
     model: ModelDifference | None = None
     fields: tuple[FieldChange, ...] = ()
-    more_fields: int = Field(0, description="Number of changed values beyond those in `fields`.")
+    more_fields: int = Field(
+        0, description="Number of changed values that are not listed in `fields`, because there are too many."
+    )
     plot: DifferencePlot | None = Field(None, description="Values of two motions to draw, if they were requested.")
     annotations: tuple[Annotation, Annotation] | None = Field(
         None, description="The compared annotations, if values to draw were requested."

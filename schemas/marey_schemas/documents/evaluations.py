@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field
 from marey_schemas.base import Request
 
 COSTS = ("match_cost", "continuing_cost", "pose_cost")
-"""Names of the costs that the part `records` contains for each tick of a trial."""
+"""Names of the costs that the part `records` contains for each tick (step of the simulation) of a trial."""
 
 CONFIDENCE = 0.95
 """Confidence level of intervals: changes between two evaluations, means of replicates, and totals of quality."""
@@ -23,7 +23,7 @@ MOST_EVALUATIONS_COMPARED = 8
 
 
 ANGLED_FAMILIES = ("corners", "strafing")
-"""The families of trials that vary an angle instead of the turn rate."""
+"""Families (kinds) of trials that combine each speed with each angle, instead of with each turn rate."""
 
 
 def trial_name(family: str, speed_m_s: float, turn_rate_rad_s: float, angle_rad: float = 0.0, label: str = "") -> str:
@@ -87,7 +87,7 @@ REMOVAL_FACETS: Mapping[str, str] = MappingProxyType(
 
 
 class RegionVerdict(Request):
-    """Verdict on the trials of one region, such as sharp turns."""
+    """Verdict on the trials of one region, a group of trials with similar motion, such as sharp turns."""
 
     region: str = Field(max_length=64, description="Name of the region.")
     followed: int = Field(ge=0, description="Number of followed trials.")
@@ -110,12 +110,12 @@ class EvaluationDocument(Request):
         (), max_length=16, description="Verdict on each region of the trials; empty in evaluations of old versions."
     )
     headline: dict[str, float | int | None] = Field(
-        max_length=64, description="Numbers by name, shown in lists of items."
+        max_length=64, description="Headline metrics by name, which lists of items show; null: not defined."
     )
 
 
 class EvaluationRecords(Request):
-    """Part `records`: the ticks of all trials, one trial after the other."""
+    """Part `records`: the ticks (steps of the simulation) of all trials, one trial after the other."""
 
     model_config = ConfigDict(extra="allow")
 

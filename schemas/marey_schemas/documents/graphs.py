@@ -18,7 +18,7 @@ NodeName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 
 
 class GraphPlace(Request):
-    """Reference to a motion primitive of an action."""
+    """Reference to a motion primitive: the names of its action and of the primitive."""
 
     action: NodeName
     primitive: NodeName
@@ -28,12 +28,14 @@ class GraphPlace(Request):
 
 
 class GraphPrimitive(Request):
-    """A node of the graph: a model, its type, and the primitives that may follow it."""
+    """A node of the graph, the motion primitive: its model, its type, and the primitives that may follow it."""
 
     model: RevisionRef | OutputRef
     type: Literal["start", "standard", "end", "idle", "single", "cycle_end"] = "standard"
     transitions: tuple[GraphPlace, ...] = Field((), max_length=MOST_PRIMITIVES)
-    source_id: str | None = Field(None, max_length=255, description="Id of the model in the imported file.")
+    source_id: str | None = Field(
+        None, max_length=255, description="Id of the model in the imported file; absent: the graph was not imported."
+    )
 
 
 class GraphAction(Request):
@@ -53,7 +55,9 @@ class ModelGraph(Request):
     actions: dict[NodeName, GraphAction] = Field(min_length=1, max_length=MOST_PRIMITIVES)
     start: GraphPlace = Field(description="The primitive that every sequence of actions begins with.")
     description: str = Field("", max_length=10_000)
-    original: StoredOriginal | None = Field(None, description="The file that the graph was imported from.")
+    original: StoredOriginal | None = Field(
+        None, description="The file that the graph was imported from; absent: it was not imported."
+    )
 
     @model_validator(mode="after")
     def _check_graph(self) -> Self:

@@ -1,4 +1,4 @@
-"""Perceptual metrics: part `metric` of an item of the kind `metric`, and the metrics that need no item.
+"""Perceptual metrics: part `metric` of an item of the kind `metric`, and the built-in metrics, which need no item.
 
 The distance of two poses by one measurement is c + N · Σ w F(x), with the sum over joint classes. The distance of a
 metric is the mean of its components' distances, weighted by their shares.
@@ -25,7 +25,7 @@ JointClass = Literal["head", "clavicle", "upper_arm", "forearm", "hand", "thigh"
 MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)
 JOINT_CLASS_NAMES: tuple[JointClass, ...] = get_args(JointClass)
 WITHOUT_ANGLES: tuple[JointClass, ...] = ("hand", "toe")
-"""Joint classes for which the paper gives no weights of angles."""
+"""Joint classes for which Pražák et al. (2009) give no weights of angles."""
 METRIC_RATE_HZ = 60.0
 """Frame rate at which the built-in metrics measure clips; clips of other rates are resampled."""
 METRIC_CODE = "perceptual-metric@1"
@@ -53,7 +53,7 @@ PUBLISHED: Mapping[Measurement, Mapping[Shaping, tuple[float | None, ...]]] = {
         "sigmoid": (21.993, 0.189, 36.532, 0.000, 0.000, 0.000, 0.000, 0.564, 0.000, 0.306, 0.157),
     },
 }
-"""Figure 5 of the paper, by measurement and function: difference, c, N, and weights of `JOINT_CLASS_NAMES`."""
+"""Figure 5 of Pražák et al. (2009) by measurement and function F: difference, c, N, weights of `JOINT_CLASS_NAMES`."""
 
 _TEXT_AND_TABLE = (
     "The text of the paper says that velocities use hands, thighs and calves; its table has hand, calf and toe, and no "
@@ -83,8 +83,8 @@ BuiltInMetric = Annotated[
 ]
 """Name of a metric that needs no item, such as `published/sigmoid` or `published/positions-manhattan`.
 
-`published/` uses the weights of the paper, `uniform/` equal weights, c = 0 and N = 1. Without a measurement, all three
-are combined in equal shares.
+`published/` uses the weights of Pražák et al. (2009), `uniform/` equal weights, c = 0 and N = 1. A name without a
+measurement combines angles, positions and velocities in equal shares.
 """
 
 
@@ -106,8 +106,8 @@ class MetricComponent(Request):
     share: _Share = Field(description="Share of the component in the metric; the shares have the sum 1.")
     intervals: dict[JointClass, tuple[_Number, _Number]] = Field(
         default_factory=dict,
-        description="95 % interval of each weight, divided by the sum of all, over resampled participants; empty: "
-        "unknown.",
+        description="95 % interval of each weight as a share of all weights, from bootstrap samples of the "
+        "participants; empty: unknown.",
     )
 
     @model_validator(mode="after")
@@ -127,16 +127,22 @@ class MetricFit(Request):
     trials: int = Field(ge=1, description="Number of answered trials.")
     pairs: int = Field(ge=1, description="Number of pairs of motions with a known difference.")
     rmse: _Amount = Field(description="Root mean square of fitted minus perceived differences.")
-    r2: _Number | None = Field(None, description="Share of the variance that the fit explains.")
-    spearman: _Number | None = Field(None, description="Rank correlation of fitted and perceived differences.")
+    r2: _Number | None = Field(
+        None, description="Share of the variance that the fit explains; null: the perceived differences do not vary."
+    )
+    spearman: _Number | None = Field(
+        None,
+        description="Spearman's rank correlation of fitted and perceived differences; null: one of them does not vary.",
+    )
     noise_ceiling: _Amount | None = Field(
         None,
-        description="Standard error of the perceived differences by chance. A fit with a smaller error than this "
-        "describes noise. Null: too few answers repeat a pair to know it.",
+        description="Standard error by chance of the perceived differences. A fit with a smaller error describes "
+        "noise. Null: unknown, because too few pairs were judged repeatedly.",
     )
     left_out_rmse: _Amount | None = Field(
         None,
-        description="Root mean square error of the fit for motions that were left out of it, one motion at a time.",
+        description="Root mean square error for motions that were left out of the fit, one motion at a time "
+        "(cross-validation).",
     )
 
 
@@ -146,10 +152,11 @@ class MetricDocument(Request):
     schema_: Literal["marey/perceptual-metric@1"] = Field("marey/perceptual-metric@1", alias="schema")
     name: str = Field(min_length=1, max_length=300, description="Name that is shown to people.")
     origin: Literal["published", "uniform", "fitted"] = Field(
-        description="published: weights of the paper; uniform: equal weights; fitted: fitted to judgements."
+        description="published: the weights of Pražák et al. (2009); uniform: equal weights; fitted: weights "
+        "fitted to the judgements of a study."
     )
     study: RevisionRef | OutputRef | None = Field(
-        None, description="The study whose judgements a fitted metric comes from."
+        None, description="The study whose judgements a fitted metric comes from; absent for other metrics."
     )
     components: tuple[MetricComponent, ...] = Field(
         min_length=1, max_length=len(MEASUREMENTS), description="At most one component for each measurement."
@@ -169,9 +176,9 @@ class MetricDocument(Request):
     )
     root_alignment: Literal["mean_heading", "kovar2d"] = Field(
         "mean_heading",
-        description="Method by which position and heading are removed. mean_heading: the hips are moved to the "
-        "origin, and the mean heading of one second is removed; kovar2d: the two poses of each pair are "
-        "superposed.",
+        description="Method by which position and heading on the ground are removed. mean_heading: the hips are "
+        "moved to the origin, and the mean heading of one second is removed; kovar2d: the two poses "
+        "of each pair are superposed by the best rotation about the vertical and shift.",
     )
     length_unit_m: _Positive = Field(1.0, description="Metres in one unit of length.")
     velocity_interval_s: _Positive = Field(
@@ -212,7 +219,7 @@ class MetricDocument(Request):
         return document_digest(tree)
 
     def stored(self) -> dict[str, Any]:
-        """Return the document as it is stored."""
+        """Return the document as JSON, in the form in which it is stored."""
         return self.model_dump(mode="json", by_alias=True)
 
 
@@ -224,7 +231,7 @@ class MetricIdentity(Request):
 
     @classmethod
     def of(cls, metric: MetricDocument) -> MetricIdentity:
-        """Return the identity of a metric."""
+        """Return the identity (name and digest) of a metric."""
         return cls(name=metric.name, digest=metric.identity_digest())
 
 
@@ -256,7 +263,7 @@ def built_in_metric(name: str) -> MetricDocument:
 
 
 def published_component(measurement: Measurement, shaping: Shaping, share: float = 1.0) -> MetricComponent:
-    """Return a component with the weights that the paper prints. Raises `KeyError` for the shaping `power`."""
+    """Return a component with the weights of Pražák et al. (2009). Raises `KeyError` for the shaping `power`."""
     _, constant, norm, *weights = PUBLISHED[measurement][shaping]
     given = {name: weight for name, weight in zip(JOINT_CLASS_NAMES, weights, strict=True) if weight is not None}
     return MetricComponent(
@@ -265,7 +272,7 @@ def published_component(measurement: Measurement, shaping: Shaping, share: float
 
 
 def classes_of(measurement: Measurement) -> tuple[str, ...]:
-    """Return the joint classes of a measurement."""
+    """Return the joint classes that a measurement compares; angles leave out `hand` and `toe`."""
     return tuple(name for name in JOINT_CLASS_NAMES if measurement != "angles" or name not in WITHOUT_ANGLES)
 
 

@@ -28,7 +28,7 @@ Stack = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=3)]
 
 
 class FunctionalComponentsDocument(Request):
-    """Functions of canonical time with D channels: a mean and k principal components, as n B-spline coefficients."""
+    """Functions of canonical time with D channels: a mean and k principal components, as splines of n coefficients."""
 
     degree: int = Field(3, ge=0, le=9)
     knots: Vector = Field(description="[n + degree + 1] knots of the splines, in canonical frames.")
@@ -91,7 +91,7 @@ class MixtureDocument(Request):
 
 
 class Noted(Request):
-    """Base class of records about the origin and training of a model; undeclared members are allowed."""
+    """Base of documents about the origin and the training of a model; they may also have undeclared members."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -139,7 +139,7 @@ class ExampleNotes(Noted):
 
 
 class TrainingNotes(Noted):
-    """Quality of a model, in numbers."""
+    """Measured quality of a model: likelihood and error of each training example, and further numbers."""
 
     examples: tuple[ExampleNotes, ...] = Field((), description="One entry for each training example.")
 
@@ -157,7 +157,9 @@ class MotionPrimitiveDocument(Request):
     name: ItemName = Field(description="Name of the action that the model generates.")
     verdict: str = Field("", max_length=2000, description="Assessment of the model in one or two sentences.")
     headline: dict[str, float | int | str | None] = Field(
-        default_factory=dict, max_length=64, description="Numbers by name, shown in lists of items."
+        default_factory=dict,
+        max_length=64,
+        description="Headline numbers by name, which lists of items show; null: not defined.",
     )
     skeleton: RevisionRef | OutputRef
     joints: tuple[JointName, ...] = Field(
@@ -174,12 +176,12 @@ class MotionPrimitiveDocument(Request):
         default_factory=dict, max_length=MOST_KEYFRAMES, description="Canonical frame of each keyframe, by label."
     )
     duration_range_s: tuple[float, float] | None = Field(
-        None, description="Shortest and longest duration of a sample, in seconds."
+        None, description="Shortest and longest duration of a sample, in seconds; absent: not limited."
     )
     log_slope_range: tuple[float, float] | None = Field(
         None,
         description="Lower and upper limit of the temporal function of samples: the range of the examples, "
-        "slightly widened.",
+        "slightly widened. Absent: only a general limit applies.",
     )
     widening: float = Field(
         1.0,
@@ -193,11 +195,11 @@ class MotionPrimitiveDocument(Request):
         description="Method and weights of the channels during training; the functions in this document are "
         "unweighted.",
     )
-    options: dict[str, Any] | None = Field(None, description="Options of the training.")
+    options: dict[str, Any] | None = Field(None, description="Options of the training; absent: unknown.")
     provenance: ModelProvenance = Field(
         default_factory=ModelProvenance, description="The training examples and their origin."
     )
-    training: TrainingNotes | None = Field(None, description="Measured quality of the model.")
+    training: TrainingNotes | None = Field(None, description="Measured quality of the model; absent: not measured.")
 
     @model_validator(mode="after")
     def _check_shapes(self) -> Self:

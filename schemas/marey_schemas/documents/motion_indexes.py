@@ -11,7 +11,7 @@ from marey_schemas.documents.reports import StoredFile
 from marey_schemas.names import ItemId
 
 MOST_SHARDS = 2000
-"""Greatest number of shards of an index: about 1,200 hours of motion."""
+"""Greatest number of shards (files with poses of many clips) of an index: about 1,200 hours of motion."""
 _MOST_NUMBER = 2**31 - 1
 _Number = Annotated[int, Field(ge=0, le=_MOST_NUMBER)]
 INDEX_VERSION = 1
@@ -22,12 +22,13 @@ class IndexShard(Request):
     """Shard of an index: two files with the poses of many clips."""
 
     clips: StoredFile = Field(description="List of the clips, a `ShardClips` as JSON.")
-    poses: StoredFile = Field(description="Features of the poses of these clips.")
+    poses: StoredFile = Field(description="Features of the poses of the clips in `clips`, one row for each pose.")
     rows: int = Field(ge=1, description="Number of poses.")
     dropped: tuple[_Number, ...] = Field(
         (),
         max_length=100_000,
-        description="Positions, in the list of clips, of the clips that no longer belong to the index.",
+        description="Positions (from 0), in the list of clips of the shard, of the clips that no longer belong "
+        "to the index.",
     )
 
 
@@ -37,7 +38,7 @@ class MotionIndexDocument(Request):
     schema_: Literal["marey/motion-index@1"] = Field("marey/motion-index@1", alias="schema")
     version: int = Field(INDEX_VERSION, ge=1, description="Version of the format of the shards.")
     clips: int = Field(ge=0, description="Number of clips in the index.")
-    rows: int = Field(ge=0, description="Number of poses of these clips, 30 per second.")
+    rows: int = Field(ge=0, description="Number of poses of the clips in the index, 30 for each second of motion.")
     left_out: int = Field(0, ge=0, description="Number of clips whose poses cannot be compared; the log names them.")
     shards: tuple[IndexShard, ...] = Field((), max_length=MOST_SHARDS)
 

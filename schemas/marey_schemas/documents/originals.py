@@ -46,7 +46,7 @@ class StoredOriginal(Request):
 
 
 def content_digest(part: str, document: Mapping[str, Any]) -> str:
-    """Return the digest of those members of a part that an import takes from a file (see `CONTENT`).
+    """Return the digest of the members of a part that `CONTENT` lists: those that an import takes from a file.
 
     Arrays in `document` may be references.
     """

@@ -19,7 +19,7 @@ CONTACT_LABELS: Mapping[str, tuple[bool, bool]] = MappingProxyType(
 )
 """Labels of segments in which the left and the right foot are in contact with the floor."""
 LEAST_TAKES = 3
-"""Least number of takes for an interval of a total."""
+"""Number of takes from which a total has a confidence interval."""
 SPEED_EDGES_M_S = tuple(0.25 * step for step in range(33))
 TURN_EDGES_DEG_S = tuple(-180.0 + 15.0 * step for step in range(25))
 """Edges of the bins in which windows of one second are counted; windows beyond the ends count in the outermost bins."""
@@ -157,11 +157,11 @@ class QualityConditions(Request):
     )
     grouping: Literal["take"] = Field(
         "take",
-        description="Unit that is drawn at random to compute intervals. take: the clips of a take together; "
-        "a clip without a recorded take counts as a separate take.",
+        description="Unit that bootstrap samples for the intervals draw. take: the clips of a take together; a "
+        "clip without a recorded take counts as a separate take.",
     )
-    draws: int = Field(ge=0, description="Number of draws for intervals.")
-    seed: int = Field(ge=0, description="Seed of the draws.")
+    draws: int = Field(ge=0, description="Number of bootstrap samples for the intervals.")
+    seed: int = Field(ge=0, description="Seed of the bootstrap samples.")
 
 
 class QualityRow(Request):
@@ -186,7 +186,9 @@ class QualityTotal(Request):
     """Mean of a measure over clips, weighted by their duration; clips in which it is undefined are left out."""
 
     value: _Finite | None
-    low: _Finite | None = Field(description="Lower end of the 95 % interval; null with fewer than 3 takes.")
+    low: _Finite | None = Field(
+        description="Lower end of the 95 % confidence interval of the mean; null with fewer than 3 takes."
+    )
     high: _Finite | None
     clips: int
     takes: int
@@ -215,7 +217,7 @@ class QualityChange(Request):
 
 
 class QualityDocument(Request):
-    """Result of a job of the kind `quality`."""
+    """Result of a job of the kind `quality`: the measures of each clip, totals, and a comparison with a reference."""
 
     schema_: Literal["marey/quality@1"] = Field("marey/quality@1", alias="schema")
     code_version: str = Field(description="Version of Marey.")

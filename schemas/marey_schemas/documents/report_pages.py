@@ -1,4 +1,4 @@
-"""Places in stored reports that are filled when a report is handed out.
+"""Placeholders in stored reports, which the server replaces when it sends a report.
 
 The bytes of a stored report depend only on inputs, parameters, seed and version of the code, so that identical jobs can
 share a report. Project, author and date differ from job to job. So a stored page has an empty place for them, and one
@@ -12,9 +12,9 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 ORIGIN_PLACE = '<template id="origin"></template>'
-"""Place in the head of a page, inside a `dl`. Text of a report cannot contain it, because every `<` is escaped."""
+"""Placeholder of the facts about a report's origin, in a `dl`. Texts cannot contain it, because each `<` is escaped."""
 PLAYER_PLACE = '<template id="player"></template>'
-"""Place of the player; only pages with motion have it."""
+"""Placeholder of the program that plays motion; only pages with motion have it."""
 
 
 class ReportOrigin(NamedTuple):
@@ -42,7 +42,7 @@ class ReportOrigin(NamedTuple):
 
 
 def with_origin(page: bytes, origin: ReportOrigin) -> bytes:
-    """Return a page with its origin; pages without a place for it stay as they are."""
+    """Return a page with the facts about its origin; a page without the placeholder stays as it is."""
     groups = (f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>" for name, value in origin.facts())
     return page.replace(ORIGIN_PLACE.encode(), "".join(groups).encode(), 1)
 

@@ -22,7 +22,7 @@ FigureName = Annotated[str, StringConstraints(pattern=_FIGURE)]
 
 
 class StoredFile(Request):
-    """File stored as a blob."""
+    """File that is stored as a blob: its digest and its size."""
 
     blob: Digest
     size_bytes: int = Field(ge=0)
@@ -61,7 +61,7 @@ class Report(Request):
 
 
 class EvaluationReport(Report):
-    """Part `report` of an evaluation."""
+    """Part `report` of an evaluation: the HTML page and its figures."""
 
     schema_: Literal["marey/evaluation-report@1"] = Field("marey/evaluation-report@1", alias="schema")
 

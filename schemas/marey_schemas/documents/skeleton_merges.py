@@ -8,7 +8,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.names import ItemId
 
 SKELETON_MERGE = "skeleton_merge"
-"""Name of the input by which a revision that a merge made refers to the revision before it."""
+"""Role of the input in the lineage of a revision that a merge made: the revision before the merge."""
 MOST_MOVED = 5_000
 """Greatest number of items that one merge moves to another skeleton."""
 MOST_RIGS_COMPARED = 500
@@ -32,7 +32,7 @@ class SkeletonMergeRequest(Request):
 
 
 class NamedSkeleton(Answer):
-    """Skeleton, with its path in the project."""
+    """Skeleton in a merge: its id, and its path in the project."""
 
     id: str
     path: str
@@ -55,7 +55,7 @@ class MergedRig(Answer):
 
 
 class SkeletonMergeAnswer(Answer):
-    """Result of a merge, or of its preview, by rig."""
+    """Result of a merge of skeletons, or of its preview: for each rig, the skeletons that become one."""
 
     rigs: tuple[MergedRig, ...]
     dry_run: bool

@@ -21,7 +21,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 class Joint(Request):
-    """Joint of a hierarchy."""
+    """Joint of a skeleton: its name, its parent, and its rest pose."""
 
     name: JointName
     parent: int = Field(ge=-1, description="Index of the parent, smaller than the joint's own; -1 for the root.")
@@ -33,7 +33,7 @@ class Joint(Request):
 
 
 class EndSiteDocument(Request):
-    """Point at the end of a chain, without a rotation of its own."""
+    """End site of a joint, such as a fingertip: a point without a rotation of its own."""
 
     joint: int = Field(ge=0)
     offset: Vector3
@@ -51,14 +51,16 @@ class SkeletonHierarchy(Request):
         seen: set[str] = set()
         for index, joint in enumerate(self.joints):
             if joint.name in seen:
-                raise ValueError(f"joints[{index}]: the name {joint.name!r} is used twice")
+                raise ValueError(
+                    f"joints[{index}]: another joint has the name {joint.name!r}, too; give each joint its own name"
+                )
             seen.add(joint.name)
             if (joint.parent == -1) != (index == 0) or joint.parent >= index:
                 place = f"joints[{index}] ({joint.name})"
                 raise ValueError(f"{place}: parent {joint.parent} must come before the joint; only joint 0 is the root")
         for index, site in enumerate(self.end_sites):
             if site.joint >= len(self.joints):
-                raise ValueError(f"end_sites[{index}]: joint {site.joint} does not exist")
+                raise ValueError(f"end_sites[{index}]: the skeleton has no joint with the index {site.joint}")
         return self
 
 
@@ -72,8 +74,12 @@ class JointAxesDocument(Request):
 class PredecessorSkeletonOrigin(Request):
     """Files of Marey's predecessor that a skeleton was imported from."""
 
-    skeleton: StoredOriginal | None = Field(None, description="The file of the hierarchy.")
-    model: StoredOriginal | None = Field(None, description="The file of the skeleton model: joints and axes.")
+    skeleton: StoredOriginal | None = Field(
+        None, description="The file of the hierarchy; absent if it was not imported."
+    )
+    model: StoredOriginal | None = Field(
+        None, description="The file of the skeleton model (joint mapping and axes); absent if it was not imported."
+    )
     rest: dict[str, Any] = Field(
         default_factory=dict,
         description="Members of the skeleton model that have no counterpart here, such as limits of joints.",
@@ -84,7 +90,9 @@ class SkeletonMapping(Request):
     """Part `mapping` of a skeleton, which users can edit: the joint for each standard joint, and the axes of joints."""
 
     schema_: Literal["marey/skeleton-mapping@1"] = Field("marey/skeleton-mapping@1", alias="schema")
-    rig: str | None = Field(None, description="The known rig whose joint names were recognised.")
+    rig: str | None = Field(
+        None, description="Name of the known rig whose joint names were recognised; absent: none was."
+    )
     method: Literal["names", "geometry", "manual"] = "manual"
     confidence: float = Field(1.0, ge=0.0, le=1.0)
     joints: dict[str, JointName] = Field(

@@ -27,7 +27,7 @@ class StudyMotion(Request):
 
     @property
     def revision(self) -> RevisionRef:
-        """The revision of the clip; in a stored study, references to outputs of jobs are resolved."""
+        """The revision of the clip. Stored studies refer to revisions only, not to outputs of jobs."""
         assert isinstance(self.clip, RevisionRef)
         return self.clip
 
@@ -45,7 +45,9 @@ class StudyDocument(Request):
     )
     trials: int = Field(63, ge=1, le=MOST_TRIALS, description="Number of answered trials of each participant.")
     shown: Literal[4] = Field(SHOWN, description="Number of motions that a trial shows.")
-    seconds: float = Field(10.0, ge=1, le=120, allow_inf_nan=False, description="Time for an answer.")
+    seconds: float = Field(
+        10.0, ge=1, le=120, allow_inf_nan=False, description="Seconds that a participant has to answer a trial."
+    )
     seed: int = Field(0, ge=0, le=2**32 - 1, description="Seed of the trials; the same seed draws the same trials.")
 
     @model_validator(mode="after")

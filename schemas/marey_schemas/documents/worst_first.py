@@ -1,4 +1,4 @@
-"""The one order of everything that Marey calls the worst: trials, changed trials and clips.
+"""Order of rows from the worst to the best, for trials, changed trials and clips.
 
 Reports, the command line, the SDK and stored results all list the worst in this order, so their first rows agree.
 """
@@ -44,5 +44,5 @@ def increase(before: float | None, after: float | None) -> float | None:
 
 
 def middle_of(ranked: list[T]) -> T:
-    """Return the row in the middle of rows that are sorted from the worst to the best; of two, the worse one."""
+    """Return the median row of rows that are sorted from the worst to the best; of two middle rows, the worse one."""
     return ranked[(len(ranked) - 1) // 2]

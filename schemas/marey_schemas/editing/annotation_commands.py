@@ -134,7 +134,9 @@ class AnnotationImport(Request):
         "`document` or `file`.",
     )
     file: ImportFile | None = Field(
-        None, description="File with the document, as JSON, BSON or compressed BSON; the server already has its bytes."
+        None,
+        description="File with the document, as JSON, BSON or compressed BSON; the server already has its "
+        "bytes. An alternative to `document`.",
     )
     layer: LayerName = "imported"
     name: ItemName | None = Field(

@@ -1,4 +1,4 @@
-"""The commands of an edit: one model each, discriminated by `command`.
+"""The commands of an edit, each as a model; the field `command` names the command.
 
 Frames count from 0. Ranges are half open; the stop null means the end of the clip. Lengths are in metres and times in
 seconds. Angles are in degrees if the name of the field ends in `_deg`. Directions and positions are in the world, which
@@ -71,7 +71,7 @@ class NamedCommand(Tagged):
 
 
 class Trim(NamedCommand):
-    """Keep a range of frames."""
+    """Keep a range of frames, and remove all frames before and after it."""
 
     examples: ClassVar[Examples] = ({"start": 10, "stop": 170}, {"start": 3})
     command: Literal["trim"] = "trim"
@@ -102,7 +102,7 @@ class Split(NamedCommand):
 
 
 class Concatenate(NamedCommand):
-    """Append another clip of the same skeleton."""
+    """Append another clip of the same skeleton, with a blend where the clips meet."""
 
     examples: ClassVar[Examples] = (
         {"source": EXAMPLE_SOURCE},
@@ -112,21 +112,21 @@ class Concatenate(NamedCommand):
     source: ItemId = Field(description="The clip to append.")
     place: Literal["seam", "keep"] = Field(
         "seam",
-        description="seam: the appended clip is turned and shifted on the ground, so that the motion continues where "
-        "it ends; keep: the appended clip is not moved.",
+        description="seam: the appended clip is turned and shifted on the ground, so that it continues where the "
+        "motion before it ends; keep: the appended clip is not moved.",
     )
     blend: Literal["inertialise", "slerp"] = Field(
         "inertialise",
-        description="inertialise: the difference at the seam decays in the appended clip, and no frame is "
-        "lost; slerp: the end of one clip is cross-faded with the start of the other, and these "
-        "frames overlap.",
+        description="Method of blending. inertialise: the difference where the clips meet decays in the appended "
+        "clip, and no frame is lost; slerp: the end of the first clip is cross-faded with the start "
+        "of the second, and these frames overlap.",
     )
     blend_s: Seconds = Field(0.3, description="Duration of the blend in seconds; 0: a hard cut.")
     keep_feet: bool = Field(
         True,
-        description="Keep a foot in place if it is in contact before and after the seam (only with `blend` "
-        "inertialise), and keep all feet above their floors. false: only rotations and the path of the root are "
-        "blended.",
+        description="Keep a foot in place that is in contact before and after the seam between the clips (only "
+        "with `blend` inertialise), and keep all feet above their floors. false: only rotations and "
+        "the path of the root are blended.",
     )
 
 
@@ -160,8 +160,8 @@ class CloseLoop(NamedCommand):
     )
     blend_s: Seconds | None = Field(
         None,
-        description="Distance from either end, in seconds, within which poses may change; absent: up to the "
-        "middle of the clip.",
+        description="Seconds from the start and from the end of the clip within which poses may change; absent: "
+        "up to the middle.",
     )
 
 
@@ -182,7 +182,7 @@ class CutLoop(NamedCommand):
 
 
 class Translate(NamedCommand):
-    """Shift the whole motion."""
+    """Shift the whole motion in the world."""
 
     examples: ClassVar[Examples] = ({"shift_m": [1.0, 0.5, -2.0]},)
     command: Literal["translate"] = "translate"
@@ -253,19 +253,24 @@ class FlipAxes(NamedCommand):
 
 
 class FixDrift(NamedCommand):
-    """Spread a shift and a turn of the body over a range of frames; later frames get the whole shift and turn."""
+    """Correct drift: spread a shift and a turn of the body over a range of frames; later frames get all of it."""
 
     examples: ClassVar[Examples] = (
         {"shift_m": [0.2, 0.0, -0.1], "turn_deg": 10.0, "frames": [20, 80], "profile": "smooth"},
     )
     command: Literal["fix_drift"] = "fix_drift"
-    shift_m: Shift = Field((0.0, 0.0, 0.0), description="Shift of the end of the range, in metres along x, y and z.")
+    shift_m: Shift = Field(
+        (0.0, 0.0, 0.0), description="Shift that the last frame of the range gets, in metres along x, y and z."
+    )
     turn_deg: Degrees = Field(
-        0.0, description="Turn of the end of the range about the vertical, in degrees, positive to the left."
+        0.0,
+        description="Turn about the vertical that the last frame of the range gets, in degrees, positive to the left.",
     )
     frames: Frames | None = Field(None, description=f"{WHOLE_OR_RANGE} The range has at least two frames.")
     profile: Literal["linear", "smooth"] = Field(
-        "linear", description="linear: the same share in every frame; smooth: slow at the start and the end."
+        "linear",
+        description="Growth of the correction over the range. linear: the same share in every frame; "
+        "smooth: slow at the start and the end.",
     )
 
 
@@ -341,7 +346,9 @@ class Smooth(NamedCommand):
         description="Width of the filter, in seconds: each frame becomes a weighted mean of the frames within this "
         "width.",
     )
-    order: int = Field(3, ge=0, le=9, description="Degree of the polynomials of the filter savitzky_golay.")
+    order: int = Field(
+        3, ge=0, le=9, description="Degree of the polynomials of the filter savitzky_golay; other filters ignore it."
+    )
     joints: Joints | None = Field(None, description="Joints to smooth; absent: all.")
     root_translation: bool = Field(True, description="Also smooth the path of the root.")
     keep_feet: bool = Field(
@@ -356,7 +363,7 @@ class Smooth(NamedCommand):
 
 
 class RotateJoint(NamedCommand):
-    """Add a rotation to a joint."""
+    """Turn a joint by the same rotation in all frames of a range, in addition to its motion."""
 
     examples: ClassVar[Examples] = ({"joint": "LeftArm", "angle_deg": 20.0, "axis": [0.0, 1.0, 0.0], "space": "world"},)
     command: Literal["rotate_joint"] = "rotate_joint"

@@ -66,15 +66,22 @@ class _Constraint(Tagged):
         gt=0,
         le=1e6,
         allow_inf_nan=False,
-        description="Weight of the constraint where constraints contradict each other.",
+        description="Weight of the constraint, relative to other constraints that it contradicts.",
     )
 
 
 class PositionConstraint(_Constraint):
-    """Position of a joint, or of a point fixed to a joint; by default, the position in the first frame is kept."""
+    """Constraint on the position of a joint, or of a point fixed to a joint.
+
+    By default, the position in the first frame of the range is kept.
+    """
 
     kind: Literal["position"] = "position"
-    point_m: Shift | None = Field(None, description="Target position in the world, in metres.")
+    point_m: Shift | None = Field(
+        None,
+        description="Target position in the world, in metres. Without it and "
+        "`shift_m`: the position in the first frame of the range.",
+    )
     shift_m: Shift | None = Field(
         None, description="Shift of the joint from its position in each frame, in metres; an alternative to `point_m`."
     )
@@ -99,23 +106,28 @@ class PositionConstraint(_Constraint):
 
 
 class OrientationConstraint(_Constraint):
-    """Orientation of a joint in the world. Without a rotation, the initial orientation is kept."""
+    """Constraint on the orientation of a joint in the world.
+
+    By default, the orientation in the first frame of the range is kept.
+    """
 
     kind: Literal["orientation"] = "orientation"
     rotation: Rotation | None = Field(
-        None, description="Target rotation in the world, as a unit quaternion (w, x, y, z)."
+        None,
+        description="Target rotation in the world, as a unit quaternion (w, x, y, z); absent: the rotation "
+        "in the first frame of the range.",
     )
 
 
 class LookAtConstraint(_Constraint):
-    """Target at which an axis of a joint, such as the direction of view, must point."""
+    """Constraint that an axis of a joint, such as the direction of view of the head, points at a target."""
 
     kind: Literal["look_at"] = "look_at"
     point_m: Shift
     axis: Axis | None = Field(
         None,
-        description="The direction that points at the target, in the joint's frame; absent: the front "
-        "of head and trunk, the bone of limbs.",
+        description="The direction, in the joint's frame, that must point at the target. Absent: for joints of "
+        "head and trunk, the direction that they face; for limbs, the direction of the bone.",
     )
     offset_m: Shift = Field((0.0, 0.0, 0.0), description="Offset of the eye from the joint, in the joint's frame.")
 
@@ -145,7 +157,8 @@ class ConeLimit(_Limit):
     kind: Literal["cone"] = "cone"
     joint: JointName
     swing_deg: tuple[Opening, Opening] = Field(
-        description="Greatest swing about the swing axis and across it, in degrees."
+        description="Greatest swing of the bone in degrees: about the swing axis, and about the axis orthogonal "
+        "to swing axis and bone."
     )
     twist_deg: AngleRange = Field((-180.0, 180.0), description="Least and greatest twist about the bone, in degrees.")
 

@@ -44,15 +44,18 @@ class EditPreviewRequest(Request):
 
 
 class EditPreview(Answer):
-    """Frames of the result of an edit."""
+    """Frames of the result of an edit that was computed but not stored."""
 
     pieces: int = Field(description="Number of clips that result from the edit of the clip.")
     frame_count: int = Field(description="Number of frames of the whole result.")
     frame_rate_hz: float
     frames: tuple[int, int] = Field(description="Half-open range of the frames in this answer.")
-    motion: MotionDocument | None = Field(None, description="Motion of the frames in this answer.")
+    motion: MotionDocument | None = Field(
+        None, description="Motion of the frames in this answer; null if the request did not ask for it."
+    )
     positions: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=3, columns=3)] | None = Field(
-        None, description="[frames, joints, 3]: positions of the joints in metres."
+        None,
+        description="[frames, joints, 3]: positions of the joints in metres; null if the request did not ask for them.",
     )
     findings: tuple[dict[str, Any], ...] = Field(
         (), description="Measurements that commands made, each with its `command`."

@@ -1,4 +1,4 @@
-"""Differences between arrays: of an array, only the frames that differ from an array of the receiver are sent.
+"""Array differences: only the frames of an array are sent that differ from another array, which the receiver has.
 
 In a document, such an *array difference* is an object in place of the array. It names the other array, its *base*, by
 the content digest of a revision and a JSON Pointer into the same part of this revision. The other members are `dtype`
@@ -47,7 +47,7 @@ class ArrayDifference:
 
     @classmethod
     def of(cls, value: Any) -> ArrayDifference | None:
-        """Return the array difference in a document; None if `value` is not an array difference.
+        """Return `value`, a value in a document, as an array difference; None if it is none.
 
         Raises `ArrayError` if dtype or shape are malformed.
         """
@@ -141,7 +141,9 @@ class ArrayDifference:
 
 
 def detach_differences(tree: Any, keep: Callable[[ArrayDifference], None]) -> Any:
-    """Return a document with each array difference replaced by the reference to the array, as `detach_arrays` does.
+    """Return a document in which each array difference is replaced by a reference to the whole array.
+
+    The references have the form that `detach_arrays` produces.
 
     `keep` is called with each array difference. Raises `ArrayError` if one is malformed.
     """
@@ -186,5 +188,5 @@ def _unsigned(spec: ArraySpec) -> np.dtype[Any]:
 
 
 def _integers(frames: NDArray[Any], spec: ArraySpec) -> NDArray[Any]:
-    """Return the (frames, columns) integers of decoded frames."""
+    """Return frames as unsigned integers (frames, columns), in the form in which differences are computed."""
     return to_integers(frames.reshape(len(frames), _columns(spec)))

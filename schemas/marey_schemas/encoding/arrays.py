@@ -35,7 +35,8 @@ __all__ = [
 LEAF_KEYS = frozenset({"dtype", "shape", "data"})
 MAX_ARRAY_BYTES = 1 << 28
 _MISREAD_BITS = 0x15AE43FD
-"""Bits of 7.038531e-26, the only float32 that changes if its shortest text is parsed as a double and then rounded."""
+"""Bits of 7.038531e-26, the only float32 that changes when a parser reads its shortest text as a double and rounds it.
+"""
 _ELEMENT_TYPES: dict[str, set[type]] = {"f": {int, float}, "i": {int}, "u": {int}, "b": {bool}}
 
 
@@ -89,7 +90,9 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
     """
     unknown = sorted(leaf.keys() - LEAF_KEYS - {"encoding"})
     if unknown:
-        raise ArrayError("bad-array", f"the description of an array has no key {unknown[0]!r}")
+        raise ArrayError(
+            "bad-array", f"an array has only the keys dtype, shape, data and encoding; remove the key {unknown[0]!r}"
+        )
     spec = ArraySpec.parse(leaf["dtype"], leaf["shape"])
     spec.require(max_bytes)
     data = leaf["data"]

@@ -14,7 +14,7 @@ MAX_ELEMENTS = 1 << 40  # keeps every product of sizes inside 64 bits, whatever 
 
 
 class ArrayError(ValueError):
-    """An array, or an array leaf, violates the limits or does not match its declaration."""
+    """An array, or its form in a document, exceeds a limit or does not match its declared dtype and shape."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(code, detail)

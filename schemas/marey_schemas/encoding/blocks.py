@@ -54,7 +54,7 @@ class _Layout:
         return -(-self.columns // self.group_columns)
 
     def of_frames(self, frames: int) -> "_Layout":
-        """Return the same layout for another number of frames."""
+        """Return this layout for an array with another number of frames."""
         return replace(self, spec=ArraySpec(self.spec.dtype, (frames, *self.spec.shape[1:])))
 
     def block(self, index: int) -> slice:
@@ -148,7 +148,7 @@ def changed_blocks(data: bytes, former: bytes) -> Iterator[slice]:
     """
     (layout, starts), (other, others) = _read_head(data), _read_head(former)
     if layout != other:
-        raise BlockError("arrays with different layouts cannot be compared block by block")
+        raise BlockError("the arrays have different layouts, so they cannot be compared block by block")
     for block in range(layout.blocks):
         first, end = block * layout.groups, (block + 1) * layout.groups
         if data[starts[first] : starts[end]] != former[others[first] : others[end]]:
@@ -193,7 +193,7 @@ def _packed(layout: _Layout, array: NDArray[Any], *, predict: bool) -> list[byte
 
 
 def _assembled(layout: _Layout, packed: list[bytes]) -> bytes:
-    """Return header, index and tiles as bytes."""
+    """Return an encoded array as bytes, from its header, the index of its tiles, and the tiles."""
     spec = layout.spec
     head = MAGIC + spec.dtype.encode("ascii")
     head += struct.pack(f"<B{len(spec.shape)}Q", len(spec.shape), *spec.shape)
@@ -245,7 +245,7 @@ def decode(
 
 
 def _read_head(data: bytes) -> tuple[_Layout, list[int]]:
-    """Return the layout of an encoded array, the start of each tile, and the end of the last one."""
+    """Return the layout of an encoded array, the byte at which each tile starts, and the end of the last tile."""
     if data[: len(MAGIC)] != MAGIC:
         raise BlockError("these bytes are not a block-encoded array")
     try:

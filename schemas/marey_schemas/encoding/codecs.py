@@ -29,7 +29,7 @@ MAX_LIST = 1 << 20
 MAX_VALUES = 1 << 21
 """Greatest number of values in a document that is decoded; the elements of arrays do not count."""
 FREE_LISTS = 1 << 17
-"""Number of objects and lists that a document of any size may contain; large documents may contain more."""
+"""Number of objects and lists that every document may contain; documents above a certain size may contain more."""
 BYTES_PER_LIST = 6
 """Least number of bytes per object or list in a document with more than `FREE_LISTS` objects and lists.
 
@@ -156,7 +156,7 @@ def _finite_array(value: NDArray[Any] | EncodedArray) -> NDArray[Any]:
 
 
 class _Count:
-    """Counter that refuses a document with too many objects, lists or members of objects while it is parsed."""
+    """Counter of objects and lists, which refuses a document with too many of them while it is parsed."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -330,7 +330,9 @@ class _Walk:
             self._copies_left -= len(value.raw)
             if self._copies_left < 0:
                 raise self._error(
-                    "too-deep", "the nested objects of a BSON document take too many bytes; use MessagePack"
+                    "too-deep",
+                    "the nested objects of the BSON document have too many bytes together, since each level is "
+                    "copied; use MessagePack",
                 )
         self._enter(len(value))
         keys = [self._key(key) for key in value]

@@ -11,11 +11,11 @@ class Hashed(Protocol):
     """SHA-256 of bytes, which may have been added piece by piece."""
 
     def hexdigest(self) -> str:
-        """Return the hexadecimal digits."""
+        """Return the hash as hexadecimal digits."""
 
 
 def digest_of(data: bytes | memoryview) -> str:
-    """Return the digest of bytes."""
+    """Return the digest of bytes, `sha256:` and 64 hexadecimal digits."""
     return digest_of_hash(hashlib.sha256(data))
 
 

@@ -37,13 +37,13 @@ def is_partial(value: Any) -> bool:
     return isinstance(value, Mapping) and value.keys() == _MEMBERS
 
 
-def partial_array(array: EncodedArray, base: str, pointer: str, held: Sequence[str]) -> dict[str, Any] | None:
-    """Return an array without the tiles whose digests are in `held`; None if no tile of the array is in the base.
+def partial_array(array: EncodedArray, base: str, pointer: str, base_digests: Sequence[str]) -> dict[str, Any] | None:
+    """Return an array without the tiles that its base has; None if the base has no tile of the array.
 
-    `base` and `pointer` name the base, as described above, and `held` lists the digests of the base's tiles.
+    `base` and `pointer` name the base, as described above, and `base_digests` lists the digests of its tiles.
     """
     tiles, spec = blocks.split(array.data), ArraySpec(array.dtype, array.shape)
-    places = {digest: number for number, digest in enumerate(held)}
+    places = {digest: number for number, digest in enumerate(base_digests)}
     numbers = [places.get(digest, _SENT) for digest in tile_digests(array)]
     if set(numbers) <= {_SENT} or blocks.join(spec, tiles) != array.data:
         return None
@@ -59,10 +59,10 @@ def partial_array(array: EncodedArray, base: str, pointer: str, held: Sequence[s
     }
 
 
-def completed(partial: Mapping[str, Any], held: Sequence[bytes]) -> NDArray[Any] | EncodedArray:
+def completed(partial: Mapping[str, Any], base_tiles: Sequence[bytes]) -> NDArray[Any] | EncodedArray:
     """Return the array that a partial array describes, checked as if it had been sent whole.
 
-    `held` contains the tiles of the base, as `blocks.split` returns them, because many partial arrays can share a base.
+    `base_tiles` contains the tiles of the base, as `blocks.split` returns them: many partial arrays can share a base.
     Raises `ArrayError` if the members of the partial array do not match each other or the base.
     """
     spec = ArraySpec.parse(partial["dtype"], partial["shape"])
@@ -70,7 +70,7 @@ def completed(partial: Mapping[str, Any], held: Sequence[bytes]) -> NDArray[Any]
     most_bytes = 2 * spec.nbytes + _MOST_OVERHEAD * count
     tiles, sizes = (_flat(partial, name, count).astype(np.int64) for name in ("tiles", "sizes"))
     sent = _flat(partial, "bytes", most_bytes)
-    if any(not _SENT <= number < len(held) for number in tiles.tolist()) or (sizes < 0).any():
+    if any(not _SENT <= number < len(base_tiles) for number in tiles.tolist()) or (sizes < 0).any():
         raise ArrayError("bad-array", "a partial array names a tile that its base does not have")
     if int(sizes.sum()) != len(sent) or len(sizes) != int((tiles == _SENT).sum()):
         raise ArrayError("bad-array", "the bytes of a partial array do not match the sizes of its tiles")
@@ -82,7 +82,7 @@ def completed(partial: Mapping[str, Any], held: Sequence[bytes]) -> NDArray[Any]
             joined.append(data[start:end])
             start = end
         else:
-            joined.append(held[number])
+            joined.append(base_tiles[number])
     if len(joined) != count or sum(map(len, joined)) > most_bytes:
         raise ArrayError("bad-array", f"the tiles of a partial array do not match its shape {list(spec.shape)}")
     leaf = {

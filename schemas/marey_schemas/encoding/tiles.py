@@ -67,7 +67,7 @@ def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns:
 
 
 def form_of(data: bytes) -> int:
-    """Return the form of a valid tile: `RAW`, `DIFFERENCES` or `QUATERNIONS`. Only the tile's start is decompressed."""
+    """Return the form of a valid tile, `RAW`, `DIFFERENCES` or `QUATERNIONS`, by decompressing only its start."""
     return zstandard.ZstdDecompressor().stream_reader(data).read(1)[0]
 
 
@@ -259,7 +259,7 @@ def _undo_prediction(body: _Sections, columns: int, frames: int) -> Integers:
 
 
 def _rows(chosen: NDArray[Any], columns: int, lead: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of the predicted channels and of all others, in order."""
+    """Return the indices of the channels that are predicted, and the indices of all other channels, each in order."""
     predicted = lead + 4 * np.arange(len(chosen)) + chosen
     return predicted.astype(np.intp), np.delete(np.arange(columns), predicted)
 

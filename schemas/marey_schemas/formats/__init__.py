@@ -46,7 +46,7 @@ UNITS_M = {
 
 @dataclass(frozen=True, slots=True)
 class FileFormat:
-    """Row of the table of file formats.
+    """A file format: what can be read and written in it, and how its files are recognised.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class FileFormat:
     unread: str = ""
 
     def names(self, file: str) -> bool:
-        """Return whether a file name has one of the endings of the format."""
+        """Return whether a file name has one of the endings of the format, in any case."""
         return file.lower().endswith(self.endings + self.other_endings)
 
 

@@ -20,7 +20,7 @@ _PREDECESSOR = format_named("predecessor")
 _ENDINGS = sorted((*_PREDECESSOR.endings, *_PREDECESSOR.other_endings), key=len, reverse=True)
 _MODEL_ENDINGS = ("_quaternion_mm", "_mm")
 TREE_ENDINGS = ("_quaternion_cluster_tree", "_cluster_tree", "_tree")
-"""Endings of the stems of trees, after the name of the model."""
+"""Endings that the names of files with trees have after the name of the model, without the file ending."""
 _NOTES_ENDINGS = ("_sections", "_annotations", "_annotation", "_alignment")
 _SKELETON = "skeleton"
 _SKELETON_MODEL = "skeleton_model"
@@ -50,7 +50,7 @@ class Pairing:
 
 
 _Files = Sequence[tuple[str, str]]
-"""Names of files in one folder, each with the path as given."""
+"""Files of one folder, each as a pair of the name of the file and its path as given."""
 
 
 def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
@@ -174,7 +174,7 @@ def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
 
 
 def _maps(stem: str) -> bool:
-    """Return whether a file with this stem has the name of a skeleton model."""
+    """Return whether a file with this stem (its name without ending) is named like a skeleton model."""
     return stem.lower().endswith(_SKELETON_MODEL)
 
 

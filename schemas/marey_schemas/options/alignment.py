@@ -1,4 +1,4 @@
-"""Options of alignment: the cost of a pair of poses, and the path through the costs."""
+"""Options of alignment by dynamic time warping: the cost of a pair of poses, and the path through the costs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,10 @@ class CostOptions(Options):
     @classmethod
     def _check_window(cls, window: int) -> int:
         if window % 2 == 0:
-            raise ValueError("must be odd, so that the window has as many frames before its middle frame as after it")
+            raise ValueError(
+                "the number of frames must be odd, so that the window has as many frames before its middle frame as "
+                "after it"
+            )
         return window
 
 
@@ -64,8 +67,8 @@ class AlignOptions(CostOptions):
         3,
         ge=0,
         le=60,
-        description="Greatest number of consecutive steps of the path that advance only one of the two clips. With "
-        "the limit n, a frame is matched with at most n + 1 frames. null: no limit.",
+        description="Greatest number of consecutive steps of the alignment path that advance only one of the two "
+        "clips. With the limit n, a frame is matched with at most n + 1 frames. null: no limit.",
     )
     weights: dict[JointName, _Weight] = Field(
         default_factory=dict,

@@ -15,7 +15,7 @@ Degrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 
 
 OUT_OF_REST = 0.25
-"""Distance of a hand from its rest position, as a share of its farthest distance, above which the hand is reaching."""
+"""Share of the farthest distance of a hand from its rest position above which the hand is reaching."""
 
 
 class ContactOptions(Options):
@@ -95,10 +95,18 @@ class VelocityMinimaProposal(_Proposal):
         (), max_length=256, description="Joints whose mean speed is used, by their own or their standard names."
     )
     smoothing_s: float = Field(
-        0.05, gt=0, le=10, allow_inf_nan=False, description="Standard deviation of the smoothing, in seconds."
+        0.05,
+        gt=0,
+        le=10,
+        allow_inf_nan=False,
+        description="Standard deviation of the Gaussian that smooths the speed, in seconds.",
     )
     least_depth: float = Field(
-        0.1, gt=0, le=1, allow_inf_nan=False, description="Least depth of a minimum, as a share of the highest speed."
+        0.1,
+        gt=0,
+        le=1,
+        allow_inf_nan=False,
+        description="Least depth of a minimum of the speed, as a share of the highest speed in the clip.",
     )
     least_apart_s: float = Field(
         0.2, gt=0, le=3600, allow_inf_nan=False, description="Least time between two minima, in seconds."
@@ -112,17 +120,21 @@ class WristContactProposal(_Proposal):
         "wrist_contact", description="Name of the method that proposes segments and keyframes."
     )
     hand: Literal["left", "right", "either"] = Field(
-        "either", description="Hand that reaches; either: the hand that reaches farther."
+        "either", description="Hand whose reaches are found; either: the hand that reaches farther."
     )
     least_reach_m: float = Field(
-        0.2, gt=0, le=10, allow_inf_nan=False, description="Least distance of a reach, in metres."
+        0.2,
+        gt=0,
+        le=10,
+        allow_inf_nan=False,
+        description="Least distance from the rest position, in metres, that the hand must reach.",
     )
     arrived: float = Field(
         0.95,
         gt=OUT_OF_REST,
         le=1,
         allow_inf_nan=False,
-        description="Share of the farthest distance from rest at which a hand has arrived.",
+        description="Share of its farthest distance from the rest position at which a hand has arrived.",
     )
     release: bool = Field(
         False,

@@ -12,7 +12,7 @@ from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 from marey_schemas.options.verdict import VerdictLimits
 
 Family = Literal["circle", "switching", "stopping", "corners", "eights", "strafing", "takes"]
-"""Kinds of trials, by the path and the speeds that they ask for."""
+"""Families (kinds) of trials, which differ in the path and the speeds that the character has to follow."""
 Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
 Angle = Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
@@ -59,7 +59,7 @@ _IMPOSSIBLE: dict[Family, tuple[str, ...]] = {
     "strafing": ("open_loop",),  # nor a direction that differs from the heading
     "takes": ("path", "open_loop"),  # a real path can contain stops and side steps
 }
-"""Follow modes in which the trials of a family cannot be followed."""
+"""Values of the option `follow` with which the trials of a family are not possible."""
 
 
 class EvaluationOptions(Grid):
@@ -79,8 +79,9 @@ class EvaluationOptions(Grid):
         20,
         ge=1,
         le=500,
-        description="Greatest number of `takes` trials. Clips are chosen evenly from those that last at least 4 s and "
-        "move at least 2 m. Long clips are asked for up to `duration_s`.",
+        description="Greatest number of `takes` trials. Their clips are chosen evenly from those that last at "
+        "least 4 s and move at least 2 m. Of a long clip, the character follows at most `duration_s` "
+        "seconds.",
     )
     corner_angles_deg: tuple[Angle, ...] = Field(
         (-90.0, 90.0, 180.0),
@@ -123,24 +124,30 @@ class EvaluationOptions(Grid):
         ge=1,
         le=64,
         description="Number of replicates of each trial. The first one is the trial itself; each further one has "
-        "another phase of the stride at the start, and an approach that is up to one second longer. Results are means "
-        "with 95 % intervals. 1: only the trial itself, as published, without intervals.",
+        "another phase of the stride at the start, and an approach that is up to one second longer. "
+        "Results are means with 95 % intervals. 1: only the trial itself, as in the published "
+        "method, without intervals.",
     )
     seed: int = Field(
         0, ge=0, lt=2**63, description="Seed of the random differences between the replicates of a trial."
     )
     window: Literal["circle", "all"] = Field(
-        "circle", description="Part of a trial that is measured. circle: the circle only; all: also the approach."
+        "circle",
+        description="Part of a trial that is measured. circle: the course after the approach; all: "
+        "also the approach (the straight path before it).",
     )
     coverage_least_s: float = Field(
         COVERAGE_LEAST_S,
         gt=0,
         le=3600,
         allow_inf_nan=False,
-        description="Seconds of data that a cell of speed and turn rate needs to count as covered.",
+        description="Seconds of data that a cell of the coverage map (a speed and a turn rate) needs to count as "
+        "covered.",
     )
     literal_formulas: bool = Field(
-        False, description="Also compute the measures by the published formulas, taken literally."
+        False,
+        description="Also compute errors by the formulas exactly as the paper prints them, to compare "
+        "results with those of the paper.",
     )
     database: DatabaseOptions = Field(
         DatabaseOptions(), description="Options of the database that is built from the clips."
@@ -161,7 +168,8 @@ class EvaluationOptions(Grid):
         return self
 
     def courses_deg(self, family: Family) -> tuple[float, ...]:
-        """Return what the trials of a family vary beside their speed: turn rates (degrees/s) or angles (degrees).
+        """Return the values that trials of a family combine with each speed: turn rates (degrees/s) or angles
+        (degrees).
 
         Trials along takes depend on the clips, so they are not listed.
         """

@@ -13,7 +13,7 @@ from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_FORMATS, 
 class MotionFileOptions(Options):
     """Format of written motion files, with options that depend on the format."""
 
-    format: ExportFormat = Field(DEFAULT_FORMAT, description="Format of the files.")
+    format: ExportFormat = Field(DEFAULT_FORMAT, description="Format of the written files.")
     unit: WrittenUnit = Field(
         DEFAULT_UNIT, description="Unit of length of the files, for formats without a fixed unit."
     )

@@ -39,7 +39,10 @@ class ImportOptions(Options):
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."
     )
     unit_scale_m: float | None = Field(
-        None, gt=1e-6, lt=1e3, description="Metres per unit of length, for units without a name."
+        None,
+        gt=1e-6,
+        lt=1e3,
+        description="Metres per unit of length, for units without a name; an alternative to `unit`. Absent: inferred.",
     )
     up_axis: UpAxis | None = Field(None, description="Axis that points up in the files. Absent: inferred.")
     handedness: Handedness = Field(
@@ -58,9 +61,10 @@ class ImportOptions(Options):
     )
     end_index: EndIndex | None = Field(
         None,
-        description="Whether a section of an annotation in a file of Marey's predecessor includes its frame `end_idx`, "
-        "as in the predecessor's editor, or ends before this frame, as in its time warping. Absent: exclusive if "
-        "sections would overlap otherwise, else inclusive.",
+        description="Meaning of `end_idx`, the last index of a section in annotation files of Marey's "
+        "predecessor. inclusive: the section includes this frame, as in the predecessor's editor; "
+        "exclusive: it ends before this frame, as in the predecessor's time warping. Absent: "
+        "exclusive if sections would overlap otherwise, else inclusive.",
     )
     replace_skeleton: bool = Field(
         False,
@@ -69,7 +73,7 @@ class ImportOptions(Options):
     )
     trim_rest_pose: bool = Field(False, description="Remove rest poses at the beginning and at the end of each clip.")
     tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS, description="Tags that every clip gets.")
-    subject: str | None = Field(None, max_length=255, description="The performer.")
+    subject: str | None = Field(None, max_length=255, description="Performer, under a pseudonym.")
     licence: str | None = Field(None, max_length=255, description="Licence of the data.")
     capture_system: str | None = Field(None, max_length=255, description="The device or system that recorded the data.")
 

@@ -16,7 +16,9 @@ _Factor = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 class ObjectiveOptions(Options):
     """Weights of the objective, which is the cost of a set of clips in metres; a smaller cost is better."""
 
-    offset: _Price = Field(1.0, description="Weight of the mean distance between the character and its reference.")
+    offset: _Price = Field(
+        1.0, description="Weight of the mean distance between the character and the path that it follows."
+    )
     abs_se_v: _Price = Field(0.5, description="Metres that a speed error of 1 m/s adds to the objective.")
     abs_se_omega_deg: _Price = Field(
         0.005, description="Metres that a turn rate error of 1 degree/s adds to the objective."
@@ -24,13 +26,13 @@ class ObjectiveOptions(Options):
     pose_cost: _Price = Field(0.5, description="Metres that a pose cost of 1 m adds to the objective.")
     seconds: _Price = Field(
         0.0001,
-        description="Metres that each second of data adds to the objective. A clip is removed if it lowers the other "
-        "terms by less than its duration adds.",
+        description="Metres that each second of data adds to the objective. A clip is worth removing if it "
+        "lowers the other terms by less than its duration adds.",
     )
 
 
 class ObjectiveChoice(Options):
-    """Objective that a computation minimises."""
+    """Base of options with the objective that suggestions, optimisations and sweeps minimise."""
 
     objective: ObjectiveOptions = Field(
         ObjectiveOptions(), description="Weights of the objective: the cost of a set of clips."
@@ -70,20 +72,21 @@ class ConfirmedEffects(ObjectiveChoice):
     def _check_confirmations(cls, count: int) -> int:
         if 0 < count < LEAST_REPLICATES:
             raise ValueError(
-                f"{count} replicates have no interval; choose at least {LEAST_REPLICATES}, or 0 to leave effects "
-                "unconfirmed"
+                f"{count} replicates are too few for an interval; choose at least {LEAST_REPLICATES}, or 0 to "
+                "leave effects unconfirmed"
             )
         return count
 
 
 class SuggestionOptions(ConfirmedEffects):
-    """Options that select the suggestions to compute."""
+    """Options of `suggest`: how many suggestions are computed, and when clips count as duplicates."""
 
     removals: int = Field(
         10,
         ge=0,
         le=1000,
-        description="Number of clips whose removal is planned, in addition to the unused clips; 0: none.",
+        description="Greatest number of removals to plan, in addition to the clips that no trial uses. Each step "
+        "removes the clip whose removal harms least per second of data. 0: none.",
     )
     simulated_additions: int = Field(
         3,
@@ -124,13 +127,13 @@ class SuggestionOptions(ConfirmedEffects):
     )
     lost_pose: _Price = Field(
         0.01,
-        description="With a metric: weight of lost poses in the harm of a removal, in metres per second of these "
-        "poses. A pose is lost if it looks like no pose of the remaining clips.",
+        description="With a metric: metres that each second of lost poses adds to the harm of a removal. A pose "
+        "is lost if it looks like no pose of the remaining clips.",
     )
 
 
 class OptimisationOptions(ConfirmedEffects):
-    """Limits of an optimisation."""
+    """Limits of an optimisation of a set of clips: gain, steps, tries, and duration."""
 
     least_gain: float = Field(
         0.0,

@@ -17,14 +17,14 @@ Selection = Literal["features", "pose_distance"]
 Follow = Literal["time", "path", "open_loop"]
 
 TICK_RATE_HZ = 60.0
-"""Default rate of features and simulation in Hz."""
+"""Default rate of the features and of the simulation, in hertz."""
 
 _Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 _OF_GROUP = "Weight of the {} in the cost of a match; 0 leaves it out."
 
 
 class FeatureWeights(Options):
-    """Weights of the groups of features in the cost of a match; the fields have the order of the features."""
+    """Weights of the groups of features in the cost of a match, in the order of the features in the database."""
 
     left_foot_position: _Weight = Field(0.75, description=_OF_GROUP.format("position of the left foot"))
     right_foot_position: _Weight = Field(0.75, description=_OF_GROUP.format("position of the right foot"))
@@ -48,9 +48,9 @@ class DatabaseOptions(Options):
     )
     end_policy: EndPolicy = Field(
         "clamp",
-        description="Trajectory features near a clip's end. clamp: the last frame is repeated, and the last "
-        "1/3 s is not selected; trim: the last second is not selected; loop: the clip's "
-        "beginning follows, for clips marked as loops.",
+        description="Handling of the end of a clip, where its future trajectory is unknown. clamp: the last "
+        "frame is repeated, and the last 1/3 s is not selected; trim: the last second is not "
+        "selected; loop: the beginning of the clip follows, for clips marked as loops.",
     )
     root_mode: RootMode = Field(
         "simulated",
@@ -85,7 +85,7 @@ class DatabaseOptions(Options):
     @classmethod
     def _check_order(cls, horizons_s: tuple[float, ...]) -> tuple[float, ...]:
         if any(after <= before for before, after in pairwise(horizons_s)):
-            raise ValueError("the values must be in increasing order")
+            raise ValueError("the times must be in increasing order")
         return horizons_s
 
     @field_validator("extra_joints")
@@ -101,8 +101,8 @@ class DatabaseOptions(Options):
         ticks = [0, *(round(horizon_s * self.rate_hz) for horizon_s in self.horizons_s)]
         if any(after <= before for before, after in pairwise(ticks)):
             raise ValueError(
-                f"horizons_s: the first must be at least one frame (1/{self.rate_hz:g} s), and so must the "
-                "distances between them"
+                "horizons_s: the first time, and the distances between successive times, must be at least one "
+                f"frame (1/{self.rate_hz:g} s)"
             )
         return self
 
@@ -112,10 +112,13 @@ class ControllerOptions(Options):
 
     follow: Follow = Field(
         "time",
-        description="Desired trajectory of the character. time: the reference at the same time; path: the reference, "
-        "beginning at the point nearest to the character; open_loop: only the speed and turn rate of the reference.",
+        description="Trajectory that each search asks for, from the reference (the trajectory to follow). time: "
+        "where the reference is at the same time; path: the reference from the point nearest to the "
+        "character; open_loop: only the speed and turn rate of the reference.",
     )
-    search_every_s: float = Field(0.1, gt=0, le=2, allow_inf_nan=False, description="Seconds between two searches.")
+    search_every_s: float = Field(
+        0.1, gt=0, le=2, allow_inf_nan=False, description="Seconds from one search of the database to the next."
+    )
     continuing_bias: float = Field(
         0.0,
         ge=-1000,
@@ -143,7 +146,8 @@ class ControllerOptions(Options):
         gt=0,
         le=5,
         allow_inf_nan=False,
-        description="Half-life in seconds of the offset from the old motion after a switch.",
+        description="Half-life, in seconds, with which the difference between the old and the new motion decays "
+        "after a switch.",
     )
     root_inertialisation: bool = Field(
         True, description="Whether the blend after a switch also includes the root's velocity."
@@ -158,13 +162,15 @@ class ControllerOptions(Options):
         ge=0,
         le=1,
         allow_inf_nan=False,
-        description="Rate, per second, at which the character is pulled to the reference: within a second, the "
-        "distance shrinks by the factor exp(-rate). This hides tracking errors.",
+        description="Rate, per second, at which the character is pulled to the trajectory that it follows: "
+        "within a second, the distance shrinks by the factor exp(-rate). This hides tracking errors. "
+        "0: it is not pulled.",
     )
     root_clamp_m: float | None = Field(
         None,
         gt=0,
         le=100,
         allow_inf_nan=False,
-        description="Greatest distance of the character from the reference, in metres; this hides tracking errors.",
+        description="Greatest distance of the character from the trajectory that it follows, in metres; this "
+        "hides tracking errors. Absent: no limit.",
     )

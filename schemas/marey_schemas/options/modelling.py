@@ -86,7 +86,11 @@ class ModelOptions(MixtureOptions):
     )
     spatial_share: _Share = Field(0.95, description="Share of the variance that the spatial components explain.")
     spatial_components: int | None = Field(
-        None, ge=0, le=1000, description="Exact number of spatial components, instead of the share."
+        None,
+        ge=0,
+        le=1000,
+        description="Exact number of spatial components, instead of the share of the "
+        "variance; absent: the share determines it.",
     )
     spatial_coefficients: int | None = Field(
         None,

@@ -12,12 +12,12 @@ from marey_schemas.documents.metrics import BuiltInMetric
 DEFAULT_METRIC: BuiltInMetric = "published/positions-sigmoid"
 """Metric of a comparison if none is chosen: the one that agrees best with the published judgements.
 
-The paper prints no shares by which angles, positions and velocities could be combined.
+Pražák et al. (2009) print no shares by which angles, positions and velocities could be combined.
 """
 
 
 class MetricChoice(Options):
-    """Choice of a metric that needs no item; the input `metric` of a job gives a stored metric instead."""
+    """Choice of a built-in perceptual metric; a job with a stored metric gets it as the input `metric` instead."""
 
     metric: BuiltInMetric | None = Field(
         None,
@@ -27,7 +27,7 @@ class MetricChoice(Options):
 
 
 class DistanceOptions(Options):
-    """Options of distances between clips."""
+    """Options of perceptual distances between clips."""
 
     cycles: Literal["cut", "whole"] = Field(
         "cut",

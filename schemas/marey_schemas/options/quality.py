@@ -33,26 +33,35 @@ class QualityOptions(Options):
     )
     floor: Literal["planted", "zero"] = Field(
         "planted",
-        description="Reference from which the heights of feet are measured. planted: the height of the joint while "
-        "the foot stands on the floor, which is the 5th percentile of the heights of the joint in the clip; "
-        "zero: height 0, as published. Penetration is always measured from height 0.",
+        description="Reference from which the heights of feet are measured. planted: the height of the joint "
+        "while the foot stands on the floor, which is the 5th percentile of the heights of the joint "
+        "in the clip; zero: height 0, as in the publications of the measures. Penetration is always "
+        "measured from height 0.",
     )
     weighted_height_m: _Height = Field(
-        0.025, description="Height in metres at which the weight of the weighted foot skate has fallen to 0."
+        0.025,
+        description="Height in metres from which the speed of a toe does not count in the measure "
+        "`skate_weighted_m_s`; below, its weight grows from 0 to 1 at the floor.",
     )
     near_height_m: _Height = Field(
-        0.05, description="Height in metres below which a toe counts as near the floor, for foot skate by height."
+        0.05,
+        description="Height in metres below which a toe counts as near the floor, in the measures "
+        "`skate_height_m_s` and `skate_ratio`.",
     )
     skate_speed_m_s: _Speed = Field(
-        0.2, description="Speed in metres per second above which a toe near the floor counts as skating, for the ratio."
+        0.2,
+        description="Speed in metres per second above which a toe near the floor counts as skating, in the "
+        "measure `skate_ratio`.",
     )
     contact_height_m: _Height = Field(
-        0.1, description="Height in metres below which a slow joint counts as touching the floor, for the consistency."
+        0.1,
+        description="Height in metres below which a slow joint counts as touching the floor, in the measure "
+        "`contact_consistency`.",
     )
     contact_speed_m_s: _Speed = Field(
         TOE_SPEED_M_S,
-        description="Speed in metres per second below which a low joint counts as touching the floor, for the "
-        "consistency.",
+        description="Speed in metres per second below which a low joint counts as touching the floor, in the "
+        "measure `contact_consistency`.",
     )
     knee_least_deg: _Bend = Field(-10.0, description="Least bend of a knee in degrees; negative: bent forwards.")
     knee_most_deg: _Bend = Field(135.0, description="Greatest bend of a knee in degrees.")

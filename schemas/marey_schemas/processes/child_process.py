@@ -31,7 +31,7 @@ WAIT_EVERY_S = 0.005
 """Seconds between two checks whether the child process has ended, while the parent waits for its end."""
 MOST_MESSAGE_BYTES = 1 << 30
 ONE_DESCRIPTOR = b"\x01"
-"""Message that announces one passed descriptor, in the form that `multiprocessing.reduction.recv_handle` expects."""
+"""Message that accompanies a file descriptor sent to a child, as `multiprocessing.reduction.recv_handle` expects it."""
 
 
 class ChildBroken(Exception):
@@ -43,7 +43,7 @@ class ChildBroken(Exception):
 
 
 class BadMessage(Exception):
-    """Bytes that are not a message."""
+    """The received bytes are not a valid message."""
 
 
 class ConnectedChild(ABC):

@@ -43,16 +43,16 @@ On systems other than Linux, the libraries may have started threads by then.
 """
 FORK = b"fork"
 STARTED = 1 << 16
-"""Value in place of the exit status of a child that has been started; exit statuses are smaller."""
+"""Value that is sent instead of an exit status when a child has been started; exit statuses are smaller."""
 LOST = 1 << 17
-"""Value in place of the exit status of a child whose fork server has ended."""
+"""Value that is used as the exit status of a child whose fork server has ended."""
 THREADS_END_S = 2.0
 """Longest wait in seconds for the end of the threads that a fork server uses while it loads modules.
 
 `Thread.join` returns a moment before the system has removed the thread.
 """
 NO_CHILD = -1
-"""Value in place of the process id of a child that could not be started."""
+"""Value that is sent instead of a process id if a child could not be started."""
 _NUMBER, _NUMBER_AND_STATUS = struct.Struct("<q"), struct.Struct("<qq")
 
 
@@ -87,7 +87,7 @@ class ForkServer:
 
     @property
     def alive(self) -> bool:
-        """Whether children can be forked."""
+        """Whether the fork server runs, so that children can be forked."""
         return not self._ended and self._process is not None and self._process.alive
 
     def fork(self) -> ForkedChild:
@@ -115,7 +115,7 @@ class ForkServer:
         return child
 
     def status_of(self, pid: int, timeout_s: float | None = None) -> int | None:
-        """Return the exit status of a child, or None if it still runs after `timeout_s`; without a timeout, wait on."""
+        """Return the exit status of a child; None if the child still runs after `timeout_s` (None: without limit)."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or pid in self._statuses, timeout_s)
             return self._statuses.get(pid, LOST if self._ended else None)
@@ -296,7 +296,7 @@ def _carry_out(
 def _run_child(
     serve: Callable[[Connection], None], connected: socket.socket, others: Sequence[Connection | socket.socket]
 ) -> None:
-    """Run the forked child; does not return."""
+    """Run `serve` in the forked child, then end the process; never returns."""
     status = 1
     try:
         signal.set_wakeup_fd(-1)

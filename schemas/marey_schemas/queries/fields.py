@@ -68,5 +68,5 @@ def find_field(name: str) -> QueryField | None:
 
 
 def field_names() -> list[str]:
-    """Return the names of all fields and facets."""
+    """Return the names of all fields and of all declared facets (published numbers) that queries can use."""
     return [*FIELDS, *(f"{FACET_PREFIX}{name}" for name in declared_facets())]

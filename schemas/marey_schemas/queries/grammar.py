@@ -110,7 +110,7 @@ class Negation:
 
 @dataclass(frozen=True, slots=True)
 class Junction:
-    """Queries joined by one word: with `and`, all must be true; with `or`, at least one."""
+    """Queries joined by `and` or by `or`: with `and`, all of them must be true; with `or`, at least one."""
 
     word: Literal["and", "or"]
     queries: tuple[Query, ...]
@@ -142,10 +142,14 @@ def parse(text: str) -> Query:
     conditions = list(conditions_of(query))
     if len(conditions) > MOST_CONDITIONS or sum(len(one.values) for one in conditions) > MOST_COMPARED_VALUES:
         raise QueryError(
-            f"at most {MOST_CONDITIONS} conditions with {MOST_COMPARED_VALUES} values together are accepted", 1
+            f"the query is too long: it may have at most {MOST_CONDITIONS} conditions, with "
+            f"{MOST_COMPARED_VALUES} values in total",
+            1,
         )
     if len(alike := list(likenesses_of(query))) > MOST_LIKENESSES:
-        raise QueryError(f"at most {MOST_LIKENESSES} conditions like(...) are accepted", alike[-1].column)
+        raise QueryError(
+            f"a query may have at most {MOST_LIKENESSES} conditions like(...); remove the others", alike[-1].column
+        )
     return query
 
 
@@ -216,7 +220,7 @@ def _require_shallow(text: str) -> None:
         if depth > DEEPEST:
             raise QueryError(f"more than {DEEPEST} brackets are open; use fewer nested brackets", column)
     if len([word for word in text.lower().split() if word == "not"]) > MOST_CONDITIONS:
-        raise QueryError(f"at most {MOST_CONDITIONS} negations are accepted", 1)
+        raise QueryError(f"a query may have at most {MOST_CONDITIONS} negations; remove the others", 1)
 
 
 _QUOTE = "put values with spaces or special characters between quotation marks"
@@ -299,7 +303,10 @@ def _likeness(tree: Any, source: str) -> Likeness:
         raise QueryError("the distance must not be negative", _column(limit))
     named = _text(metric[0]) if metric else None
     if named == "":
-        raise QueryError("name a metric, or leave it out for the default one", _column(metric[0]))
+        raise QueryError(
+            "the name of the metric is empty; name a metric, or leave it out to use the default metric",
+            _column(metric[0]),
+        )
     return Likeness(parsed, named, distance, operator == "<", source, int(tree.meta.start_pos) + 1)
 
 

@@ -48,7 +48,7 @@ def matches(query: Query, facts: QueriedFacts) -> bool:
             return _number(facts.facets.get(query.field.removeprefix(FACET_PREFIX)), query)
         return _COMPARISONS[query.field](facts, query)
     if isinstance(query, Likeness):
-        raise ValueError("motions are compared by an index, not by facts")
+        raise ValueError("a condition like(...) cannot be evaluated on facts, because it needs an index of motions")
     if isinstance(query, Negation):
         return not matches(query.query, facts)
     join = all if query.word == "and" else any

@@ -38,8 +38,8 @@ class OutputsCommit(Request):
     message: Message = Field("", description="Message of the commit; empty: the kind and the id of the job.")
     replace: bool = Field(
         False,
-        description="Also remove earlier entries of the folder that the job did not produce this time. Only entries "
-        "of the kinds that the job makes are removed.",
+        description="Also remove entries of the folder that are not among the outputs of this job, for example "
+        "results of an earlier job. Only entries of the kinds that the job makes are removed.",
     )
 
     @classmethod
@@ -58,16 +58,19 @@ class OutputsCommit(Request):
 
 
 class CommitOptions(Options):
-    """Options of commands that submit jobs: the commit of the outputs."""
+    """Options of commands that submit jobs, for the commit of the results to a branch of a dataset."""
 
     commit_to: str | None = Field(
-        None, description="Commit the results to a branch when the job ends: dataset[@branch][/folder]."
+        None,
+        description="Commit the results to a branch when the job ends: dataset[@branch][/folder]. Absent: "
+        "no commit is made.",
     )
     commit_message: str | None = Field(
         None, description="Message of the commit; absent: the kind and the id of the job."
     )
     commit_replace: bool = Field(
-        False, description="In the same commit, remove entries of the folder that the job did not produce this time."
+        False,
+        description="In the same commit, remove entries of the folder that are not among the results of this job.",
     )
 
     def commit(self) -> OutputsCommit | None:
@@ -92,7 +95,7 @@ class CommitConflict(Answer):
 
 
 class JobCommit(Answer):
-    """Commit that a job makes of its outputs."""
+    """Commit of the outputs of a job to a branch: the plan until the job ends, then the result."""
 
     dataset: str
     branch: str
@@ -100,8 +103,8 @@ class JobCommit(Answer):
     message: str
     replace: bool
     base: str | None = Field(
-        description="Newest commit of the branch at the time when the inputs of the job were fixed. Later changes by "
-        "others are not overwritten."
+        description="Newest commit of the branch at the time when the inputs of the job were fixed. Later "
+        "changes by others are not overwritten. Null: the branch had no commit."
     )
     digest: str | None = Field(
         None, description="Commit that has the outputs; null before the end of the job, and if no entry changed."

@@ -1,4 +1,4 @@
-"""Comparisons of runs: a table of their settings and logged fields, replicates with intervals, curves over steps."""
+"""Comparisons of runs of a script: tables of settings and fields, replicates with intervals, curves over steps."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from marey_schemas.sizes import KIB
 MOST_COMPARED = 100
 """Greatest number of runs in a comparison."""
 MOST_CURVES = 20
-"""Greatest number of fields whose curves the result of a run keeps, in the order in which the fields appear."""
+"""Greatest number of fields whose curves the result of a run contains: the first fields that the script logs."""
 MOST_POINTS = 256
-"""Greatest number of points of a curve; longer curves are thinned."""
+"""Greatest number of points of a stored curve; of longer curves, only some points are stored."""
 MOST_CURVE_BYTES = 512 * KIB
-"""Greatest size of the file with the curves of a run."""
+"""Greatest size in bytes of the file with the curves of a run."""
 LAST_STEP = 2**53
-"""Greatest step. Programs that read JSON numbers as double-precision floats represent integers up to this exactly."""
+"""Greatest number of a step. Programs that read JSON numbers as double-precision floats read it exactly."""
 MOST_DRAWN = 6
 """Greatest number of fields whose curves a comparison contains."""
 
@@ -57,7 +57,7 @@ class Curve(Answer):
 
 
 class Curves(Answer):
-    """Curves of a run by field."""
+    """Curves (values over steps) of a run, by the name of the logged field."""
 
     curves: dict[Annotated[str, StringConstraints(max_length=LONGEST_NAME)], Curve] = Field(max_length=MOST_CURVES)
 
@@ -77,7 +77,7 @@ class ComparedColumn(Answer):
 
 
 class ComparedRun(Answer):
-    """Run in a comparison."""
+    """Run of a script in a comparison, with its parameters and the fields that it logged."""
 
     job: str
     commit: str
@@ -97,7 +97,7 @@ class ComparedRun(Answer):
     curves: dict[str, Curve] = Field({}, description="Curves of the requested fields.")
 
     def cell(self, column: ComparedColumn) -> Value | None:
-        """Return the value in a column; None if the run has none."""
+        """Return the value of this run in a column; None if the run has no value there."""
         if column.of == "commit":
             return self.commit
         if column.of == "input":
@@ -121,20 +121,24 @@ class FieldSummary(Answer):
 class ComparedSetting(Answer):
     """Runs with the same command, inputs and parameters, which differ only by their seeds."""
 
-    runs: tuple[int, ...] = Field(description="Indices in `runs` of the counted runs.")
+    runs: tuple[int, ...] = Field(
+        description="Indices in `runs` of the counted runs: of the newest run with each seed."
+    )
     repeats: int = Field(description="Number of further runs, which have the same seed as a counted run.")
-    fields: dict[str, FieldSummary] = Field(description="Summary of each numeric field that a counted run logged.")
+    fields: dict[str, FieldSummary] = Field(
+        description="Mean and interval of each numeric field over the counted runs, by the name of the field."
+    )
 
 
 class RunComparison(Answer):
-    """Comparison of the succeeded runs of a script."""
+    """Comparison of the succeeded runs of a script: columns, runs, and settings with means over replicates."""
 
     subject: str = Field(description="Name of the script.")
     columns: tuple[ComparedColumn, ...]
     runs: tuple[ComparedRun, ...] = Field(description="Runs in the requested order.")
     settings: tuple[ComparedSetting, ...] = Field(description="Settings in the order of their first runs.")
     curves: tuple[str, ...] = Field((), description="Fields whose curves the runs contain.")
-    complete: bool = Field(description="Whether `runs` contains all succeeded runs.")
+    complete: bool = Field(description="Whether `runs` contains all succeeded runs of the script.")
 
     def titles(self, columns: Sequence[ComparedColumn]) -> tuple[str, ...]:
         """Return the titles of columns: their names, or names such as `value.path` if several columns have one name."""

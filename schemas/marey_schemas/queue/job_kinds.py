@@ -215,7 +215,7 @@ TREE = KindDeclaration(
 
 
 def _reads_answers(_params: Mapping[str, Any]) -> bool:
-    """Return True: the job reads answers of participants while it runs, and these may change between two jobs."""
+    """Return True, because the job reads answers of participants while it runs, which may change between two jobs."""
     return True
 
 
@@ -241,7 +241,7 @@ INDEX = KindDeclaration(
     version=1,
     inputs={
         "clips": InputSpec(
-            kind=Kind.CLIP, many=True, parts=("motion",), description="The clips that the index shall contain."
+            kind=Kind.CLIP, many=True, parts=("motion",), description="The clips that the index will contain."
         ),
         "index": InputSpec(
             kind=Kind.INDEX,
@@ -268,7 +268,7 @@ RUN_SCRIPT = KindDeclaration(
 
 
 def script_kind(declared: ScriptDeclaration) -> KindDeclaration:
-    """Return the kind `script` with the inputs of one script."""
+    """Return the job kind `script` with the inputs that a script declares."""
     return replace(RUN_SCRIPT, inputs=declared.input_specs())
 
 
@@ -305,8 +305,8 @@ def job_kinds() -> Mapping[str, KindDeclaration]:
             raise TypeError(f"the entry point {entry.value} in the group {ENTRY_POINT_GROUP} must be a KindDeclaration")
         if kind.name in kinds:
             raise ValueError(
-                f"the entry point {entry.value} declares the job kind {kind.name!r}, but another job kind has this "
-                "name already"
+                f"the entry point {entry.value} declares the job kind {kind.name!r}, but another job kind has "
+                "this name already; rename one of them"
             )
         kinds[kind.name] = kind
     return MappingProxyType(kinds)

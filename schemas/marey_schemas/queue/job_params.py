@@ -44,11 +44,13 @@ class TaggedResults(Request):
 class SuffixedResults(TaggedResults):
     """Base of parameters with a suffix for the names of the results, and tags."""
 
-    suffix: NameSuffix = Field("", description="Text that is appended to the names of the results.")
+    suffix: NameSuffix = Field(
+        "", description="Text that is appended to the name of each input to form the name of its result."
+    )
 
 
 class AlignParams(AlignOptions, MetricChoice, SuffixedResults):
-    """Parameters of jobs of the kind `align`."""
+    """Parameters of jobs of the kind `align`, which align examples of one action with each other."""
 
     layer: LayerName | None = Field(
         None, description="Layer of the annotations to use; required if a clip has annotations of several layers."
@@ -67,14 +69,14 @@ _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
 
 
 class AnnotateParams(TaggedResults):
-    """Parameters of jobs of the kind `annotate`."""
+    """Parameters of jobs of the kind `annotate`, which propose segments and keyframes of clips."""
 
     proposal: Proposal = Field(description="Method that proposes segments and keyframes, with its options.")
     layer: LayerName | None = Field(None, description="Name of the layer; default: the name of the method.")
 
 
 class CutParams(TaggedResults):
-    """Parameters of jobs of the kind `cut`."""
+    """Parameters of jobs of the kind `cut`, which cut clips along segments of annotations."""
 
     layer: LayerName | None = Field(None, description="Layer of the annotations to use; absent: all layers.")
     labels: tuple[Label, ...] = Field(
@@ -88,7 +90,7 @@ class CutParams(TaggedResults):
     )
     shortest_s: Seconds = Field(0.0, description="Shortest segment to cut out, in seconds.")
     longest_s: Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)] | None = Field(
-        None, description="Longest segment to cut out, in seconds."
+        None, description="Longest segment to cut out, in seconds; absent: no limit."
     )
     name: str = Field(
         "{clip}_{label}_{number:2}",
@@ -97,7 +99,9 @@ class CutParams(TaggedResults):
         description="Pattern of the pieces' names; {number:2} counts the segments of a label in a clip from "
         "1, with two digits.",
     )
-    by_label: bool = Field(False, description="Put the pieces of each label into a folder of their own.")
+    by_label: bool = Field(
+        False, description="Put the pieces of each label into a separate subfolder, which has the name of the label."
+    )
 
     @field_validator("name")
     @classmethod
@@ -142,17 +146,23 @@ MOST_EVALUATION_TASKS = 64
 
 
 class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
-    """Parameters of jobs of the kind `evaluate`."""
+    """Parameters of jobs of the kind `evaluate`, which evaluate locomotion clips by motion matching."""
 
     name: ItemName = Field("evaluation", description="Name of the result.")
     loops: tuple[ItemId, ...] = Field(
         (), max_length=100_000, description="Clips that are loops, in addition to those tagged `loop`."
     )
     trims: dict[ItemId, tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(gt=0)]]] = Field(
-        default_factory=dict, max_length=100_000, description="Half-open range of frames to use, by the id of the clip."
+        default_factory=dict,
+        max_length=100_000,
+        description="Range of frames to use, as first frame and the "
+        "frame after the last, by the id of the clip; "
+        "other clips are used whole.",
     )
     baseline: bool = Field(
-        True, description="For comparison, also measure a set of generated clips that covers every cell."
+        True,
+        description="For comparison, also run the trials with a baseline: generated clips that contain "
+        "every speed and turn rate.",
     )
     report: bool = Field(True, description="Write the report and its figures.")
     trial_figures: tuple[TrialName, ...] = Field(
@@ -190,7 +200,7 @@ class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
 
 
 def count_evaluation_tasks(params: EvaluateParams) -> int:
-    """Return the number of tasks for the trials. A task runs few trials, so that a failure loses little work."""
+    """Return the number of tasks of an evaluation; a task has few trials, so that a failure loses little work."""
     per_task = max(TRIALS_PER_TASK, -(-params.trial_count // MOST_EVALUATION_TASKS))
     return -(-params.trial_count // per_task)
 
@@ -200,7 +210,7 @@ WEIGHT_GROUPS = len(FeatureWeights.model_fields.keys() - {"extra_joints"})
 
 
 class CompareParams(Request):
-    """Parameters of jobs of the kind `compare`."""
+    """Parameters of jobs of the kind `compare`, which compare evaluations."""
 
     title: str = Field(
         "", max_length=200, description="Title of the report; default: the names of the two evaluations."
@@ -209,7 +219,7 @@ class CompareParams(Request):
 
 
 class AnalyseStudyParams(Request):
-    """Parameters of jobs of the kind `analyse_study`."""
+    """Parameters of jobs of the kind `analyse_study`, which analyse the judgements of a study."""
 
     title: str = Field("", max_length=200, description="Title of the report; default: the title of the study.")
     report: bool = Field(True, description="Write the report, a self-contained HTML page.")
@@ -217,7 +227,8 @@ class AnalyseStudyParams(Request):
         1000,
         ge=0,
         le=10_000,
-        description="Number of times that participants are drawn with replacement, for intervals of the weights.",
+        description="Number of bootstrap samples of the participants, from which the intervals of the weights "
+        "are computed.",
     )
 
 
@@ -228,7 +239,7 @@ CLIPS_PER_BLOCK = 50
 
 
 class DistancesParams(DistanceOptions, MetricChoice):
-    """Parameters of jobs of the kind `distances`."""
+    """Parameters of jobs of the kind `distances`, which measure perceptual distances of clips."""
 
     loops: tuple[ItemId, ...] = Field(
         (), max_length=MOST_COMPARED_CLIPS, description="Clips that are loops, in addition to those tagged `loop`."
@@ -246,25 +257,28 @@ def count_distance_tasks(_params: DistancesParams, clips: int) -> int:
 
 
 class QualityParams(QualityOptions):
-    """Parameters of jobs of the kind `quality`."""
+    """Parameters of jobs of the kind `quality`, which measure defects of clips."""
 
     draws: int = Field(
-        1000, ge=0, le=10_000, description="Number of times that takes are drawn with replacement, for intervals."
+        1000,
+        ge=0,
+        le=10_000,
+        description="Number of bootstrap samples of the takes, from which the confidence intervals are computed.",
     )
     title: str = Field("", max_length=200, description="Title of the report; default: the number of clips.")
     report: bool = Field(True, description="Write the report, a self-contained HTML page, and its figures.")
 
 
 class SuggestParams(SuggestionOptions, MetricChoice):
-    """Parameters of jobs of the kind `suggest`."""
+    """Parameters of jobs of the kind `suggest`, which find clips to remove from a set or to add."""
 
 
 class OptimiseParams(OptimisationOptions):
-    """Parameters of jobs of the kind `optimise`."""
+    """Parameters of jobs of the kind `optimise`, which improve a set of clips step by step."""
 
 
 class SweepParams(SweepOptions):
-    """Parameters of jobs of the kind `sweep`."""
+    """Parameters of jobs of the kind `sweep`, which repeat an evaluation with other weights."""
 
 
 def count_sweep_tasks(params: SweepParams) -> int:
@@ -273,7 +287,7 @@ def count_sweep_tasks(params: SweepParams) -> int:
 
 
 class ModelParams(ModelOptions, TaggedResults):
-    """Parameters of jobs of the kind `model`."""
+    """Parameters of jobs of the kind `model`, which train a generative model of an action."""
 
     name: ItemName = Field("model", description="Name of the model, and also of the action that it generates.")
     report: bool = Field(True, description="Write the report and its figures.")
@@ -285,7 +299,7 @@ class ModelParams(ModelOptions, TaggedResults):
 
 
 class TreeParams(TreeOptions):
-    """Parameters of jobs of the kind `tree`."""
+    """Parameters of jobs of the kind `tree`, which build the sample tree of a model."""
 
     def unclear_place(self, into: str) -> str | None:
         """Return the reason why the tree cannot be stored in a collection, or None if it can."""
@@ -293,7 +307,7 @@ class TreeParams(TreeOptions):
 
 
 class EditParams(SuffixedResults):
-    """Parameters of jobs of the kind `edit`."""
+    """Parameters of jobs of the kind `edit`, which apply commands to clips."""
 
     commands: tuple[EditCommand, ...] = Field(
         (),
@@ -328,21 +342,23 @@ class EditParams(SuffixedResults):
 
 
 class ImportParams(ImportOptions):
-    """Parameters of jobs of the kind `import`."""
+    """Parameters of jobs of the kind `import`, which import files."""
 
     files: tuple[ImportFile, ...] = Field(
-        min_length=1, max_length=10_000, description="Names and digests of the files."
+        min_length=1,
+        max_length=10_000,
+        description="The files to import, by name and digest; the server already has their bytes.",
     )
 
 
 class IndexParams(Request):
-    """Parameters of jobs of the kind `index`."""
+    """Parameters of jobs of the kind `index`, which index the poses of clips for searches."""
 
     name: ItemName = Field("motion-index", description="Name of the index; an index with this name is replaced.")
 
 
 class RetargetParams(RetargetOptions, SuffixedResults):
-    """Parameters of jobs of the kind `retarget`."""
+    """Parameters of jobs of the kind `retarget`, which transfer motions to another skeleton."""
 
     scale: float | None = Field(
         None, gt=0, lt=1000, description="Scale of the root's path; absent: the ratio of the hip heights."
@@ -350,4 +366,4 @@ class RetargetParams(RetargetOptions, SuffixedResults):
 
 
 class ExportParams(MotionFileOptions, ConsentOverride):
-    """Parameters of jobs of the kind `export`: one archive of files."""
+    """Parameters of jobs of the kind `export`, which write clips to files in one archive."""

@@ -48,7 +48,7 @@ NOTHING_DONE = "nothing-done"
 
 
 def nothing_done(result: Mapping[str, Any]) -> bool:
-    """Return whether a job has refused inputs and made nothing: it has no outputs, and lists no inputs as `empty`.
+    """Return whether a job refused inputs and produced nothing: no outputs, and no inputs that it lists as `empty`.
 
     In `result`, `outputs` is the number of outputs, and `empty` lists inputs that the job could use, but in which it
     found nothing.
@@ -80,12 +80,15 @@ class JobKind(Answer):
         default_factory=dict,
         description="Numbers that the job publishes about its inputs, and their meanings, by name.",
     )
-    fan_out: str | None = Field(None, description="The input whose items are distributed over many tasks.")
-    batch_size: int = Field(1, description="Number of items that each task of a fan-out takes.")
+    fan_out: str | None = Field(
+        None,
+        description="The input whose items are distributed over the tasks of a "
+        "job; null: the items are not distributed.",
+    )
+    batch_size: int = Field(1, description="Number of items of the input `fan_out` that each task gets.")
     gathers: bool = Field(
         False,
-        description="Whether the parameters determine the number of tasks, and a worker gathers the results of the "
-        "tasks.",
+        description="Whether the parameters determine the number of tasks, whose results a worker combines at the end.",
     )
     deterministic: bool = Field(
         True,
@@ -136,7 +139,7 @@ JobInput = ExistingInput | JobOutputsInput
 
 
 class Resources(Request):
-    """Limits of time and memory of one attempt to run a job, and other resources that the attempt needs."""
+    """Time and memory that one attempt to run a job may use, and graphics processors that it needs."""
 
     time_limit_s: int = Field(3600, ge=1, le=7 * 86400)
     memory_limit_mb: int = Field(4096, ge=64, le=1_048_576)
@@ -150,8 +153,8 @@ class Resources(Request):
         None,
         ge=1,
         le=7 * 86400,
-        description="Expected duration of the job. With the setting `own_pods`, the server gives a long job a pod of "
-        "its own.",
+        description="Expected duration of the job in seconds; null: unknown. With the server's setting "
+        "`own_pods`, a long job runs in a separate pod.",
     )
 
 
@@ -160,22 +163,24 @@ CacheMode = Literal["use", "refresh", "off"]
 
 
 class JobCreate(Request):
-    """Request to submit a job."""
+    """Request to submit a job: its kind, inputs and parameters, and how it is to run."""
 
     kind: str = Field(min_length=1, max_length=64)
     inputs: dict[str, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
     params: dict[str, Any] = Field(default_factory=dict)
     into: CollectionPath = Field("", description="The collection that receives the results.")
-    priority: int = Field(0, ge=-100, le=100, description="Jobs of higher priority run first.")
+    priority: int = Field(0, ge=-100, le=100, description="Priority; jobs of higher priority run first.")
     after: tuple[str, ...] = Field((), max_length=1000, description="Jobs that must succeed before this one starts.")
     on_failure: Literal["fail", "skip"] = Field(
         "fail",
-        description="Final state of this job if a job in `after` does not succeed. fail: failed; skip: cancelled.",
+        description="What happens to this job if a job in `after` does not succeed. fail: it fails; skip: it is "
+        "cancelled.",
     )
     concurrency_key: str | None = Field(
         None,
         max_length=255,
-        description="Key of a lock: of the jobs of a project with the same key, only one runs at a time.",
+        description="Key of a lock: of the jobs of a project with the same key, only one runs at a time. Null: "
+        "no lock.",
     )
     cache: CacheMode = Field(
         "use",
@@ -188,7 +193,8 @@ class JobCreate(Request):
     resources: Resources = Resources()
     message: Message = ""
     commit: OutputsCommit | None = Field(
-        None, description="Commit of the outputs to a branch of a dataset, made when the job succeeds."
+        None,
+        description="Commit of the outputs to a branch of a dataset, made when the job succeeds; null: none is made.",
     )
 
 
@@ -197,7 +203,7 @@ LONGEST_NOTE = 500
 
 
 class Progress(Request):
-    """Progress of an attempt."""
+    """Progress of an attempt to run a job: amount done, total amount, and a note."""
 
     done: float = Field(ge=0, allow_inf_nan=False)
     total: float | None = Field(None, gt=0, allow_inf_nan=False)
@@ -205,7 +211,7 @@ class Progress(Request):
 
 
 class JobFailure(Answer):
-    """Failure of a job, described for people."""
+    """Failure of a job, with a code for programs and a text for people."""
 
     reason: FailureReason
     code: str
@@ -213,7 +219,7 @@ class JobFailure(Answer):
 
 
 class JobOutput(Answer):
-    """Revision created by a job."""
+    """Output of a job: the revision of an item that the job created, or found unchanged."""
 
     name: str
     item: str
@@ -243,7 +249,7 @@ def commits_of(inputs: Mapping[str, Any]) -> set[str]:
 
 
 class Job(Answer):
-    """Job with its state."""
+    """Job with its inputs, parameters, state and result."""
 
     id: str
     project: str
@@ -269,16 +275,22 @@ class Job(Answer):
     position: int | None = Field(
         None, description="Index of the task among the tasks of its parent job, from 0; null if the job is not a task."
     )
-    size: int | None = Field(None, description="Number of tasks that the job is split into.")
+    size: int | None = Field(
+        None, description="Number of tasks into which the job is split; null: it is not split, or not yet."
+    )
     children: dict[str, int] = Field(default_factory=dict, description="Number of tasks in each state.")
     retry_of: str | None = None
-    cached_from: str | None = Field(None, description="Id of the job whose cached result this job reuses.")
+    cached_from: str | None = Field(
+        None, description="Id of the job whose cached result this job reuses; null: it computes its result."
+    )
     progress: Progress | None = None
     failure: JobFailure | None = None
     result: dict[str, Any] | None = None
     cancel_requested: bool = False
     publish_conflict: CommitConflict | None = Field(
-        None, description="Reason why the outputs are not on the branch to which the job was to commit them."
+        None,
+        description="Reason why the outputs are not on the branch to which the job was to commit them; "
+        "null: there is no conflict.",
     )
     commit: JobCommit | None = Field(
         None, description="Commit of the outputs; null for tasks, and if the submission requested no commit."
@@ -301,7 +313,7 @@ class TaskResult(Answer):
 
 
 class Attempt(Answer):
-    """Attempt to run a job."""
+    """Attempt of a worker to run a job; a job may need several attempts."""
 
     job: str
     fence: int
@@ -309,7 +321,9 @@ class Attempt(Answer):
     started_at: datetime
     ended_at: datetime | None
     outcome: str | None = Field(
-        None, description="How the attempt ended: succeeded, failed, interrupted, lost, cancelled or timeout."
+        None,
+        description="How the attempt ended: succeeded, failed, interrupted, lost, cancelled or timeout; "
+        "null while it runs.",
     )
     detail: str | None = None
 
@@ -321,6 +335,6 @@ class JobBatch(Request):
 
 
 class JobList(Answer):
-    """Jobs in the order of submission."""
+    """Jobs of one request, in the order in which they were given."""
 
     jobs: tuple[Job, ...]

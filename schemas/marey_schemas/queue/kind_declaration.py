@@ -1,4 +1,4 @@
-"""Declaration of a kind of job: its inputs, parameters and outputs, how it is split, and when results are reused."""
+"""Declaration of a kind of job: inputs, parameters, outputs, division into tasks, and reuse of results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ EVERY_INPUT = "*"
 
 @dataclass(frozen=True)
 class KindDeclaration:
-    """A kind of job.
+    """Declaration of a kind of job, from which server, client and worker derive everything about it.
 
     `version` changes whenever the same inputs, parameters and seed may give other results; cached results of another
     version are not used. `implementation` names the worker's function `run(context, params)` as `module:function`.

@@ -125,7 +125,8 @@ QUALITY = KindDeclaration(
 )
 
 _EVALUATED = InputSpec(
-    kind=Kind.EVALUATION, description="The evaluation. Its clips are read at the revisions that the evaluation used."
+    kind=Kind.EVALUATION,
+    description="The evaluation to improve. Its clips are read at the revisions that the evaluation used.",
 )
 _CANDIDATES = InputSpec(
     kind=Kind.CLIP,

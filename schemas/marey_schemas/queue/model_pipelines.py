@@ -14,7 +14,7 @@ Inputs = tuple[ExistingInput, ...]
 
 
 class ModelPlan(Request):
-    """Inputs and options of a model.
+    """Plan of a model: the takes from which it is made, and the parameters of each step.
 
     Takes are files to import or existing clips. They are retargeted if a skeleton is given, cut into examples along
     proposed or existing annotations, and aligned; a model is trained on the examples, and a tree is built for searches.

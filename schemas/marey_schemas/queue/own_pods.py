@@ -1,4 +1,4 @@
-"""Pods that run a single job: labels of the jobs that need such a pod, and images that scripts name."""
+"""Jobs in pods of their own: the labels of such jobs, and the container images that scripts name."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ IMAGE_VARIABLE = "MAREY_SCRIPT_IMAGE"
 
 
 def with_digest(image: str) -> str:
-    """Return the name of an image. Raises `ValueError` if it does not end in a digest."""
+    """Return `image`, the name of a container image. Raises `ValueError` if it does not end in a digest."""
     if len(image) > 500 or re.fullmatch(r"[A-Za-z0-9][\w.:/-]*@sha256:[0-9a-f]{64}", image, re.ASCII) is None:
         raise ValueError("the image must be named by its digest, as in registry.example.org/marey-worker@sha256:...")
     return image
@@ -34,7 +34,7 @@ Image = Annotated[str, AfterValidator(with_digest)]
 
 
 def is_allowed_image(image: str, allowed: Iterable[str]) -> bool:
-    """Return whether an image is in the list.
+    """Return whether a list of allowed images contains an image.
 
     An entry is an image with its digest, the name of a repository (all its digests), or a prefix that ends in `/`.
     """

@@ -41,8 +41,8 @@ TimeZoneName = Annotated[
 Overlapping = Annotated[
     bool,
     Field(
-        description="Whether a job is submitted even if the previous job of the schedule has not ended. If false, "
-        "the time is skipped in this case."
+        description="Whether a job is submitted even if the previous job of the schedule has not ended. False: "
+        "no job is submitted at this time."
     ),
 ]
 
@@ -80,7 +80,7 @@ class ScheduleChange(Request):
 
 
 class Schedule(Answer):
-    """Schedule of a project."""
+    """Schedule of a project: a job, and the times at which the server submits it."""
 
     name: str
     project: str
@@ -97,9 +97,12 @@ class Schedule(Answer):
         description="Time of the next submission; null: the schedule is paused, or the time is being computed."
     )
     last_at: datetime | None = Field(
-        None, description="Time at which the schedule last submitted a job, skipped a time, or was refused."
+        None,
+        description="Time at which the schedule last submitted a job, skipped a time, or was refused; null: not yet.",
     )
-    last_job: str | None = Field(None, description="Id of the job that was submitted last; it may be deleted already.")
+    last_job: str | None = Field(
+        None, description="Id of the job that was submitted last; it may be deleted already. Null: none was submitted."
+    )
     problem: str | None = Field(
         None,
         description="Reason why the last job was not submitted, or why the schedule is paused; null: there is none.",

@@ -73,8 +73,8 @@ class ScriptParameter(Request):
     """Parameter of a script, which becomes one word of its command."""
 
     type: Literal["number", "integer", "text", "boolean"] = "number"
-    minimum: float | None = Field(None, allow_inf_nan=False, description="Least value of a number.")
-    maximum: float | None = Field(None, allow_inf_nan=False, description="Greatest value of a number.")
+    minimum: float | None = Field(None, allow_inf_nan=False, description="Least value of a number; null: no limit.")
+    maximum: float | None = Field(None, allow_inf_nan=False, description="Greatest value of a number; null: no limit.")
     choices: tuple[str, ...] = Field((), max_length=100, description="Allowed texts; empty: any text.")
     default: Value | None = Field(
         None, description="Value that is used if a run gives no value; null: each run must give a value."
@@ -96,7 +96,7 @@ class ScriptParameter(Request):
         return self
 
     def fault_of(self, value: Value) -> str | None:
-        """Return why a value is not allowed, or None if it is."""
+        """Return the reason why a value is not allowed for this parameter; None if it is allowed."""
         if self.type == "boolean":
             return None if isinstance(value, bool) else "the value must be true or false"
         if self.type == "text":
@@ -149,7 +149,7 @@ class ScriptOutput(Request):
         description="Format of a clip, such as bvh. For logged fields: jsonl, if each line is a JSON object of values "
         "of one step; absent: the file is one JSON object.",
     )
-    max_bytes: int = Field(64 * MIB, ge=1, le=GIB, description="Greatest size of the file.")
+    max_bytes: int = Field(64 * MIB, ge=1, le=GIB, description="Greatest size of the file, in bytes.")
     required: bool = Field(True, description="Whether a run fails if the script does not write this file.")
     description: Message = ""
 
@@ -165,7 +165,7 @@ class ScriptOutput(Request):
 
     @property
     def ending(self) -> str:
-        """The ending of the file's name."""
+        """The ending of the name of the written file, such as `.bvh`."""
         if self.kind == "clip":
             return _MOTION_ENDINGS[self.format or ""]
         return f".{self.format or 'json'}" if self.kind == "fields" else ""
@@ -174,7 +174,7 @@ class ScriptOutput(Request):
 class ScriptLimits(Request):
     """Limits of one run of a script."""
 
-    seconds: int = Field(3600, ge=1, le=86400, description="Greatest duration.")
+    seconds: int = Field(3600, ge=1, le=86400, description="Greatest duration of a run, in seconds.")
     memory_mb: int = Field(2048, ge=64, le=262_144, description="Greatest memory of all its processes, in MiB.")
     written_mb: int = Field(1024, ge=1, le=65_536, description="Greatest size of all its files, in MiB.")
     processes: int = Field(32, ge=1, le=1024, description="Greatest number of processes at the same time.")
@@ -308,12 +308,12 @@ class ScriptCreate(ScriptDeclaration):
 
     @property
     def declaration(self) -> ScriptDeclaration:
-        """The script without its name and description."""
+        """The declaration of the script, without its name and description."""
         return ScriptDeclaration.model_validate(self.model_dump(exclude={"name", "description"}))
 
 
 class Script(Answer):
-    """Script of a project."""
+    """Script that is registered in a project, with the user who registered it."""
 
     name: str
     project: str
@@ -332,13 +332,14 @@ class ScriptParams(ConsentOverride):
     )
     declaration: ScriptDeclaration | None = Field(
         None,
-        description="The script as it was registered when the job was submitted. The server fills in this field; if "
-        "a request contains the field, its value must equal the registered script.",
+        description="The script in the form in which it was registered at the submission of the job. The server "
+        "sets this field; if a request contains the field, its value must equal the registered "
+        "script.",
     )
 
 
 class ScriptRunCreate(ConsentOverride):
-    """Request to run a script."""
+    """Request to run a script as a job, with values for its parameters and inputs."""
 
     values: dict[FieldName, Value] = Field(
         default_factory=dict, max_length=MOST_DECLARED, description="Values of the parameters."
@@ -348,7 +349,8 @@ class ScriptRunCreate(ConsentOverride):
     seed: int = Field(0, ge=0, lt=2**63, description="Value of the environment variable MAREY_SEED of the script.")
     message: Message = Field("", description="Message of the run, shown in the history of its results.")
     commit: OutputsCommit | None = Field(
-        None, description="Commit of the outputs to a branch of a dataset, made when the run succeeds."
+        None,
+        description="Commit of the outputs to a branch of a dataset, made when the run succeeds; null: none is made.",
     )
 
 

@@ -17,7 +17,7 @@ FAULT_VARIABLE = "MAREY_FAULT"
 """Environment variable with which tests make a server or worker fail at a named point."""
 
 INTERRUPTED_STATUS = 143
-"""Exit status of a worker that returned a job to the queue because it was asked to stop."""
+"""Exit status of a worker that ended because it was asked to stop, and returned a job to the queue."""
 
 LONGEST_CODE = 128
 LONGEST_DETAIL = 20_000
@@ -29,7 +29,7 @@ PROTOCOL_VERSION = 1
 
 
 class ClaimRequest(Request):
-    """Request of a worker for jobs."""
+    """Request of a worker to claim jobs."""
 
     worker: ShownText = Field(max_length=255, description="Name of the worker, shown to people.")
     kinds: tuple[ShownText, ...] = Field(min_length=1, max_length=256)
@@ -42,14 +42,19 @@ class ClaimRequest(Request):
     )
     job: str | None = Field(None, description="Id of the only job that the worker claims; absent: any job.")
     task: int | None = Field(
-        None, ge=0, le=1_000_000, description="Claim only the task of `job` that has this position."
+        None,
+        ge=0,
+        le=1_000_000,
+        description="Index, from 0, of the only task of `job` that the worker claims; "
+        "absent: any task, or the job itself.",
     )
     claim_id: str | None = Field(
         None,
         min_length=16,
         max_length=64,
-        description="Random id of the claim. If a request is repeated with the same id and the same token, it gets "
-        "those leases of the first request that are still held, renewed; it is refused if all of them have ended.",
+        description="Random id of the claim. A repeated request with the same id and the same token renews and "
+        "returns those leases of the first request that have not ended; it is refused if all of them "
+        "have ended.",
     )
 
 
@@ -67,7 +72,11 @@ class PinnedInput(Answer):
         "not given as an output of a job.",
     )
 
-    commit: str | None = Field(None, description="Commit of a dataset from which the input was taken.")
+    commit: str | None = Field(
+        None,
+        description="Digest of the commit of a dataset from which the input was "
+        "taken; null: it was not taken from a dataset.",
+    )
     consent_ended: str | None = Field(
         None,
         description="Last day of the performer's consent. Set only if this day has passed, by the clock of the "
@@ -122,7 +131,8 @@ class Lease(Answer):
     )
     size: int | None = Field(
         None,
-        description="Number of tasks of the parent job; set for its tasks, and for the job that gathers their results.",
+        description="Number of tasks of the parent job, for its tasks and for the job that combines their "
+        "results; otherwise null.",
     )
     resources: Resources
     fence: int
@@ -159,7 +169,7 @@ class HeartbeatAnswer(Answer):
 
 
 class StagedOutput(Request):
-    """Staged result, invisible until the attempt completes."""
+    """Result of an attempt that is staged: it becomes visible when the attempt completes."""
 
     name: str = Field(
         min_length=1, max_length=1500, description="Name that is unique within the attempt; other outputs refer to it."
@@ -199,7 +209,7 @@ class StageRequest(Request):
     @model_validator(mode="after")
     def _require_content(self) -> Self:
         if not self.outputs and not self.facets:
-            raise ValueError("the request contains neither outputs nor facets")
+            raise ValueError("the request contains neither outputs nor facets; send at least one of them")
         return self
 
 
@@ -223,7 +233,7 @@ class CompleteRequest(Request):
 
 
 class FailRequest(Request):
-    """Report of a failed attempt."""
+    """Report of a worker that its attempt has failed, with the reason."""
 
     write_id: str = Field(min_length=8, max_length=64)
     code: str = Field(min_length=1, max_length=LONGEST_CODE)
@@ -231,7 +241,8 @@ class FailRequest(Request):
     signature: str | None = Field(
         None,
         max_length=LONGEST_SIGNATURE,
-        description="Signature of the failure; a job is not retried after two attempts with the same signature.",
+        description="Text that equal failures have in common, such as the place of an exception; a job is not "
+        "retried after two attempts with the same signature. Absent: none.",
     )
     retryable: bool = True
     interrupted: bool = Field(
@@ -242,7 +253,7 @@ class FailRequest(Request):
 
 
 class BatchCompletion(CompleteRequest):
-    """Completion of one job in a batch."""
+    """Completion of one job in a request that completes many."""
 
     job: str
     fence: int
@@ -255,16 +266,18 @@ class BatchCompleteRequest(Request):
 
 
 class CompleteAnswer(Answer):
-    """Results that a successful job published."""
+    """Answer to the completion of a job: the published results."""
 
     job: str
     state: JobState
     outputs: tuple[JobOutput, ...] = ()
-    commit: str | None = Field(None, description="Commit of a dataset that has the outputs.")
+    commit: str | None = Field(
+        None, description="Digest of the commit that the job made of its outputs; null: it made none."
+    )
 
 
 class FailAnswer(Answer):
-    """State of the job after the failed attempt."""
+    """Answer to the report of a failed attempt: the state of the job now, and the wait before the next attempt."""
 
     job: str
     state: JobState
@@ -290,13 +303,13 @@ class BatchCompleteAnswer(Answer):
 
 
 class StageAnswer(Answer):
-    """Number of results that the attempt has staged."""
+    """Answer to a request to stage results: the number of results that the attempt has staged so far."""
 
     staged: int
 
 
 class LogAnswer(Answer):
-    """Length of the attempt's log."""
+    """Answer to a piece of a log: the length of the attempt's log so far."""
 
     offset: int = Field(description="Number of bytes received, which is where the next piece starts.")
     capped: bool = Field(default=False, description="Whether the log is full, so that further output is dropped.")

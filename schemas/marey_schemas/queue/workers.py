@@ -1,4 +1,4 @@
-"""Workers as administrators see them."""
+"""Workers in answers for administrators."""
 
 from __future__ import annotations
 

@@ -21,9 +21,12 @@ ParticipantState = Literal["invited", "started", "finished", "withdrawn"]
 class StudyLinksCreate(Request):
     """Request for links, each for one participant."""
 
-    count: int = Field(1, ge=1, le=MOST_LINKS_AT_ONCE, description="Number of links.")
+    count: int = Field(1, ge=1, le=MOST_LINKS_AT_ONCE, description="Number of links to create.")
     expires_in_s: int = Field(
-        30 * DAY_S, ge=60, le=MOST_LINK_DAYS * DAY_S, description="Seconds within which a participant can begin."
+        30 * DAY_S,
+        ge=60,
+        le=MOST_LINK_DAYS * DAY_S,
+        description="Seconds after the creation of the link within which the participant must begin.",
     )
 
 
@@ -35,7 +38,7 @@ class NewStudyLink(Answer):
 
 
 class NewStudyLinks(Answer):
-    """New links of a study."""
+    """New links of a study, one for each participant."""
 
     revision: int = Field(description="Revision of the study that these participants see.")
     expires_at: datetime
@@ -43,7 +46,7 @@ class NewStudyLinks(Answer):
 
 
 class StudyParticipant(Answer):
-    """A participant, under a pseudonym."""
+    """Participant of a study, under a pseudonym: state and progress."""
 
     id: str
     participant: str = Field(description="Pseudonym, such as p1.")
@@ -85,8 +88,8 @@ class StudyDifferences(Answer):
         description="Motions along the first principal component of the differences; null: some motion is in no trial."
     )
     noise: float | None = Field(
-        description="Standard error of the differences by chance (root mean square), without how much people differ "
-        "from each other; null: too few answers repeat a pair to know it."
+        description="Standard error by chance of the differences (root mean square), without the differences "
+        "between people; null: unknown, because too few pairs were judged repeatedly."
     )
 
 
@@ -96,15 +99,21 @@ class JudgedTrial(Answer):
     index: int = Field(description="Number of trials that the participant had answered before.")
     number: int = Field(description="Number of the trial among all that were shown to the participant, from 1.")
     shown: tuple[int, ...] = Field(description="Motions by place on the screen: indices into the motions of the study.")
-    chosen: tuple[int, int] | None = Field(description="Places of the chosen motions; null for a timeout.")
-    latency_s: float | None = Field(description="Time until the answer, by the clock of the server.")
-    timeouts_before: int = Field(description="Number of timeouts since the last answer.")
+    chosen: tuple[int, int] | None = Field(
+        description="Places of the two chosen motions on the screen; null if the trial timed out."
+    )
+    latency_s: float | None = Field(
+        description="Seconds until the answer, by the clock of the server; null if the trial timed out."
+    )
+    timeouts_before: int = Field(
+        description="Number of trials of the participant that timed out since the last answer."
+    )
     seed: int
     client_fps: float | None
 
 
 class JudgingParticipant(Answer):
-    """The trials of one participant."""
+    """Participant of a study, under a pseudonym, with the trials that were shown."""
 
     participant: str = Field(description="Pseudonym, such as p1.")
     finished: bool

@@ -35,7 +35,7 @@ class StudyWelcome(Answer):
     clips: int = Field(description="Number of motions.")
     trials: int = Field(description="Number of trials to answer.")
     shown: int = Field(description="Number of motions in a trial.")
-    seconds: float = Field(description="Time for an answer.")
+    seconds: float = Field(description="Seconds that the participant has to answer a trial.")
 
 
 class ParticipationCreate(Request):
@@ -59,7 +59,7 @@ class ParticipationCreate(Request):
 
 
 class Participation(Answer):
-    """Progress of a participant."""
+    """State of a participant: what the study asks for, and the trials answered so far."""
 
     title: str
     clips: int = Field(description="Number of motions. The motions are numbered from 0.")
@@ -67,7 +67,7 @@ class Participation(Answer):
     answered: int
     remaining: int
     shown: int = Field(description="Number of motions in a trial.")
-    seconds: float = Field(description="Time for an answer.")
+    seconds: float = Field(description="Seconds that the participant has to answer a trial.")
     finished: bool
 
 
@@ -100,7 +100,11 @@ class TrialAnswer(Request):
 
     chosen: tuple[Place, Place] = Field(description="Two different places, from 0.")
     client_fps: float | None = Field(
-        None, gt=0, le=1000, allow_inf_nan=False, description="Frames per second that the browser drew."
+        None,
+        gt=0,
+        le=1000,
+        allow_inf_nan=False,
+        description="Frames per second that the browser drew while the trial was shown; absent: not measured.",
     )
 
     @model_validator(mode="after")

@@ -36,7 +36,7 @@ class TraceContext:
 
     @property
     def header(self) -> str:
-        """The context in the form of the header."""
+        """The context as the value of the header `traceparent`."""
         return f"00-{self.shown_trace}-{self.span_id:016x}-{self.sampled:02x}"
 
     @property

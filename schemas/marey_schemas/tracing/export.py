@@ -197,8 +197,8 @@ def _readable(context: TraceContext, span: Span, resource: Resource) -> Readable
     )
 
 
-class _Seldom(logging.Handler):
-    """Handler that logs at most one message in `WARN_EVERY_S` seconds, so that no collector can flood the log."""
+class _RateLimited(logging.Handler):
+    """Logging handler that logs at most one message in `WARN_EVERY_S` seconds, so that no collector floods the log."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -206,7 +206,7 @@ class _Seldom(logging.Handler):
         self._held_back = 0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log the message as a warning of Marey, without the traceback; if it comes too soon, only count it."""
+        """Log the message as a warning of Marey, without the traceback; only count it if it follows too soon."""
         if (now := time.monotonic()) < self._due:
             self._held_back += 1
             return
@@ -216,11 +216,11 @@ class _Seldom(logging.Handler):
 
 
 def _quieten(name: str) -> None:
-    """Send the messages of a library to `_Seldom` only."""
+    """Send the log messages of a library only to a handler that limits their rate."""
     logger = logging.getLogger(name)
     logger.propagate = False
-    if not any(isinstance(handler, _Seldom) for handler in logger.handlers):
-        logger.addHandler(_Seldom())
+    if not any(isinstance(handler, _RateLimited) for handler in logger.handlers):
+        logger.addHandler(_RateLimited())
 
 
 @contextmanager

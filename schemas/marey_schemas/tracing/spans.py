@@ -100,7 +100,7 @@ def current_scope() -> SpanScope | None:
 
 
 def trace_headers(scope: SpanScope | None) -> dict[str, str]:
-    """Return the headers that pass a trace on."""
+    """Return the HTTP headers that pass the trace of a scope on; empty without a scope."""
     return {} if scope is None else {HEADER: scope.context.header}
 
 

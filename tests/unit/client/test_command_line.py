@@ -22,7 +22,7 @@ from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client.cli import projects, with_global_options_first
 from marey_client.cli.access import tokens
-from marey_client.cli.addresses import Address, require_item, the_thing
+from marey_client.cli.addresses import Address, folder_or_item, require_item
 from marey_client.cli.app import OTHER_NAMES, app, with_one_command
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
 from marey_client.cli.datasets import combining, versions
@@ -315,7 +315,7 @@ def test_an_empty_list_of_projects_without_a_token_hints_at_that(
     "find",
     [
         lambda marey: require_item(marey, Address("lab", "raw"), [Kind.CLIP]),
-        lambda marey: the_thing(marey, "lab/raw", "clip"),
+        lambda marey: folder_or_item(marey, "lab/raw", "clip"),
     ],
 )
 def test_who_asks_for_an_item_at_a_folder_is_told_that_it_is_one(

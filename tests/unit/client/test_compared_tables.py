@@ -91,9 +91,9 @@ def test_the_sdk_sends_goals_by_their_kind() -> None:
 
 WRONG = [
     (["--csv", "--json"], "choose one of --csv and --json"),
-    (["--plot", "bars"], "need --chart"),
+    (["--plot", "bars"], "have an effect only with --chart"),
     (["--chart", "runs.pdf"], "must end in .html, .svg or .png"),
-    (["--highest", "a", "--lowest", "a"], "a can be in only one of --highest and --lowest"),
+    (["--highest", "a", "--lowest", "a"], "a is named by --highest and by --lowest"),
 ]
 
 

@@ -154,7 +154,7 @@ def test_any_value_can_be_quoted(value: str) -> None:
         ("like(a:9-3) < 1", "column 6: 'a:9-3': the end, frame 3, must be after"),
         ("like(a:1) > 2", "column 11: like(...) is a distance of motions; compare it with < or <="),
         ("like(a:1) < -2", "column 13: the distance must not be negative"),
-        ("like(a:1, '') < 2", "column 11: name a metric, or leave it out"),
+        ("like(a:1, '') < 2", "column 11: the name of the metric is empty"),
         ("like = 3", "column 1: write like("),
         (" or ".join(["like(a:1) < 1"] * 4), "at most 3 conditions like"),
     ],

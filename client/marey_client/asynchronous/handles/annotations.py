@@ -22,7 +22,7 @@ class AsyncAnnotationHandle(AsyncItemHandle):
     _sync: AnnotationHandle
 
     async def document(self, *, revision: int | None = None) -> Annotation:
-        """Return the annotation's clip, segments and keyframes."""
+        """Return the part `annotation`: the annotated clip, segments and keyframes; default: of the newest revision."""
         return await self._run(self._sync.document, revision=revision)
 
     async def apply(self, commands: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, message: str = "") -> Item:
@@ -35,5 +35,8 @@ class AsyncAnnotationHandle(AsyncItemHandle):
         return await self._run(self._sync.apply, commands, message=message)
 
     async def put(self, annotation: Annotation, *, message: str | None = None) -> Item:
-        """Replace the segments and keyframes; the item gets a new revision."""
+        """Replace the segments and keyframes; the item gets a new revision.
+
+        Raises `PreconditionFailed` if the annotation was changed since it was read.
+        """
         return await self._run(self._sync.put, annotation, message=message)

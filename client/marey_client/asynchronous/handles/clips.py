@@ -22,7 +22,7 @@ from marey_schemas.items import Item
 
 @counterpart_of(ClipHandle)
 class AsyncClipHandle(AsyncPosesHandle):
-    """Handle of a clip."""
+    """Handle of a clip: poses, description (the part `info`) and annotations of the clip."""
 
     _sync: ClipHandle
 
@@ -31,7 +31,10 @@ class AsyncClipHandle(AsyncPosesHandle):
         return await self._run(self._sync.info)
 
     async def put_info(self, info: ClipInfo) -> Item:
-        """Replace the description of the clip; the item gets a new revision, in which the poses are unchanged."""
+        """Replace the description of the clip; the item gets a new revision, in which the poses are unchanged.
+
+        Raises `PreconditionFailed` if the clip was changed since it was read.
+        """
         return await self._run(self._sync.put_info, info)
 
     async def put_motion(self, motion: MotionDocument, *, message: str | None = None) -> Item:

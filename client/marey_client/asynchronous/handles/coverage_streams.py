@@ -18,7 +18,7 @@ from marey_schemas.coverage_streams import CoverageProgress, CoverageStream, Cov
 
 @counterpart_of(CoverageStreams)
 class AsyncCoverageStreams(Counterpart):
-    """Coverage streams of a project."""
+    """Coverage streams of a project: each measures which motions a performance has covered, while it is recorded."""
 
     _sync: CoverageStreams
 
@@ -28,7 +28,7 @@ class AsyncCoverageStreams(Counterpart):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the streams, relative to the API's root."""
         return self._sync.url
 
     async def begin(
@@ -57,13 +57,13 @@ class AsyncCoverageStreams(Counterpart):
 
 @counterpart_of(CoverageStreamHandle)
 class AsyncCoverageStreamHandle(Counterpart):
-    """Handle of a coverage stream. `offset` is the number of frames sent so far."""
+    """Handle of a coverage stream, to which the frames of a performance are sent."""
 
     _sync: CoverageStreamHandle
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the stream, relative to the API's root."""
         return self._sync.url
 
     @property

@@ -18,7 +18,7 @@ from marey_schemas.datasets.naming import MAIN, Dataset
 
 @counterpart_of(Datasets)
 class AsyncDatasets(Counterpart):
-    """Datasets of a project."""
+    """Datasets of a project, and imports of versions into them."""
 
     _sync: Datasets
 
@@ -28,7 +28,7 @@ class AsyncDatasets(Counterpart):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the datasets, relative to the API's root."""
         return self._sync.url
 
     async def create(self, name: str, *, collection: str | None = None, description: str = "") -> AsyncDatasetHandle:

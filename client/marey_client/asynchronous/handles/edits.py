@@ -16,7 +16,7 @@ from marey_schemas.items import Item
 
 @counterpart_of(EditHandle)
 class AsyncEditHandle(AsyncItemHandle):
-    """Handle of an edit."""
+    """Handle of an edit: a saved list of commands with a title."""
 
     _sync: EditHandle
 
@@ -37,7 +37,7 @@ AsyncCommands = AsyncEditHandle | EditDocument | Command | Sequence[Command]
 
 @counterpart_of(Edits)
 class AsyncEdits(AsyncItems[AsyncEditHandle]):
-    """Edits of a project."""
+    """Edits (saved lists of commands) of a project."""
 
     _sync: Edits
 
@@ -50,7 +50,7 @@ class AsyncEdits(AsyncItems[AsyncEditHandle]):
         collection: str = "",
         message: str = "",
     ) -> AsyncEditHandle:
-        """Save commands as an edit: a new one, or a new revision of the edit with this name in the collection."""
+        """Save commands as an edit; an edit of this name in the folder `collection` gets a new revision."""
         exchanged: AsyncEditHandle = await self._exchange(
             self._sync.save, name, commands, title=title, collection=collection, message=message
         )

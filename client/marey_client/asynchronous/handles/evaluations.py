@@ -24,7 +24,7 @@ from marey_schemas.queue.jobs import JobCreate
 
 @counterpart_of(EvaluationHandle)
 class AsyncEvaluationHandle(AsyncReportedHandle):
-    """Handle of an evaluation."""
+    """Handle of an evaluation of locomotion clips: trials, use of the clips, report, and jobs to improve the clips."""
 
     _sync: EvaluationHandle
 

@@ -26,11 +26,11 @@ class AsyncFindings(Counterpart):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The main numbers of the result."""
+        """The main numbers of the job's result, by name."""
         return self._sync.summary
 
     async def document(self) -> dict[str, Any]:
-        """Return all results; arrays are numpy arrays."""
+        """Return the document with all results of the job; arrays are numpy arrays."""
         return await self._run(self._sync.document)
 
     async def report(self) -> bytes:
@@ -46,7 +46,7 @@ class AsyncFindings(Counterpart):
         return await self._run(self._sync.save_file, name, path)
 
     def figures(self) -> tuple[StoredFigure, ...]:
-        """Return the figures of the report; without a report, there are none."""
+        """Return the figures of the report; an empty result without a report."""
         return self._sync.figures()
 
     async def save_figures(self, folder: str | Path) -> list[Path]:

@@ -55,6 +55,6 @@ class AsyncJobHandle(ModelCounterpart, Job):
         return self._each(self._sync.log, follow=follow)
 
     async def cancel(self) -> AsyncJobHandle:
-        """Ask the job to stop; a queued job is cancelled at once."""
+        """Ask the job to stop; a job that does not run yet is cancelled at once."""
         exchanged: AsyncJobHandle = await self._exchange(self._sync.cancel)
         return exchanged

@@ -15,7 +15,7 @@ from marey_schemas.documents.metrics import MetricDocument
 
 @counterpart_of(MetricHandle)
 class AsyncMetricHandle(AsyncItemHandle):
-    """Handle of a perceptual metric."""
+    """Handle of a stored perceptual metric."""
 
     _sync: MetricHandle
 
@@ -29,7 +29,7 @@ AsyncMetric: TypeAlias = AsyncMetricHandle | str
 
 @counterpart_of(PerceptualMetrics)
 class AsyncPerceptualMetrics(AsyncItems[AsyncMetricHandle]):
-    """The perceptual metrics of a project."""
+    """Stored perceptual metrics of a project."""
 
     _sync: PerceptualMetrics
 

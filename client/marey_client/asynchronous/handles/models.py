@@ -18,7 +18,7 @@ from marey_schemas.formats import DEFAULT_FORMAT
 
 @counterpart_of(ModelHandle)
 class AsyncModelHandle(AsyncSearchableHandle):
-    """Handle of a model."""
+    """Handle of a generative model of one action: its quality, its report, and motions drawn from it."""
 
     _sync: ModelHandle
 
@@ -27,11 +27,11 @@ class AsyncModelHandle(AsyncSearchableHandle):
         return await self._run(self._sync.document, revision=revision)
 
     async def training(self) -> dict[str, Any]:
-        """Return the measures of the model's quality: errors, likelihoods, examples, foot contacts, warnings."""
+        """Return the measured quality of the model: errors, likelihoods, examples, foot contacts and warnings."""
         return await self._run(self._sync.training)
 
     async def sample(self, n: int = 1, seed: int = 0, *, revision: int | None = None) -> Samples:
-        """Draw `n` motions. The same seed gives the same motions; with a greater `n`, further motions follow them."""
+        """Draw `n` motions. The same seed gives the same motions; a greater `n` adds motions after them."""
         return await self._run(self._sync.sample, n, seed, revision=revision)
 
     async def save_samples(

@@ -48,7 +48,7 @@ class AsyncPipelineRun(Counterpart):
         return exchanged
 
     def outputs(self, step: str) -> AsyncIterator[JobOutput]:
-        """Return the revisions created by a step."""
+        """Return the revisions that the job of a step created."""
         return self._each(self._sync.outputs, step)
 
     async def cancel(self) -> Mapping[str, Job]:

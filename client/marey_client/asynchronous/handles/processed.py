@@ -25,11 +25,11 @@ class AsyncProcessedHandle(AsyncPosesHandle):
     _sync: ProcessedHandle
 
     async def info(self, *, revision: int | None = None) -> AlignmentInfo:
-        """Return the alignment: its keyframes, cost and options, and the source frame of each canonical frame."""
+        """Return the part `info`: keyframes, cost and options of the alignment, and the time function."""
         return await self._run(self._sync.info, revision=revision)
 
     async def time_function(self) -> NDArray[np.float64]:
-        """Return the fractional source frame of each canonical frame, (N,).
+        """Return the source frame of each canonical frame, as an array (N,) of fractional frame numbers.
 
         Source frames are counted at the rate of the aligned clip.
         """

@@ -18,7 +18,7 @@ from marey_schemas.kinds import Kind
 
 @counterpart_of(Proposals)
 class AsyncProposals(Counterpart):
-    """Proposals of a dataset."""
+    """Proposals to merge versions into branches of a dataset."""
 
     _sync: Proposals
 

@@ -16,7 +16,7 @@ from marey_schemas.documents.reports import StoredFigure
 
 @counterpart_of(ReportedHandle)
 class AsyncReportedHandle(AsyncItemHandle):
-    """Handle of an evaluation or a model: an item that has a verdict, and may have a part `report`."""
+    """Handle of an evaluation or a model, which has a verdict in words and may have a part `report`."""
 
     _sync: ReportedHandle
 
@@ -30,7 +30,7 @@ class AsyncReportedHandle(AsyncItemHandle):
         return await self._run(self._sync.summary)
 
     async def figures(self) -> tuple[StoredFigure, ...]:
-        """Return the figures of the report."""
+        """Return the figures of the report, with the formats in which each is stored."""
         return await self._run(self._sync.figures)
 
     async def report(self) -> bytes:
@@ -40,7 +40,7 @@ class AsyncReportedHandle(AsyncItemHandle):
     async def figure(
         self, name: str, format: str = "png", *, trial: str | None = None, table: str | None = None
     ) -> bytes:
-        """Return a figure as png or svg, its data as json, or one `table` of its data as csv.
+        """Return a figure as bytes: as png or svg, its data as json, or one `table` of its data as csv.
 
         Figures of single trials need the name of the `trial`.
         """

@@ -15,7 +15,7 @@ from marey_schemas.queue.schedules import Schedule, ScheduleChange
 
 @counterpart_of(Schedules)
 class AsyncSchedules(Counterpart):
-    """Schedules of a project."""
+    """Schedules of a project, each of which submits a job at the times of a cron expression."""
 
     _sync: Schedules
 
@@ -25,7 +25,7 @@ class AsyncSchedules(Counterpart):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the schedules, relative to the API's root."""
         return self._sync.url
 
     async def create(

@@ -17,7 +17,7 @@ from marey_schemas.queue.scripts import Script, ScriptCreate, ScriptRun, Value
 
 @counterpart_of(Scripts)
 class AsyncScripts(Counterpart):
-    """Scripts of a project."""
+    """Scripts of a project: commands of pinned Git commits, which run as jobs."""
 
     _sync: Scripts
 
@@ -27,11 +27,11 @@ class AsyncScripts(Counterpart):
 
     @property
     def url(self) -> str:
-        """The path of the resource, relative to the API's root."""
+        """The path of the scripts, relative to the API's root."""
         return self._sync.url
 
     async def register(self, script: ScriptCreate) -> Script:
-        """Register a script.
+        """Register a script, so that members of the project can run it.
 
         Raises `Forbidden` if the server runs no scripts or the caller is no maintainer, `Conflict` if the name is
         taken, and `Invalid` if the server does not allow the repository.

@@ -14,18 +14,21 @@ from marey_schemas.items import Item
 
 @counterpart_of(SkeletonHandle)
 class AsyncSkeletonHandle(AsyncItemHandle):
-    """Handle of a skeleton."""
+    """Handle of a skeleton: its hierarchy of joints, and its joint mapping."""
 
     _sync: SkeletonHandle
 
     async def hierarchy(self) -> SkeletonHierarchy:
-        """Return joints, offsets and rest pose."""
+        """Return the part `hierarchy`: joints, offsets and rest pose."""
         return await self._run(self._sync.hierarchy)
 
     async def mapping(self) -> SkeletonMapping:
-        """Return the mapping of standard joints to joints, and the axes of joints."""
+        """Return the part `mapping`: the joint for each standard joint, and the anatomical axes of joints."""
         return await self._run(self._sync.mapping)
 
     async def put_mapping(self, mapping: SkeletonMapping) -> Item:
-        """Replace the mapping of joints; the item gets a new revision."""
+        """Replace the joint mapping; the item gets a new revision.
+
+        Raises `PreconditionFailed` if the skeleton was changed since it was read.
+        """
         return await self._run(self._sync.put_mapping, mapping)

@@ -23,7 +23,7 @@ from marey_schemas.studies.conducting import JudgingParticipant, NewStudyLinks, 
 
 @counterpart_of(StudyHandle)
 class AsyncStudyHandle(AsyncItemHandle):
-    """Handle of a study."""
+    """Handle of a perceptual study: its design, participants, judgements and analysis."""
 
     _sync: StudyHandle
 
@@ -47,7 +47,7 @@ class AsyncStudyHandle(AsyncItemHandle):
         await self._run(self._sync.withdraw, participant)
 
     async def progress(self) -> StudyProgress:
-        """Return numbers of participants and trials."""
+        """Return the numbers of participants and answered trials, over all revisions of the study."""
         return await self._run(self._sync.progress)
 
     def judgements(self, *, revision: int | None = None) -> AsyncIterator[JudgingParticipant]:
@@ -68,13 +68,13 @@ class AsyncStudyHandle(AsyncItemHandle):
         return exchanged
 
     async def analyse_request(self, **options: Unpack[AnalyseStudyKeywords]) -> JobCreate:
-        """Return the job request of `analyse`."""
+        """Return the job request that `analyse` submits; `options` are those of `AnalyseStudyParams`."""
         return await self._run(self._sync.analyse_request, **options)
 
 
 @counterpart_of(Studies)
 class AsyncStudies(AsyncItems[AsyncStudyHandle]):
-    """Studies of a project."""
+    """Perceptual studies of a project."""
 
     _sync: Studies
 

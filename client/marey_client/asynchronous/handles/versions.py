@@ -52,11 +52,11 @@ class AsyncDatasetHandle(Counterpart):
         return self._sync.project_url
 
     async def read(self) -> Dataset:
-        """Return the dataset."""
+        """Read the dataset: its folder, its description, and the version that is checked out."""
         return await self._run(self._sync.read)
 
     async def delete(self) -> None:
-        """Delete the dataset; its items stay."""
+        """Delete the dataset with its versions; the items of the project stay."""
         await self._run(self._sync.delete)
 
     @property
@@ -89,7 +89,7 @@ class AsyncDatasetHandle(Counterpart):
         return self._each(self._sync.log, version, path=path)
 
     async def at(self, version: str = MAIN) -> Commit:
-        """Return the commit that a version names."""
+        """Return the commit that a version names: a branch, a tag or a digest."""
         return await self._run(self._sync.at, version)
 
     async def has(self, commit: str) -> bool:
@@ -274,11 +274,11 @@ class AsyncDatasetHandle(Counterpart):
         return self._each(self._sync.refs)
 
     async def find_ref(self, name: str) -> Ref | None:
-        """Return the branch or tag with a name; None if there is none, or if there is no such dataset."""
+        """Return the branch or the tag with this name; None if there is none, or if the dataset does not exist."""
         return await self._run(self._sync.find_ref, name)
 
     async def create_branch(self, name: str, at: str = MAIN) -> Ref:
-        """Create a branch at a version."""
+        """Create a branch that begins at the version `at`. Raises `Conflict` if the name is taken."""
         return await self._run(self._sync.create_branch, name, at)
 
     async def create_tag(self, name: str, at: str = MAIN) -> Ref:
@@ -293,7 +293,10 @@ class AsyncDatasetHandle(Counterpart):
         return await self._run(self._sync.move_branch, name, to, expected_rev=expected_rev)
 
     async def ref(self, name: str) -> Ref:
-        """Return a branch with its protection, or a tag."""
+        """Return the branch or the tag with this name, a branch with its protection.
+
+        Raises `NotFound` if there is none.
+        """
         return await self._run(self._sync.ref, name)
 
     async def protect(self, branch: str, rule: ProtectionRule) -> Ref:

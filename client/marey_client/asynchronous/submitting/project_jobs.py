@@ -42,7 +42,7 @@ from marey_schemas.queue.pipelines import PipelineCreate
 
 @counterpart_of(JobSubmission)
 class AsyncJobSubmission(AsyncProjectItems):
-    """Items of a project, and the jobs that make items of them.
+    """Items of a project, and methods that submit jobs, which make new items from items.
 
     Methods that submit a job take `commit`: if the job succeeds, its results are committed to a branch of a dataset.
     For example, "gaits@main/studio" is the folder `studio` on the branch `main` of the dataset `gaits`.
@@ -51,12 +51,12 @@ class AsyncJobSubmission(AsyncProjectItems):
     _sync: JobSubmission
 
     async def submit(self, job: JobCreate) -> AsyncJobHandle:
-        """Submit a job."""
+        """Submit a job of any kind to the project; return its handle."""
         exchanged: AsyncJobHandle = await self._exchange(self._sync.submit, job)
         return exchanged
 
     async def job(self, job_id: str) -> AsyncJobHandle:
-        """Return a job of the project by its id."""
+        """Return a handle of the job of the project with this id. Raises `NotFound` if there is none."""
         exchanged: AsyncJobHandle = await self._exchange(self._sync.job, job_id)
         return exchanged
 

@@ -1,4 +1,4 @@
-"""Commands `login`, `logout` and `user`."""
+"""Commands `login` and `logout`, and the group `user` for accounts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage use
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.command()(login)
     app.command()(logout)
     app.add_typer(user, name="user")
@@ -31,7 +31,9 @@ def add_to(app: typer.Typer) -> None:
 
 def login(
     context: typer.Context,
-    name: Annotated[str | None, typer.Option(help="User name; the command asks for it if it is left out.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the user who signs in. Default: the command asks for it.")
+    ] = None,
     with_token: Annotated[
         bool, typer.Option("--with-token", help="Read a token from standard input instead of asking for a password.")
     ] = False,
@@ -118,7 +120,7 @@ def _sign_up(marey: Marey, name: str | None, days: int) -> str:
 
 
 def logout(context: typer.Context) -> None:
-    """Delete the stored token for a server."""
+    """Delete the stored token for a server from this machine. The token stays valid until it ends or is revoked."""
     from marey_client.credentials import forget_login, logins_path
 
     with connect(context, anonymous=True) as marey:
@@ -134,7 +136,7 @@ def logout(context: typer.Context) -> None:
 def create_user(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name that the user signs in with.")],
-    display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users.")] = None,
+    display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users. Default: none.")] = None,
     administrator: Annotated[
         bool, typer.Option("--administrator", help="Make the user an administrator, with all rights.")
     ] = False,
@@ -162,7 +164,7 @@ def create_user(
 
 @user.command("ls")
 def list_users(context: typer.Context, as_json: AsJson = False) -> None:
-    """Show every user."""
+    """List the users of the server (for administrators)."""
     with connect(context) as marey:
         users = list(marey.users.list())
     if as_json:
@@ -191,7 +193,7 @@ def show_user(
     name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show a user; default: yourself."""
+    """Show a user: names, rights and state; default: yourself."""
     with connect(context) as marey:
         found = marey.users.get(name) if name else marey.me()
     if as_json:
@@ -235,7 +237,7 @@ def change_password(
 
 @user.command("disable")
 def disable_user(context: typer.Context, name: UserName) -> None:
-    """Disable a user; the data of the user is kept."""
+    """Disable a user: password and tokens of the user do not work any more. The data of the user is kept."""
     with connect(context) as marey:
         marey.users.disable(name)
     print_message(f"{name} is disabled; to undo this, run marey user enable {name}")
@@ -253,9 +255,12 @@ def enable_user(context: typer.Context, name: UserName) -> None:
 def change_user(
     context: typer.Context,
     name: UserName,
-    display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users.")] = None,
+    display_name: Annotated[
+        str | None, typer.Option(help="New name that is shown to other users. Default: unchanged.")
+    ] = None,
     administrator: Annotated[
-        bool | None, typer.Option(help="Grant the user the rights of an administrator, or revoke them.")
+        bool | None,
+        typer.Option(help="Grant the user the rights of an administrator, or revoke them. Default: unchanged."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -22,7 +22,13 @@ if TYPE_CHECKING:
 
 Days = Annotated[int, typer.Option(min=1, help="Number of days for which the invitation is valid, at most 30.")]
 Uses = Annotated[int, typer.Option(min=1, help="Number of people who can use the invitation, at most 100.")]
-Note = Annotated[str, typer.Option(help="For whom the invitation is; shown in lists.")]
+Note = Annotated[
+    str,
+    typer.Option(
+        help="Person or purpose that the invitation is for, for your own reference; "
+        "lists of invitations show this text."
+    ),
+]
 Named = Annotated[
     str, typer.Argument(metavar="PREFIX|ID", help="Prefix or id of the invitation, as in the list of invitations.")
 ]
@@ -51,7 +57,7 @@ def invite_member(
     note: Note = "",
     as_json: AsJson = False,
 ) -> None:
-    """Invite users to a project, and print the code, which is never shown again.
+    """Invite users of the server to a project, and print the code of the invitation, which is never shown again.
 
     The invited person runs `marey member accept`.
     """
@@ -69,7 +75,7 @@ def list_invitations(context: typer.Context, project_name: ProjectName, as_json:
 
 
 def withdraw(context: typer.Context, project_name: ProjectName, invitation: Named) -> None:
-    """Withdraw an open invitation to a project; its code is not valid any more."""
+    """Withdraw an open invitation to a project, so that its code is not valid any more."""
     named = _named(invitation)
     with connect(context) as marey:
         marey.project(project_name).invitations.withdraw(named)
@@ -90,7 +96,10 @@ def accept(context: typer.Context, as_json: AsJson = False) -> None:
 def invite_person(
     context: typer.Context,
     project_name: Annotated[
-        str | None, typer.Option("--project", help="Project that the new user joins as a member.")
+        str | None,
+        typer.Option(
+            "--project", help="Project that the new users join as members, with the role of --role. Default: none."
+        ),
     ] = None,
     role: RoleName = None,
     days: Days = 7,
@@ -98,7 +107,7 @@ def invite_person(
     note: Note = "",
     as_json: AsJson = False,
 ) -> None:
-    """Invite people who have no account, and print the code, which is never shown again.
+    """Invite people who have no account, and print the code of the invitation, which is never shown again.
 
     The invited person runs `marey login --invitation` and chooses a user name and a password.
     """
@@ -111,14 +120,14 @@ def invite_person(
 
 
 def list_account_invitations(context: typer.Context, as_json: AsJson = False) -> None:
-    """List the open invitations of people who have no account, without their codes."""
+    """List the open invitations to create an account, without their codes."""
     with connect(context) as marey:
         found = list(marey.users.invitations.list())
     _print_list(found, as_json=as_json)
 
 
 def withdraw_account_invitation(context: typer.Context, invitation: Named) -> None:
-    """Withdraw an open invitation of people who have no account; its code is not valid any more."""
+    """Withdraw an open invitation to create an account, so that its code is not valid any more."""
     named = _named(invitation)
     with connect(context) as marey:
         marey.users.invitations.withdraw(named)

@@ -1,4 +1,4 @@
-"""Commands of the group `token`."""
+"""Commands of the group `token`: creating, listing, rotating and revoking tokens."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SOON_DAYS = 14
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(token, name="token")
 
 
@@ -39,8 +39,9 @@ def create_token(
     scope: Annotated[
         list[str] | None,
         typer.Option(
-            help="Scope: read, write, jobs, work or admin. To limit a scope to one project, append !project= and the "
-            "name of the project, as in read!project=lab."
+            help="Scope: read, write, jobs, work or admin. To limit a scope to one project, append !project= and "
+            "the name of the project, as in read!project=lab. May be repeated. Default: read, write and "
+            "jobs."
         ),
     ] = None,
     days: Annotated[
@@ -62,7 +63,10 @@ def create_token(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "--out", "-o", help="Write the secret to this file (mode 0600) instead of the screen."
+            "--output",
+            "--out",
+            "-o",
+            help="Write the secret to this new file, which only you can read, instead of the screen.",
         ),
     ] = None,
     as_json: AsJson = False,
@@ -103,7 +107,9 @@ def _token_in_file(marey: Marey, wanted: TokenCreate, path: Path) -> NewToken:
 @token.command("ls")
 def list_tokens(
     context: typer.Context,
-    user: Annotated[str | None, typer.Option(help="List the tokens of this user (for administrators).")] = None,
+    user: Annotated[
+        str | None, typer.Option(help="List the tokens of this user (for administrators). Default: your own.")
+    ] = None,
     everybody: Annotated[
         bool, typer.Option("--everybody", help="List the tokens of all users (for administrators).")
     ] = False,
@@ -181,11 +187,11 @@ def rotate_token(
 
 
 def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedelta) -> NewToken:
-    """Replace the token of the client `marey` by a successor, on the server and in the file that contains the token.
+    """Replace the token that `marey` uses by a new token, on the server and in the file that contains the token.
 
-    The id of the rotation is stored next to the token's file before the request is sent. So if the program ends before
-    the successor is stored, the next call gets the same successor. Raises `BadCredentialFile` if no file contains the
-    token.
+    A random id of this replacement is stored next to the token's file before the request is sent. If the program ends
+    before the new token is stored, the next call sends the same id and gets the same new token. Raises
+    `BadCredentialFile` if no file contains the token.
     """
     from marey_client.access import Tokens
     from marey_client.credentials import replace_token
@@ -206,7 +212,7 @@ def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedel
 
 
 def _rotation_id(begun: Path, token: str) -> str:
-    """Return the id of this token's rotation from the file `begun`; if the file has no id, store a new one there."""
+    """Return the id for the replacement of this token from the file `begun`; store a new id there if it has none."""
     from marey_client.credentials import write_private
 
     prefix = token.split("_")[1] if token.count("_") > 1 else ""

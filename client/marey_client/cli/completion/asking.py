@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 PATIENCE_S = 0.8
 """Longest time in seconds for all requests after one press of Tab, without the program's start (about 0.4 s)."""
-QUESTIONS_AT_ONCE = 4
+LISTS_AT_ONCE = 4
 MOST_ENTRIES = 200
 """Greatest number of entries that one request asks for."""
 MOST_PAGES = 50
@@ -32,33 +32,33 @@ MOST_ANSWER_BYTES = 1 << 22
 
 
 @dataclass(frozen=True)
-class Question:
-    """Request for a list: the list's path below the API's root, and query parameters."""
+class ListRequest:
+    """Request for a list of the server: its path below the root of the REST API, and its query parameters."""
 
     path: str
     query: Mapping[str, str | int] = field(default_factory=dict)
     whole: bool = False
-    """Whether all pages of the list are requested, as long as time is left."""
+    """Whether all pages of the list are read until the deadline; otherwise, only the first page is read."""
 
     @classmethod
-    def of(cls, *names: str, **query: str | int | None) -> Question:
-        """Return the request for the path made of `names`, percent-encoded; parameters of None are left out."""
+    def of(cls, *names: str, **query: str | int | None) -> ListRequest:
+        """Return the request for a path, given by its names; query parameters that are None are left out."""
         path = "/".join(quote(name, safe="") for name in names)
         asked = {"limit": MOST_ENTRIES, **query}
         return cls(f"/{path}", {key: value for key, value in asked.items() if value is not None})
 
 
 @dataclass(frozen=True)
-class Desk:
-    """Connection to the server for the requests of one completion."""
+class ListClient:
+    """Reader of lists of the server during one completion, until a deadline."""
 
     credential: Credential
     until: float
     """Deadline of all requests, as a value of `time.monotonic()`."""
 
     @classmethod
-    def opened(cls, server: str | None, token_file: str | None) -> Desk:
-        """Return a connection with the server and the token that commands would use. Raises errors of credentials.
+    def opened(cls, server: str | None, token_file: str | None) -> ListClient:
+        """Return a reader with the server and the token that commands would use. Raises the errors of `resolve`.
 
         The user has not confirmed the command line yet. So a token is sent to the address `server` only if the token
         was saved for this address, or if commands without the option `--server` would use this address, too.
@@ -73,22 +73,22 @@ class Desk:
             found = resolve(server, None if token_file is None else Path(token_file))
         return cls(found, time.monotonic() + PATIENCE_S)
 
-    def ask(self, questions: Sequence[Question]) -> list[list[dict[str, Any]]]:
-        """Return the entries of each requested list, in the order of `questions`; no entries without an answer."""
-        answers: list[list[dict[str, Any]]] = [[] for _ in questions]
-        left = iter(list(enumerate(questions)))
+    def ask(self, requests: Sequence[ListRequest]) -> list[list[dict[str, Any]]]:
+        """Return the entries of each requested list, in the order of `requests`; a list without an answer is empty."""
+        answers: list[list[dict[str, Any]]] = [[] for _ in requests]
+        left = iter(list(enumerate(requests)))
         lock = threading.Lock()
 
         def work() -> None:
             while self._left_s > 0:
                 with lock:
-                    place, question = next(left, (None, None))
-                if place is None or question is None:
+                    place, request = next(left, (None, None))
+                if place is None or request is None:
                     return
-                for page in self._pages(question):
+                for page in self._pages(request):
                     answers[place] += page
 
-        threads = [threading.Thread(target=work, daemon=True) for _ in questions[:QUESTIONS_AT_ONCE]]
+        threads = [threading.Thread(target=work, daemon=True) for _ in requests[:LISTS_AT_ONCE]]
         for one in threads:
             one.start()
         for one in threads:
@@ -96,18 +96,18 @@ class Desk:
         return [list(one) for one in answers]
 
     def entries(self, *names: str, **query: str | int | None) -> list[dict[str, Any]]:
-        """Return the entries of a list: at most `MOST_PAGES` pages, until the deadline; arguments as `Question.of`."""
-        return self.ask([replace(Question.of(*names, **query), whole=True)])[0]
+        """Return the entries of a list, at most `MOST_PAGES` pages; the arguments are those of `ListRequest.of`."""
+        return self.ask([replace(ListRequest.of(*names, **query), whole=True)])[0]
 
     @property
     def _left_s(self) -> float:
         return self.until - time.monotonic()
 
-    def _pages(self, question: Question) -> Iterator[list[dict[str, Any]]]:
-        """Yield the entries of each page of a list."""
-        query = dict(question.query)
-        for _ in range(MOST_PAGES if question.whole else 1):
-            answer = self._answer(question.path, query)
+    def _pages(self, request: ListRequest) -> Iterator[list[dict[str, Any]]]:
+        """Yield the entries of each page of a list, page by page; only the first page unless `request.whole`."""
+        query = dict(request.query)
+        for _ in range(MOST_PAGES if request.whole else 1):
+            answer = self._answer(request.path, query)
             yield list(_entries(answer))
             cursor = answer.get("next_cursor") if isinstance(answer, dict) else None
             if not isinstance(cursor, str) or self._left_s <= 0:
@@ -150,7 +150,7 @@ class Desk:
 
 
 def _entries(answer: object) -> Iterable[dict[str, Any]]:
-    """Yield the objects of a list, whether it has pages or not."""
+    """Yield the objects in an answer: a JSON list, or a page with the member `items`; nothing for any other answer."""
     items = answer.get("items") if isinstance(answer, dict) else answer
     for one in items if isinstance(items, list) else ():
         if isinstance(one, dict):

@@ -8,7 +8,7 @@ from functools import cached_property
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from marey_client.cli.completion.asking import MOST_ENTRIES, Desk, Question
+from marey_client.cli.completion.asking import MOST_ENTRIES, ListClient, ListRequest
 from marey_schemas.kinds import Kind
 
 MOST_LISTED = 1000
@@ -17,7 +17,7 @@ MOST_PROJECTS_OF_JOBS = 20
 
 
 class Suggestion(NamedTuple):
-    """Text that replaces the typed word, and a remark that some shells show beside the text."""
+    """Suggestion to the user: the text that replaces the typed word, and a remark that some shells show beside it."""
 
     text: str
     remark: str = ""
@@ -25,7 +25,7 @@ class Suggestion(NamedTuple):
 
 @dataclass(frozen=True)
 class Typed:
-    """Typed beginning of a word, the values of the parameters before this word, and the global options."""
+    """Part of the command line to complete: the beginning of a word, the parameters before it, and global options."""
 
     start: str
     values: Mapping[str, Any]
@@ -33,12 +33,12 @@ class Typed:
     token_file: str | None = None
 
     @cached_property
-    def desk(self) -> Desk:
-        """The connection to the server."""
-        return Desk.opened(self.server, self.token_file)
+    def lists(self) -> ListClient:
+        """The reader of lists of the server, opened when it is first needed."""
+        return ListClient.opened(self.server, self.token_file)
 
     def value(self, *names: str) -> str:
-        """Return the value of the first of these parameters that has one, or the empty text."""
+        """Return the value of the first of the named parameters that has a value; the empty text if none has."""
         for name in names:
             value = self.values.get(name)
             if isinstance(value, (list, tuple)):
@@ -53,20 +53,21 @@ How = Callable[[Typed], Iterable[Suggestion]]
 
 
 def one_of(*words: str) -> How:
-    """Complete with fixed words."""
+    """Return a function that suggests the given words."""
     return lambda _: map(Suggestion, words)
 
 
 def listed_in(declared: str, *more: str) -> How:
-    """Complete with the words of a list, an enumeration or a function without parameters, declared as `module:name`.
+    """Return a function that suggests words: those of a list, an enumeration or a function, declared as `module:name`.
 
-    The module is imported only if the words are needed. `more` are further words.
+    A function is called without arguments. The module is imported only if the words are needed. `more` are further
+    words.
     """
     return lambda _: map(Suggestion, (*_words(declared), *more))
 
 
 def several_listed_in(declared: str) -> How:
-    """Complete the last of several words that commas separate; the words are declared as for `listed_in`."""
+    """Return a function that completes the word after the last comma of a list; `declared` is that of `listed_in`."""
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         before, comma, _ = typed.start.rpartition(",")
@@ -83,12 +84,12 @@ def _words(declared: str) -> tuple[str, ...]:
 
 
 def nothing(_: Typed) -> tuple[Suggestion, ...]:
-    """Complete nothing, because the parameter is a new name."""
+    """Suggest nothing, because the parameter is a name that the user makes up."""
     return ()
 
 
 def any_of(*hows: How) -> How:
-    """Complete with the suggestions of several functions."""
+    """Return a function that returns the suggestions of several functions."""
     return lambda typed: (one for how in hows for one in how(typed))
 
 
@@ -97,40 +98,46 @@ def any_of(*hows: How) -> How:
 
 def projects(typed: Typed) -> Iterator[Suggestion]:
     """Complete the name of a project."""
-    for one in typed.desk.entries("projects", sort="name", limit=MOST_LISTED):
+    for one in typed.lists.entries("projects", sort="name", limit=MOST_LISTED):
         yield Suggestion(one["name"], one.get("title") or "")
 
 
 def places(*kinds: Kind) -> How:
-    """Complete an address, one name at a time: project, folders, item of one of the kinds. Folders end with `/`."""
+    """Return a function that completes an address such as `lab/raw/walk`, one name at a time; folders end with `/`.
+
+    Only items of the given kinds are suggested.
+    """
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         project, slash, path = typed.start.partition("/")
         if not slash:
             return (Suggestion(f"{one.text}/", one.remark) for one in projects(typed))
-        return (Suggestion(f"{project}/{one.text}", one.remark) for one in _paths(typed.desk, project, path, kinds))
+        return (Suggestion(f"{project}/{one.text}", one.remark) for one in _paths(typed.lists, project, path, kinds))
 
     return how
 
 
 def paths(*kinds: Kind) -> How:
-    """Complete a path in the project of the command, one name at a time; without kinds, the path of a folder."""
+    """Return a function that completes a path in the project of the command, one name at a time.
+
+    Only items of the given kinds are suggested; without kinds, only folders.
+    """
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         project = _project_of(typed)
-        return _paths(typed.desk, project, typed.start, kinds) if project else iter(())
+        return _paths(typed.lists, project, typed.start, kinds) if project else iter(())
 
     return how
 
 
-def _paths(desk: Desk, project: str, path: str, kinds: Sequence[Kind]) -> Iterator[Suggestion]:
-    """Yield folders, then items: those in the parent folder of `path` whose names begin with the path's last name."""
+def _paths(lists: ListClient, project: str, path: str, kinds: Sequence[Kind]) -> Iterator[Suggestion]:
+    """Yield folders, then items, in the parent folder of `path` whose names begin with the last name of `path`."""
     folder, slash, name = path.rpartition("/")
     among: dict[str, str | None] = {"directly_in": folder, "name": f"{name}*" if name else None}
-    below, *items = desk.ask(
+    below, *items = lists.ask(
         [
-            Question.of("projects", project, "collections", **among),
-            *(Question.of("projects", project, kind.plural, **among, sort="name", fields="name") for kind in kinds),
+            ListRequest.of("projects", project, "collections", **among),
+            *(ListRequest.of("projects", project, kind.plural, **among, sort="name", fields="name") for kind in kinds),
         ]
     )
     yield from (Suggestion(f"{one['path']}/") for one in below)
@@ -143,7 +150,7 @@ _PLACES = ("place", "places", "sources", "takes", "evaluation", "address", "clip
 
 
 def _project_of(typed: Typed) -> str:
-    """Return the project of the earlier parameters: a project's name, or the beginning of an address; or empty text."""
+    """Return the project that an earlier parameter names, alone or as the start of an address; empty if none does."""
     return typed.value(*_PROJECTS) or typed.value(*_PLACES).strip("/").partition("/")[0]
 
 
@@ -155,7 +162,7 @@ def datasets(typed: Typed) -> Iterator[Suggestion]:
     project, slash, _ = typed.start.partition("/")
     if not slash:
         return (Suggestion(f"{one.text}/", one.remark) for one in projects(typed))
-    found = typed.desk.entries("projects", project, "datasets")
+    found = typed.lists.entries("projects", project, "datasets")
     return (Suggestion(f"{project}/{one['name']}", "dataset") for one in found)
 
 
@@ -164,12 +171,12 @@ def versions(typed: Typed) -> Iterator[Suggestion]:
     dataset, at, _ = typed.start.partition("@")
     if not at:
         return datasets(typed)
-    return (Suggestion(f"{dataset}@{one.text}", one.remark) for one in _refs(typed.desk, dataset))
+    return (Suggestion(f"{dataset}@{one.text}", one.remark) for one in _refs(typed.lists, dataset))
 
 
 def refs(typed: Typed) -> Iterator[Suggestion]:
     """Complete a branch or a tag of the dataset of the command."""
-    return _refs(typed.desk, typed.value("place").partition("@")[0])
+    return _refs(typed.lists, typed.value("place").partition("@")[0])
 
 
 def branches(typed: Typed) -> Iterator[Suggestion]:
@@ -186,7 +193,7 @@ def entries(typed: Typed) -> Iterator[Suggestion]:
         return
     asked = {"version": version or None, "path": folder or None, "limit": MOST_LISTED}
     seen: dict[str, Suggestion] = {}
-    for one in typed.desk.entries("projects", project, "datasets", name, "entries", **asked):
+    for one in typed.lists.entries("projects", project, "datasets", name, "entries", **asked):
         step, below, _ = one["path"].removeprefix(f"{folder}{slash}").partition("/")
         text = f"{folder}{slash}{step}{below}"
         seen.setdefault(text, Suggestion(text, "" if below else one["kind"]))
@@ -197,7 +204,7 @@ def proposals(typed: Typed) -> Iterator[Suggestion]:
     """Complete the number of a proposal to the dataset of the command."""
     project, _, name = typed.value("place").strip("/").partition("/")
     if project and name:
-        for one in typed.desk.entries("projects", project, "datasets", name, "proposals"):
+        for one in typed.lists.entries("projects", project, "datasets", name, "proposals"):
             yield Suggestion(str(one["number"]), f"{one['state']}: {one['title']}")
 
 
@@ -206,15 +213,15 @@ def commit_targets(typed: Typed) -> Iterator[Suggestion]:
     project = _project_of(typed)
     dataset, at, _ = typed.start.partition("@")
     if at:
-        found = _refs(typed.desk, f"{project}/{dataset}")
+        found = _refs(typed.lists, f"{project}/{dataset}")
         return (Suggestion(f"{dataset}@{one.text}", one.remark) for one in found if one.remark == "branch")
     return iter(in_project("datasets")(typed))
 
 
-def _refs(desk: Desk, dataset: str) -> Iterator[Suggestion]:
+def _refs(lists: ListClient, dataset: str) -> Iterator[Suggestion]:
     project, _, name = dataset.strip("/").partition("/")
     if project and name and "/" not in name:
-        for one in desk.entries("projects", project, "datasets", name, "refs"):
+        for one in lists.entries("projects", project, "datasets", name, "refs"):
             yield Suggestion(one["name"], one["kind"])
 
 
@@ -240,13 +247,13 @@ def jobs(*states: str) -> How:
     """Complete the id of a recent job of the project, or of all projects; with `states`, only jobs in these states."""
 
     def how(typed: Typed) -> Iterator[Suggestion]:
-        desk = typed.desk
+        lists = typed.lists
         project = typed.value("project")
-        of_projects = Question.of("projects", sort="-updated_at")
-        names = [project] if project else [one["name"] for one in desk.ask([of_projects])[0]]
+        of_projects = ListRequest.of("projects", sort="-updated_at")
+        names = [project] if project else [one["name"] for one in lists.ask([of_projects])[0]]
         most = MOST_ENTRIES if typed.start else JOBS_OF_PROJECT
         wanted = {"state": ",".join(states) or None, "limit": most}
-        found = desk.ask([Question.of("projects", one, "jobs", **wanted) for one in names[:MOST_PROJECTS_OF_JOBS]])
+        found = lists.ask([ListRequest.of("projects", one, "jobs", **wanted) for one in names[:MOST_PROJECTS_OF_JOBS]])
         newest = sorted((job for some in found for job in some), key=lambda job: job["created_at"], reverse=True)
         yield from (Suggestion(job["id"], f"{job['kind']}, {job['state']}") for job in newest)
 
@@ -257,19 +264,19 @@ def job_kinds(typed: Typed) -> Iterator[Suggestion]:
     """Complete the kind of a job."""
     return (
         Suggestion(one["name"], one["description"].partition(".")[0])
-        for one in typed.desk.entries("job-kinds", limit=None)
+        for one in typed.lists.entries("job-kinds", limit=None)
     )
 
 
 def users(typed: Typed) -> Iterator[Suggestion]:
     """Complete the name of a user; the server lists users for administrators only."""
-    return (Suggestion(one["name"], one.get("display_name") or "") for one in typed.desk.entries("users"))
+    return (Suggestion(one["name"], one.get("display_name") or "") for one in typed.lists.entries("users"))
 
 
 def members(typed: Typed) -> Iterator[Suggestion]:
     """Complete the name of a member of the project of the command."""
     if project := _project_of(typed):
-        yield from (Suggestion(one["user"]) for one in typed.desk.entries("projects", project, "members", limit=None))
+        yield from (Suggestion(one["user"]) for one in typed.lists.entries("projects", project, "members", limit=None))
 
 
 def in_project(plural: str, field: str = "name", remark: str = "") -> How:
@@ -277,7 +284,7 @@ def in_project(plural: str, field: str = "name", remark: str = "") -> How:
 
     def how(typed: Typed) -> Iterator[Suggestion]:
         if project := _project_of(typed):
-            for one in typed.desk.entries("projects", project, plural):
+            for one in typed.lists.entries("projects", project, plural):
                 yield Suggestion(str(one[field]), str(one.get(remark) or ""))
 
     return how

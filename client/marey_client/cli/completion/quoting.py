@@ -1,4 +1,4 @@
-"""Quoting: parsing of command lines as shells parse them, and escaping of suggestions so that shells read plain text.
+"""Quoting for shells: command lines are parsed as shells do, and suggestions are escaped so that they stay plain text.
 
 Other people choose the names on the server. So the shell must not read a suggestion as anything but text: not as a
 second command, as a substitution, or as a repetition of an earlier command by `!`.
@@ -63,7 +63,7 @@ def for_bash(text: str, raw: str, replaced: str) -> str | None:
 
 
 def for_powershell(text: str, remark: str) -> str | None:
-    """Return a line for typer's script for PowerShell, or None if the script would cut the text."""
+    """Return a suggestion as typer's script for PowerShell reads it; None if the script would cut the text."""
     if ":::" in text:
         return None
     safe = all(one.isascii() and (one.isalnum() or one in "_-./=:") for one in text)
@@ -76,7 +76,7 @@ _QUOTES_OF_POWERSHELL = "'\u2018\u2019\u201a\u201b"
 
 
 def _is_expanded(mark: Mark) -> bool:
-    """Return whether bash might replace this character by something else, or end the command there."""
+    """Return whether bash might replace this character by other text, or end the command at this character."""
     if mark.typed in _EXPANDS:
         return mark.quote != "'" and not mark.is_escaped
     return mark.is_free and mark.typed in _ENDS_A_COMMAND

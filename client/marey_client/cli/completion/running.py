@@ -1,4 +1,4 @@
-"""Answers to shells that request completion: the parameter at the cursor is found with typer, then completed."""
+"""Answers to shells that request completion: typer finds the parameter, and a function of `found` completes it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def complete(app: typer.Typer, line: Line) -> list[Suggestion] | None:
     from typer.completion import completion_init  # pyrefly: ignore[implicit-reexport]  # of a private module
 
     completion_init()
-    asked = _Asked(line)
+    asked = _ShellRequest(line)
     output = contextlib.redirect_stdout(io.StringIO())
     with _environment(typed_by_typer(line)), output as written, contextlib.suppress(SystemExit):
         asked.prepared(app)(prog_name="marey")
@@ -71,8 +71,11 @@ def answer_shell(
     return 0
 
 
-class _Asked:
-    """Request of a shell, and the suggestions in `found`; None if `SUBJECTS` has no entry for the parameter."""
+class _ShellRequest:
+    """Request of a shell for completion.
+
+    `found` holds the suggestions; None if `SUBJECTS` has no entry for the parameter.
+    """
 
     def __init__(self, line: Line) -> None:
         self.line = line
@@ -102,7 +105,7 @@ class _Asked:
     def _without_models(self, command: type[SchemaCommand]) -> Callable[..., Any]:
         """Return the function of a command without the options that come from models, because models load slowly.
 
-        If the line contains an option that the function does not declare itself, these options are included.
+        If the line contains an option that the function does not declare itself, the options from models are included.
         """
         options = [word.partition("=")[0] for word in (*self.line.words, self.line.start) if word.startswith("-")]
         if set(options) <= {"--json", *_own_options(command.function, command.groups)}:
@@ -110,7 +113,7 @@ class _Asked:
         return expanded(command.function, command.groups)
 
     def _completed(self, function: Callable[..., Any], command: tuple[str, ...]) -> Callable[..., Any]:
-        """Return a function that does nothing; its parameters are those of `function`, completed by `SUBJECTS`."""
+        """Return a function with the parameters of `function`, which typer completes by `SUBJECTS`; it does nothing."""
 
         def run(**_: Any) -> None: ...
 
@@ -151,7 +154,7 @@ class _Asked:
     def _values(self, ctx: typer.Context, depth: int) -> Mapping[str, Any]:
         """Return the values of the parameters before the word at the cursor.
 
-        If this word is the value of an option, typer has parsed no arguments; then the line is parsed without the
+        If this word is the value of an option, typer has parsed no arguments yet. Then the line is parsed without the
         option.
         """
         words = list(self.line.words)

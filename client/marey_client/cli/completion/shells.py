@@ -99,10 +99,10 @@ class Line:
     raw: str
     """Beginning of the word at the cursor as it was typed, with quotes and backslashes."""
     options: tuple[str, ...] = ()
-    """Global options with their values, which typer needs before all other words."""
+    """Global options such as `--server`, with their values; typer needs them before all other words."""
 
     replaced: str | None = None
-    """End of `raw` that bash replaces by the chosen suggestion; None if the shell did not send it."""
+    """End of `raw` that bash replaces by the chosen suggestion; None if the shell did not send this end."""
 
     @classmethod
     def parse(cls, text: str, replaced: str | None = None) -> Line:
@@ -120,7 +120,7 @@ class Line:
 
 
 def read_line(environment: Mapping[str, str]) -> Line:
-    """Return the line that a shell sends with a script of this module, or with a script that typer generated."""
+    """Return the command line that a shell sends in environment variables, by a script of this module or of typer."""
     if LINE in environment:
         ends_with_space = environment.get(WORD) == ""
         return Line.parse(environment[LINE] + " " * ends_with_space, environment.get(REPLACED))

@@ -1,4 +1,4 @@
-"""Table of the completion functions of parameters. Choices and files need no entry: typer completes them by type."""
+"""Table of the completion functions of parameters. Typer completes choices and files by itself; they need no entry."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Commands of datasets."""
+"""Commands of the groups `dataset`, `proposal` and `archive`."""

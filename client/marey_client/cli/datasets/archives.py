@@ -33,7 +33,7 @@ ArchivePath = Annotated[
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register all commands of archives."""
+    """Add the commands of archives to the application `app`."""
     app.add_typer(archive, name="archive")
 
 

@@ -33,7 +33,7 @@ Each evaluation is named after its version, and no report is made.
 
 
 def add_to(dataset: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the group `marey dataset`."""
     add_command(dataset, bisect, params=OPTIONS, job=FINDINGS_JOB)
 
 
@@ -54,10 +54,18 @@ def bisect(
         str, typer.Option(help="Later version that is known to be bad: a branch, a tag or a commit.")
     ] = "main",
     above: Annotated[
-        float | None, typer.Option(help="Limit of the metric: versions with a value above the limit are bad.")
+        float | None,
+        typer.Option(
+            help="Limit of the metric: versions with a value above it are bad. Give one "
+            "of --above, --below and --half-way."
+        ),
     ] = None,
     below: Annotated[
-        float | None, typer.Option(help="Limit of the metric: versions with a value below the limit are bad.")
+        float | None,
+        typer.Option(
+            help="Limit of the metric: versions with a value below it are bad. Give one "
+            "of --above, --below and --half-way."
+        ),
     ] = None,
     half_way: Annotated[
         bool,

@@ -61,7 +61,7 @@ Parent = Annotated[
 
 
 def add_to(dataset: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the group `marey dataset`."""
     for command in (merge, cherry_pick, revert):
         dataset.command()(command)
 

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from marey_schemas.datasets.differences import ChangeKind, DatasetDifference, EntryDifference
 
 MOST_DETAILED = 20
-"""Greatest number of entries whose content is compared; each comparison needs a request of its own."""
+"""Greatest number of entries that `--details` describes; each needs a request of its own."""
 
 
 def add_to(dataset: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the group `marey dataset`."""
     dataset.command()(diff)
 
 
@@ -36,7 +36,7 @@ def diff(
             "before it."
         ),
     ] = None,
-    path: Annotated[str, typer.Option(help="Entry or folder to compare.")] = "",
+    path: Annotated[str, typer.Option(help="Entry or folder to compare. Default: all entries.")] = "",
     most: Annotated[
         int, typer.Option("--limit", "-n", min=1, max=10_000, help="Greatest number of entries to list.")
     ] = 1000,

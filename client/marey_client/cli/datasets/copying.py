@@ -41,7 +41,7 @@ Branch = Annotated[
 
 
 def add_to(dataset: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the group `marey dataset`."""
     for command in (push, pull):
         dataset.command()(command)
 

@@ -26,7 +26,7 @@ RENAMED_SHOWN = 5
 
 
 def add_to(dataset: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the group `marey dataset`."""
     dataset.command()(export)
 
 
@@ -38,11 +38,13 @@ def export(
         str,
         typer.Option(
             "--as",
-            help=f"{one_of(LAYOUTS)}: a tree of motion files, a dataset repository of the Hugging Face Hub, or a "
-            "LeRobotDataset v3.0.",
+            help=f"Layout of the folder. {one_of(LAYOUTS)}: a tree of motion files, a dataset repository of the "
+            "Hugging Face Hub, or a LeRobotDataset v3.0.",
         ),
     ] = "files",
-    path: Annotated[str, typer.Option(help="Folder of the version; only the clips below it are exported.")] = "",
+    path: Annotated[
+        str, typer.Option(help="Folder of the version; only the clips below it are exported. Default: all clips.")
+    ] = "",
     format: Annotated[  # noqa: A002
         str | None,
         typer.Option(help=f"Format of the motion files: {one_of(WHOLE_FORMATS)}. Default: {DEFAULT_FORMAT}."),
@@ -95,7 +97,7 @@ def _export(
 
 
 def _print_notes(made: ExportedVersion) -> None:
-    """Print which clips got another name, and which entries were left out."""
+    """Print which files have other names than their clips, and how many entries were left out as they are no clips."""
     for path, file in list(made.renamed.items())[:RENAMED_SHOWN]:
         print_message(f"{path} is in the file {file}, because not all systems accept its name")
     if len(made.renamed) > RENAMED_SHOWN:

@@ -35,7 +35,7 @@ class NamedVersion(NamedTuple):
     version: str
 
     def on(self, marey: Marey) -> DatasetHandle:
-        """Return a handle of the dataset."""
+        """Return a handle of the dataset that the argument names."""
         return marey.project(self.project).datasets.at(self.dataset)
 
 

@@ -43,12 +43,12 @@ Number = Annotated[int, typer.Argument(min=1, help="Number of the proposal; `mar
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(proposal, name="proposal")
 
 
 def add_protection_to(dataset: typer.Typer) -> None:
-    """Register the commands that protect branches."""
+    """Add the commands that protect branches to the group `marey dataset`."""
     dataset.command()(protect)
     dataset.command()(unprotect)
 
@@ -75,7 +75,9 @@ def open_proposal(
 def list_proposals(
     context: typer.Context,
     place: DatasetPlace,
-    state: Annotated[ProposalState | None, typer.Option(help="List only proposals in this state.")] = None,
+    state: Annotated[
+        ProposalState | None, typer.Option(help="List only proposals in this state. Default: in any state.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the proposals of a dataset, newest first."""
@@ -152,10 +154,21 @@ def comment(
     number: Number,
     text: Annotated[str, typer.Argument(help="Text of the comment.")],
     entry: Annotated[
-        str | None, typer.Option(metavar="PATH:KIND", help="Entry that the comment is about, such as raw/walk:clip.")
+        str | None,
+        typer.Option(
+            metavar="PATH:KIND",
+            help="Entry that the comment is about, such as "
+            "raw/walk:clip. Default: the comment is about the "
+            "whole proposal.",
+        ),
     ] = None,
     frames: Annotated[
-        str | None, typer.Option(metavar="FIRST:END", help="Range of the entry's frames; END is not included.")
+        str | None,
+        typer.Option(
+            metavar="FIRST:END",
+            help="With --entry: range of frames that the comment is "
+            "about; END is not included. Default: the whole entry.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -192,8 +205,10 @@ def review(
     context: typer.Context,
     place: DatasetPlace,
     number: Number,
-    verdict: Annotated[Verdict, typer.Argument(help="Verdict on the newest commit.")],
-    text: Annotated[str, typer.Option("--message", "-m", help="Reasons.")] = "",
+    verdict: Annotated[Verdict, typer.Argument(help="Verdict of your review of the newest commit.")],
+    text: Annotated[
+        str, typer.Option("--message", "-m", help="Reasons for the verdict, which the proposal shows.")
+    ] = "",
     commit: CommitSeen = None,
     as_json: AsJson = False,
 ) -> None:
@@ -312,7 +327,7 @@ def protect(
         typer.Option(
             "--check",
             metavar="NAME",
-            help="Name of a check that must succeed before a merge; repeat the option for several.",
+            help="Name of a check that must succeed before a merge; may be repeated.",
         ),
     ] = None,
     up_to_date: Annotated[

@@ -26,7 +26,7 @@ dataset = typer.Typer(
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register all commands of datasets."""
+    """Add the commands of datasets to the application `app`."""
     bisecting.add_to(dataset)
     combining.add_to(dataset)
     comparing.add_to(dataset)
@@ -73,7 +73,7 @@ def list_datasets(context: typer.Context, project_name: ProjectName, as_json: As
 
 
 def _checked_out(one: Dataset) -> str:
-    """Return what is checked out in the folder, such as `1f3a9c07d2e4: tag = night; raw, rigs`."""
+    """Return the commit and the selection that are checked out, such as `1f3a9c07d2e4: tag = night; raw, rigs`."""
     if one.checked_out is None:
         return ""
     selection = "; ".join(filter(None, (one.checked_out.query, ", ".join(one.checked_out.paths))))
@@ -137,7 +137,7 @@ def _at_path(one: ListedCommit) -> str:
 
 @dataset.command("show")
 def show(context: typer.Context, place: VersionPlace, as_json: AsJson = False) -> None:
-    """Show the commit that a version names."""
+    """Show the commit that a version names: digest, parents, author, time, message and number of entries."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).at(at.version)
@@ -150,7 +150,7 @@ def show(context: typer.Context, place: VersionPlace, as_json: AsJson = False) -
 def entries(
     context: typer.Context,
     place: VersionPlace,
-    path: Annotated[str, typer.Option(help="Folder below which entries are listed.")] = "",
+    path: Annotated[str, typer.Option(help="Folder below which entries are listed. Default: all entries.")] = "",
     as_json: AsJson = False,
 ) -> None:
     """List the entries of a version by path."""
@@ -191,7 +191,7 @@ def branch(
     place: VersionPlace,
     name: Annotated[str, typer.Argument(help="Name of the new branch.")],
 ) -> None:
-    """Create a branch at a version."""
+    """Create a branch that begins at a version."""
     at = parse(place, version=True)
     with connect(context) as marey:
         made = at.on(marey).create_branch(name, at.version)
@@ -215,7 +215,7 @@ def tag(
 def reset(
     context: typer.Context,
     place: VersionPlace,
-    name: Annotated[str, typer.Argument(help="Branch to move.")],
+    name: Annotated[str, typer.Argument(help="Name of the branch to move.")],
 ) -> None:
     """Move a branch to any version, for example to an earlier one. No commit is deleted."""
     at = parse(place, version=True)
@@ -228,11 +228,13 @@ def reset(
 def blame(
     context: typer.Context,
     place: VersionPlace,
-    path: Annotated[str, typer.Argument(help="Path of an entry.")],
-    kind: Annotated[str, typer.Option(help="Kind of the entry.")] = "clip",
+    path: Annotated[str, typer.Argument(help="Path of the entry in the dataset, such as raw/walk.")],
+    kind: Annotated[
+        str, typer.Option(help="Kind of the entry, because entries of several kinds may have this path.")
+    ] = "clip",
     as_json: AsJson = False,
 ) -> None:
-    """Show the last commit that changed each part of an entry, its tags and its path, with author and time."""
+    """Show, for each part of an entry, for its tags and for its path, the last commit that changed it."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).blame(path.strip("/"), kind_named(kind), at.version)
@@ -262,7 +264,12 @@ def checkout(
         typer.Option(help="Check out only this entry, or the entries below this folder; may be repeated."),
     ] = None,
     discard: Annotated[
-        bool, typer.Option("--discard", help="Discard changes in the folder that no commit has recorded.")
+        bool,
+        typer.Option(
+            "--discard",
+            help="Discard changes in the folder that no commit has recorded. Without "
+            "this option, such changes are an error.",
+        ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:

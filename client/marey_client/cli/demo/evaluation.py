@@ -16,8 +16,7 @@ from marey_client.project import ProjectHandle
 
 NAME = "evaluation"
 TRAVEL_M = 0.5
-"""Least horizontal displacement, in metres, of the root of a locomotion clip within `TRAVEL_WINDOW_S` (median).
-"""
+"""Median horizontal displacement of the root within `TRAVEL_WINDOW_S`, in metres, from which a clip is locomotion."""
 TRAVEL_WINDOW_S = 1.0
 """Time in seconds over which the displacement of the root is measured."""
 OPTIONS: dict[str, Any] = {
@@ -38,7 +37,7 @@ class DemoEvaluation:
 
     @property
     def sentence(self) -> str:
-        """The quality of the clips, in a sentence."""
+        """The result of the evaluation, in one sentence; if nothing was evaluated, the reason."""
         if self.summary is None:
             return f"None of {self.clips} retargeted clips is locomotion, so nothing was evaluated."
         return str(self.summary["verdict"])
@@ -78,7 +77,7 @@ def evaluate_locomotion(
 
 
 def travels(clip: ClipHandle, root: str) -> bool:
-    """Return whether the root's median horizontal displacement over `TRAVEL_WINDOW_S` is at least `TRAVEL_M`."""
+    """Return whether a clip is locomotion: its root moves a median of at least `TRAVEL_M` within `TRAVEL_WINDOW_S`."""
     rate_hz = float(clip.item.summary["frame_rate_hz"])
     window = round(TRAVEL_WINDOW_S * rate_hz)
     if int(clip.item.summary["frames"]) <= window:

@@ -60,7 +60,7 @@ class DemoReport:
 
     @property
     def warnings(self) -> Counter[str]:
-        """The number of files that have a warning, by the code of the warning."""
+        """The number of files with each import warning, by the code of the warning."""
         return Counter(code for entry in self.entries for code in {warning.code for warning in entry.warnings})
 
     def as_dict(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from marey_client.cli.demo.versions import version_results
 from marey_client.cli.terminal.output import print_json, print_message
 from marey_client.credentials import ADMIN_TOKEN, read_secret
 from marey_client.errors import NotFound
-from marey_client.extras import room
+from marey_client.extras import import_optional
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.imports import FoundFiles, LocalFile, find_files
@@ -57,7 +57,7 @@ def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json:
 
 @dataclass
 class Story:
-    """Steps of the demonstration in one project."""
+    """The demonstration in one project, step by step."""
 
     project: ProjectHandle
     files: FoundFiles
@@ -124,7 +124,7 @@ class Story:
         return sorted((clip for clip in clips if _source_path(clip) in sources), key=lambda clip: clip.path)
 
     def _target(self) -> SkeletonHandle:
-        """Return the second skeleton, created on the first run."""
+        """Return the skeleton to which takes are retargeted; it is created on the first run."""
         found = next(self.project.skeletons.list(path=f"{TAKES}/{SKELETON}"), None)
         return found or self.project.skeletons.create(SKELETON, _game_skeleton_parts(), collection=TAKES)
 
@@ -148,7 +148,7 @@ class Story:
         """
         if not pairs:
             return None
-        figures = room("marey_reports.drawing.contact_sheet", "all")
+        figures = import_optional("marey_reports.drawing.contact_sheet", "all")
         load = _clip_loader(self.project)
         takes = [figures.TakePair(source.name, load(source), load(result)) for source, result in pairs]
         path = self.data / "contact-sheet.png"
@@ -162,9 +162,9 @@ class Story:
 def _generated_takes(folder: Path) -> FoundFiles:
     """Return generated walks, runs and turns as BVH files; they are the same on every machine."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_bvh = room("marey_motion.formats", "all").write_bvh
+    write_bvh = import_optional("marey_motion.formats", "all").write_bvh
     files = []
-    for take in room("marey_motion.gait", "all").generate_dataset():
+    for take in import_optional("marey_motion.gait", "all").generate_dataset():
         path = folder / f"{take.name}.bvh"
         path.write_bytes(write_bvh(take.clip))
         files.append(LocalFile(path.name, path, path.stat().st_size))
@@ -173,9 +173,9 @@ def _generated_takes(folder: Path) -> FoundFiles:
 
 def _game_skeleton_parts() -> dict[str, Any]:
     """Return a skeleton whose joint names, proportions, rest pose and axes differ from those of the takes' skeleton."""
-    documents = room("marey_motion.documents", "all")
-    rigs = room("marey_motion.rigs", "all")
-    skeleton = room("marey_motion.gait", "all").game_skeleton()
+    documents = import_optional("marey_motion.documents", "all")
+    rigs = import_optional("marey_motion.rigs", "all")
+    skeleton = import_optional("marey_motion.gait", "all").game_skeleton()
     mapping = rigs.map_joints(skeleton)
     parts = {
         "hierarchy": documents.skeleton_to_document(skeleton),
@@ -186,7 +186,7 @@ def _game_skeleton_parts() -> dict[str, Any]:
 
 def _clip_loader(project: ProjectHandle) -> Callable[[ClipHandle], Any]:
     """Return a function that loads clips of the server as clips of `marey_motion`; it loads each skeleton only once."""
-    documents = room("marey_motion.documents", "all")
+    documents = import_optional("marey_motion.documents", "all")
     skeletons: dict[tuple[str, int], Any] = {}
 
     def load(clip: ClipHandle) -> Any:

@@ -21,7 +21,7 @@ PICTURES = ("svg", "png")
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(app, diff, params=OptionsOf("marey_schemas.documents.differences:DifferenceOptions"))
 
 

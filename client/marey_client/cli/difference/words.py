@@ -1,4 +1,4 @@
-"""Descriptions of differences between revisions, for people who know motion data but not the form of the documents."""
+"""Descriptions of differences between revisions as sentences, in terms of motion instead of fields of documents."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MOST_SPANS = 3
 LEAST_TURN_DEG = 0.05
 LEAST_SHIFT_CM = 0.05
 THROUGHOUT = 0.95
-"""The text says `throughout` if the change exceeds the threshold in at least this share of the matched frames."""
+"""Share of the matched frames in which a change must exceed the threshold to be described as `throughout`."""
 
 
 def described(difference: Difference) -> Iterator[str]:
@@ -254,7 +254,7 @@ def _annotation(annotation: AnnotationDifference) -> Iterator[str]:
 
 
 def _shift(change: SegmentChange) -> int | None:
-    """Return the number of frames by which a segment moved; None if the segment changed in any other way."""
+    """Return the number of frames by which a segment moved; None if its label or its length changed, too."""
     old, new = change.before, change.after
     if old is None or new is None or old.label != new.label or new.start - old.start != new.end - old.end:
         return None
@@ -262,7 +262,7 @@ def _shift(change: SegmentChange) -> int | None:
 
 
 def _common_shift(changes: Sequence[SegmentChange]) -> int | None:
-    """Return the shift in frames that more than half of the changes share, if at least three do; otherwise None."""
+    """Return the shift in frames that at least three changes, and more than half of all, have in common; or None."""
     shifts = [shift for one in changes if (shift := _shift(one)) is not None]
     most = max(set(shifts), key=shifts.count, default=None)
     return most if most is not None and shifts.count(most) >= 3 and 2 * shifts.count(most) > len(changes) else None

@@ -1,4 +1,4 @@
-"""Command `annotation`: segments and keyframes of clips."""
+"""Commands `annotation`: show, edit, propose, import and export segments and keyframes of clips."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Label = Annotated[str, typer.Argument(help="Label of the segment or keyframe.")]
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(annotation, name="annotation")
     add_command(annotation, merge, params=MERGE)
     add_command(annotation, propose, params=ANNOTATE, job=JOB)
@@ -134,9 +134,14 @@ def move(
     context: typer.Context,
     place: Place,
     at: At,
-    start: Annotated[int | None, typer.Option(min=0, help="New first frame of the segment.")] = None,
+    start: Annotated[
+        int | None, typer.Option(min=0, help="New first frame of the segment. Give either --start or --end.")
+    ] = None,
     end: Annotated[
-        int | None, typer.Option(min=0, help="New end of the segment: the frame after its last frame.")
+        int | None,
+        typer.Option(
+            min=0, help="New end of the segment: the frame after its last frame. Give either --start or --end."
+        ),
     ] = None,
 ) -> None:
     """Move the start or the end of a segment. An adjacent segment is extended or shortened accordingly."""
@@ -164,10 +169,12 @@ def mark(
     place: Place,
     label: Label,
     frame: Annotated[int, typer.Argument(min=0, help="Frame number of the keyframe.")],
-    move_to: Annotated[int | None, typer.Option("--move", min=0, help="Move the keyframe to this frame.")] = None,
+    move_to: Annotated[
+        int | None, typer.Option("--move", min=0, help="Move the keyframe at FRAME to this frame.")
+    ] = None,
     remove_it: Annotated[bool, typer.Option("--remove", help="Remove the keyframe.")] = False,
 ) -> None:
-    """Add, move or remove a keyframe."""
+    """Add a keyframe; with --move or --remove, move it or remove it."""
     if move_to is not None and remove_it:
         raise WrongUsage("give only one of --move and --remove")
     if move_to is not None:
@@ -222,7 +229,8 @@ def import_annotation(
         typer.Argument(
             exists=True,
             dir_okay=False,
-            help="A file of Marey's predecessor, the older programs that Marey replaces (JSON, BSON or bz2).",
+            help="File in the format of Marey's predecessor, the older programs that Marey replaces: JSON, BSON "
+            "or compressed BSON.",
         ),
     ],
     layer: Annotated[str, typer.Option(help="Name of the annotation layer, such as steps.")] = "imported",
@@ -237,7 +245,9 @@ def import_annotation(
             "predecessor. exclusive: the frame after the last frame."
         ),
     ] = DEFAULT_END_INDEX,
-    label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
+    label: Annotated[
+        list[str] | None, typer.Option(help="Import only this label; may be repeated. Default: all labels.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Import an annotation of a clip from a file of Marey's predecessor.
@@ -261,15 +271,17 @@ def export_annotation(
     form: Annotated[
         AnnotationForm | None,
         typer.Option(
-            help="Layout of the file. labels: the segments of each label. list: one list of all segments, without "
-            f"labels. frames: the frames of each label. Default: {DEFAULT_FORM}."
+            help="Layout of the file. labels: the segments of each label. list: one list of all segments, "
+            "without labels. frames: the frames of each label. Default: the imported file, if the "
+            f"annotation is unchanged, else {DEFAULT_FORM}."
         ),
     ] = None,
     end_index: Annotated[
         EndIndex | None,
         typer.Option(
-            help="Meaning of end_idx in the file. inclusive: the last frame of a segment, as in the editor of Marey's "
-            f"predecessor. exclusive: the frame after the last frame. Default: {DEFAULT_END_INDEX}."
+            help="Meaning of end_idx in the file. inclusive: the last frame of a segment, as in the editor of "
+            "Marey's predecessor. exclusive: the frame after the last frame. Default: the imported file, if "
+            f"the annotation is unchanged, else {DEFAULT_END_INDEX}."
         ),
     ] = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Commands of edits as people type them: parsed, written as text, and described with all their parameters."""
+"""Commands of edits in the form `trim start=10`: parsed, written as text, and described with their parameters."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def parameter_rows(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]
 
 
 def object_types(model: type[BaseModel]) -> Iterator[tuple[str, Iterator[tuple[str, str, str, str]]]]:
-    """Return each type of object that a list in a parameter may contain, as a heading and the rows of its fields."""
+    """Return the types of objects in list parameters of a command, each as a heading and the rows of its fields."""
     for name, schema in _parameters(model).items():
         for choice in schema.get("anyOf", (schema,)):
             items = choice.get("items", {})

@@ -41,7 +41,7 @@ With = Annotated[str | None, typer.Option("--with", help="Saved edit whose comma
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(edit, name="edit")
     add_command(edit, apply_edit, "apply", params=EDIT, job=JOB)
 
@@ -58,7 +58,7 @@ def apply_edit(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Apply commands to clips, as a job."""
+    """Apply commands, or a saved edit, to clips as a job; the results are new clips or new revisions."""
     addresses = addresses_in_one_project(sources)
     if not (into or params.get("suffix") or params.get("in_place")):
         raise WrongUsage(
@@ -85,7 +85,9 @@ def save_edit(
     do: Do = None,
     file: From = None,
     title: Annotated[str, typer.Option(help="Purpose of the edit.")] = "",
-    message: Annotated[str, typer.Option("--message", "-m", help="Message shown in the history.")] = "",
+    message: Annotated[
+        str, typer.Option("--message", "-m", help="Message of the new revision, shown in the history.")
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Save commands as an edit, or replace the commands of a saved edit."""
@@ -210,7 +212,7 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
 
 
 def _with_ids(marey: Marey, project: str, command: Any) -> Any:
-    """Return a command; if it names a source clip by address, the address is replaced by the clip's id."""
+    """Return a command in which the address of a source clip, if there is one, is replaced by the clip's id."""
     from marey_schemas.kinds import Kind
 
     source = command.get("source") if isinstance(command, dict) else None
@@ -264,7 +266,7 @@ def _print_preview(shown: EditPreview, piece: int) -> None:
 
 
 def _finding(finding: dict[str, Any]) -> str:
-    """Return one line of text with what a command reported about a clip; segments appear as ranges of frames."""
+    """Return the measurements that a command reported about a clip, in one line; segments are ranges of frames."""
     figures = []
     for name, value in finding.items():
         if name == "segments":

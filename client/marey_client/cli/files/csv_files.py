@@ -9,7 +9,7 @@ from pathlib import Path
 from marey_client.cli.terminal.failures import WrongUsage
 
 _BEYOND = "\0"
-"""Key under which the CSV reader stores cells that have no column name."""
+"""Key of a row under which the CSV reader stores the cells beyond the last column."""
 
 
 def rows_of(table: Path) -> dict[int, dict[str, str | None]]:
@@ -27,10 +27,13 @@ def rows_of(table: Path) -> dict[int, dict[str, str | None]]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise WrongUsage(f"{table} cannot be read as a CSV file: {error}") from None
     if not rows:
-        raise WrongUsage(f"{table} has no rows below its column names")
+        raise WrongUsage(f"{table} has no rows below its column names; add at least one row")
     if twice := [name for name, count in names.items() if count > 1]:
         raise WrongUsage(f"{table} has several columns named {twice[0]!r}; give each column its own name")
     for number, row in rows.items():
         if _BEYOND in row:
-            raise WrongUsage(f"{table}, row {number}: the row has more cells than the table has columns")
+            raise WrongUsage(
+                f"{table}, row {number}: the row has more cells than the table has columns; remove cells, or put "
+                "texts with commas into quotes"
+            )
     return rows

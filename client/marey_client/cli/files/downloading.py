@@ -1,4 +1,4 @@
-"""Command `download`."""
+"""Command `download`, which writes clips and other items to files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DOWNLOADS_AT_ONCE = 4
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(download)
 
 
@@ -48,19 +48,20 @@ def download(
     ] = "original",
     revision: RevisionNumber = None,
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
-    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m. Default: cm.")] = None,
     part: Annotated[
         str | None,
         typer.Option(
-            help="Part to write in the predecessor's format: tree (of a model), alignment (of an aligned clip), or "
-            "skeleton_model (of a skeleton)."
+            help="With --format predecessor: part of the item to write instead of the item, which is tree (of a "
+            "model), alignment (of an aligned clip), or skeleton_model (of a skeleton)."
         ),
     ] = None,
     layout: Annotated[
         str | None,
         typer.Option(
-            help="Layout in the predecessor's format: 2 or 3 for models, database or file for skeletons. Default: the "
-            "imported file, if the item is unchanged."
+            help="With --format predecessor: layout of the file, which is 2 or 3 for models, database or file "
+            "for skeletons. Default: the imported file, if the item is unchanged; otherwise, the server "
+            "chooses."
         ),
     ] = None,
     fold_positions: Annotated[
@@ -81,7 +82,7 @@ def download(
 
     Aligned clips in a folder are written only if there are no other clips in it. After `@`, name a revision of the
     clip, or a version of the dataset. Other items, such as edits and evaluations, are written with `--format json`. For
-    models, graphs, skeletons and annotations, there is also `--format predecessor`.
+    models, graphs, skeletons and annotations, there is also `--format predecessor`, the format of Marey's predecessor.
 
     An existing file is replaced; if several clips would have the same file name, later clips get a number.
     """
@@ -152,7 +153,10 @@ def _entries_of(project: ProjectHandle, version: DatasetInput) -> list[_Exported
         handle = ClipHandle(project.transport, project.name, item)
         found.append(_Exported(handle, entry.revision, folder, name or item.name))
     if not found:
-        raise WrongUsage(f"{version.dataset}@{version.version} has no clip at {version.path or 'any path'}")
+        raise WrongUsage(
+            f"{version.dataset}@{version.version} has no clip at {version.path or 'any path'}; `marey dataset "
+            "entries` lists its entries"
+        )
     return found
 
 

@@ -1,4 +1,4 @@
-"""Commands `ls` and `show`."""
+"""Commands `ls`, which lists items and folders, and `show`, which describes an item."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _of_summary(name: str) -> Callable[[Item], object]:
 
 
 RECORDED = ("subject", "action", "take", "shoot_day", "select", "licence", "capture_system", "consent_until")
-"""Columns with fields of take records."""
+"""Columns whose values are fields of the take record of a clip."""
 STALE = "stale"
 COLUMNS: dict[str, Callable[[Item], object]] = {
     "kind": lambda item: item.kind,
@@ -54,7 +54,7 @@ FIGURES = ("revision", "joints", "frames", "Hz", "seconds")
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     for command in (ls, show):
         app.command()(command)
 
@@ -80,7 +80,10 @@ def ls(
         typer.Option("--explain", help="Print no list, but count the items that each condition of --query excludes."),
     ] = False,
     stale: Annotated[
-        bool, typer.Option("--stale", help="List only stale results: an input of the result has a newer revision now.")
+        bool,
+        typer.Option(
+            "--stale", help="List only stale results: results of jobs of which an input now has a newer revision."
+        ),
     ] = False,
     sort: Annotated[
         str,
@@ -101,7 +104,7 @@ def ls(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List the contents of a folder."""
+    """List the folders and items in a folder, the projects that you may read, or the items that options select."""
     if place is None:
         from marey_client.cli.projects import list_projects
 
@@ -109,7 +112,7 @@ def ls(
     address = Address.parse(place)
     if deleted:
         if explain or stale:
-            raise WrongUsage("--deleted cannot be combined with --explain or --stale")
+            raise WrongUsage("--deleted cannot be combined with --explain or --stale; leave out one of these options")
         return _show_deleted(context, address, kind, tag, find, query, as_json)
     if explain:
         if tag or find or stale:
@@ -241,7 +244,7 @@ def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:
 
 
 def _folders_in(marey: Marey, address: Address) -> list[str]:
-    """Return the names of the folders directly in the folder at an address."""
+    """Return the names of the folders directly in the folder at an address, sorted."""
     below = marey.project(address.project).collections.list(path=address.path)
     names = (one.path.removeprefix(address.path).strip("/").partition("/")[0] for one in below)
     return sorted({name for name in names if name})

@@ -27,7 +27,7 @@ ERRORS_SHOWN = 20
 
 
 class _RecordChange(NamedTuple):
-    """Values to set in the record of a clip, and the place from which the values come."""
+    """Values to set in the take record of a clip, and their origin for error texts: an option or a row of the table."""
 
     clip: ClipHandle
     values: Mapping[str, Any]
@@ -35,7 +35,7 @@ class _RecordChange(NamedTuple):
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(record)
 
 
@@ -51,8 +51,9 @@ def record(
     table: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file with one row for each clip: a column `clip` (name, or path below PLACE) or `file` (name of "
-            "the imported file), and a column for each field to set. Empty cells change nothing."
+            help="CSV file with one row for each clip. A column `clip` (name, or path below PLACE) or `file` "
+            "(name of the imported file) identifies the clip; each other column sets the field of its name. "
+            "Empty cells change nothing."
         ),
     ] = None,
     column: Annotated[

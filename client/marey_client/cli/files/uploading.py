@@ -1,4 +1,4 @@
-"""Command `upload`."""
+"""Command `upload`, which imports motion files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     add_command(app, upload, options=UPLOAD)
 
 
@@ -89,7 +89,10 @@ def _skeleton_at(marey: Marey, project: str, place: str) -> str:
 
     address = Address.parse(place)
     if address.project != project:
-        raise WrongUsage(f"the skeleton {place} is not in the project {project}, which receives the files")
+        raise WrongUsage(
+            f"the skeleton {place} is not in the project {project}, which receives the files; name a skeleton of this "
+            "project"
+        )
     return str(require_item(marey, address, [Kind.SKELETON]).id)
 
 

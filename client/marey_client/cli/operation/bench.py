@@ -31,7 +31,7 @@ Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(bench, name="bench")
 
 

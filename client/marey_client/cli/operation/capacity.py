@@ -15,7 +15,7 @@ MOST = 10**15
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     app.command()(capacity)
 
 
@@ -26,10 +26,10 @@ def capacity(
     days: Annotated[float, typer.Option(min=0.001, max=MOST, help="Number of days in which all work is done.")] = 30.0,
     workers: Annotated[int, typer.Option(min=1, max=MOST, help="Number of workers, each with one slot.")] = 1000,
     servers: Annotated[
-        int, typer.Option(min=1, max=MOST, help="Number of server processes that share a database.")
+        int, typer.Option(min=1, max=MOST, help="Number of server processes that share the database.")
     ] = 100,
     database_processors: Annotated[
-        int, typer.Option(min=1, max=MOST, help="Number of processors of the database.")
+        int, typer.Option(min=1, max=MOST, help="Number of processors of the machine on which the database runs.")
     ] = 8,
     costs: Annotated[
         Path | None, typer.Option(help="File of measured costs; default: the file that is part of this version.")

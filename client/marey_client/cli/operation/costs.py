@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 CHECKED = "2,8"
 MOST_CHECKED = 64
 FURTHER = 32
-"""Further number of workers for which jobs per second are predicted, but not measured."""
+"""Number of workers for which jobs per second are always predicted, but not measured."""
 
 
 def add_to(_app: typer.Typer) -> None:

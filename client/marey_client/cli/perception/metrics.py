@@ -1,4 +1,4 @@
-"""Commands `metric ls`, `metric show`, `metric store` and `metric compare`."""
+"""Commands of the group `metric`: perceptual metrics, and comparisons of clips by them."""
 
 from __future__ import annotations
 
@@ -46,12 +46,15 @@ Shown = Annotated[
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(metric, name="metric")
 
 
 def metric_at(marey: Marey, name: str | None) -> str | None:
-    """Return the name of a built-in metric or the id of a stored one. Raises `WrongUsage` if there is none."""
+    """Return the name of a built-in metric, or the id of the metric at an address.
+
+    Raises `WrongUsage` if there is none.
+    """
     from marey_schemas.documents.metrics import is_built_in
     from marey_schemas.kinds import Kind
 
@@ -65,7 +68,12 @@ def metric_at(marey: Marey, name: str | None) -> str | None:
 @metric.command("ls")
 def list_metrics(
     context: typer.Context,
-    place: Annotated[str | None, typer.Argument(help="Project or folder whose stored metrics are listed, too.")] = None,
+    place: Annotated[
+        str | None,
+        typer.Argument(
+            help="Project or folder whose stored metrics are listed, too. Default: only built-in metrics are listed."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the built-in metrics, and the stored metrics of a project."""
@@ -138,13 +146,19 @@ def compare(
     params: Chosen,
     job: Chosen,
     metric: MetricName = None,
-    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "--output", "-o", help="Also write the report of the comparison, an HTML page, to this file."
+        ),
+    ] = None,
     figures: Annotated[
-        Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
+        Path | None,
+        typer.Option(help="Also write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
     ] = None,
     maps: Annotated[
         Path | None,
-        typer.Option(help="Write motion maps and registration curves to this file, as a NumPy archive (.npz)."),
+        typer.Option(help="Also write motion maps and registration curves to this file, as a NumPy archive (.npz)."),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
@@ -189,7 +203,10 @@ add_command(metric, compare, params=DISTANCES, job=FINDINGS_JOB)
 
 
 def _document(context: typer.Context, name: str) -> MetricDocument:
-    """Return the document of a metric, given by name, by file or by address; only an address needs the server."""
+    """Return the document of a metric that is given as the name of a built-in one, as a JSON file, or as an address.
+
+    Only an address needs the server.
+    """
     from marey_schemas.documents.metrics import MetricDocument, built_in_metric, is_built_in
 
     if name.endswith(".json"):
@@ -223,6 +240,6 @@ def _print_distances(document: Mapping[str, Any]) -> None:
 
 
 def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document with its tables as lists."""
+    """Return a document in which lists replace numpy arrays, so that it can be printed as JSON."""
     tables = {name: part.tolist() for name, part in document["components"].items()}
     return {**document, "distances": document["distances"].tolist(), "components": tables}

@@ -1,4 +1,4 @@
-"""Command `quality`."""
+"""Command `quality`, which measures defects of clips."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CLIPS_SHOWN = 10
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command of this module."""
+    """Add the command of this module to the application `app`."""
     add_command(app, quality, params=QUALITY, job=JOB)
 
 
@@ -38,8 +38,8 @@ def quality(
     reference: Annotated[
         list[str] | None,
         typer.Option(
-            help="Recorded clips, or a folder of them, that are measured in the same way and shown beside the others; "
-            "may be repeated."
+            help="Recorded clip, or folder of such clips, as reference: it is measured in the same way, and its "
+            "totals are shown beside those of the clips; may be repeated."
         ),
     ] = None,
     contacts: Annotated[
@@ -51,12 +51,21 @@ def quality(
     ] = None,
     against: Annotated[
         str | None,
-        typer.Option(metavar="JOB", help="Id of an earlier job of this kind; print how the totals changed since."),
+        typer.Option(
+            metavar="JOB",
+            help="Id of an earlier job of `marey quality`: also print how the totals have changed since that job.",
+        ),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
-    csv: Annotated[Path | None, typer.Option(help="Write one row for each clip to this file, as CSV.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "--output", "-o", help="Also write the report of the measurement, an HTML page, to this file."
+        ),
+    ] = None,
+    csv: Annotated[Path | None, typer.Option(help="Also write one row for each clip to this file, as CSV.")] = None,
     figures: Annotated[
-        Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
+        Path | None,
+        typer.Option(help="Also write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,

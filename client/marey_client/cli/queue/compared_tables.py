@@ -18,7 +18,10 @@ FORMULA_SIGNS = tuple("=+-@\t\r")
 
 
 class RunTable(NamedTuple):
-    """Table of exact values; `numeric` are the headings of columns of numbers, `best` the best cells (row, column)."""
+    """Table of exact values.
+
+    `numeric`: headings of the columns of numbers; `best`: the best cells, as (row, column).
+    """
 
     heads: tuple[str, ...]
     rows: list[list[Value | None]]
@@ -26,7 +29,7 @@ class RunTable(NamedTuple):
     best: frozenset[tuple[int, int]]
 
     def texts(self) -> list[list[str]]:
-        """Return the cells as short texts for people; best values are marked."""
+        """Return the cells as short texts for people; best values end with a mark."""
         return [
             [_short(cell) + BEST * ((place, column) in self.best) for column, cell in enumerate(row)]
             for place, row in enumerate(self.rows)
@@ -42,7 +45,7 @@ class RunTable(NamedTuple):
 
 
 def shown_columns(comparison: RunComparison, *, every: bool) -> tuple[ComparedColumn, ...]:
-    """Return the columns in which the runs differ; all columns with `every`, and for a single run."""
+    """Return the columns in which the runs differ; with `every` or for a single run, all columns."""
     every = every or len(comparison.runs) < 2
     return tuple(column for column in comparison.columns if every or column.differs)
 

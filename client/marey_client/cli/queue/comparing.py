@@ -50,8 +50,9 @@ def compare(
         str,
         typer.Option(
             metavar="ORDER",
-            help="created_at, fields.NAME or values.NAME; a leading - sorts in descending order. The first value of "
-            "a field in this order is the best, unless --highest or --lowest names the field.",
+            help="Order of the runs: created_at, fields.NAME for a logged field, or values.NAME for a parameter; "
+            "a leading - sorts in descending order. The first value of the field in this order is the best, "
+            "unless --highest or --lowest names the field.",
         ),
     ] = "-created_at",
     limit: Annotated[
@@ -68,21 +69,28 @@ def compare(
     chart: Annotated[
         Path | None,
         typer.Option(
-            help="Draw to this file: .html contains a page with all charts and tables, .svg or .png one chart."
+            help="Draw charts to this file instead of printing a table: .html is a page with all charts and "
+            "tables, .svg or .png one chart."
         ),
     ] = None,
     plot: Annotated[
         Literal["lines", "scatter", "bars"] | None,
         typer.Option(
-            help="Kind of chart: lines over steps (lines), a field over a parameter (scatter), or bars. Default: in a "
-            ".html page all kinds, in a .svg or .png the first kind for which there are values."
+            help="With --chart: kind of chart. lines: fields over steps; scatter: a field over a parameter; "
+            "bars: a bar for each setting. Default: in a .html page all kinds, in a .svg or .png the first "
+            "kind for which there are values."
         ),
     ] = None,
     parameter: Annotated[
         str | None,
-        typer.Option(help="Parameter on the horizontal axis. Default: the first one that differs between the runs."),
+        typer.Option(
+            help="With --chart: parameter on the horizontal axis. Default: the first one that differs between the runs."
+        ),
     ] = None,
-    log: Annotated[bool, typer.Option("--log", help="Logarithmic scale for fields with positive values.")] = False,
+    log: Annotated[
+        bool,
+        typer.Option("--log", help="With --chart: use a logarithmic scale for fields that have only positive values."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Compare the succeeded runs of a script: a table of the differences, or charts.
@@ -94,10 +102,10 @@ def compare(
     if as_csv and as_json:
         raise WrongUsage("choose one of --csv and --json")
     if chart is None and (plot or parameter or log):
-        raise WrongUsage("--plot, --parameter and --log need --chart")
+        raise WrongUsage("--plot, --parameter and --log have an effect only with --chart; add --chart FILE")
     goals: dict[str, Any] = dict.fromkeys(highest or (), "highest")
     if both := sorted(goals.keys() & set(lowest or ())):
-        raise WrongUsage(f"{both[0]} can be in only one of --highest and --lowest")
+        raise WrongUsage(f"{both[0]} is named by --highest and by --lowest; name it by only one of them")
     goals |= dict.fromkeys(lowest or (), "lowest")
     with connect(context) as marey:
         script = marey.project(project).scripts.at(name)
@@ -121,7 +129,7 @@ def _ending_of(chart: Path | None) -> str:
 
 
 def _origin(marey: Marey, project: str) -> ReportOrigin:
-    """Return the origin of a page that this command draws now."""
+    """Return the facts that a page names as its origin: project, server, user, and the present time."""
     from marey_schemas.documents.report_pages import ReportOrigin
 
     user = marey.me().user

@@ -1,4 +1,4 @@
-"""Commands `job` and `why`."""
+"""Commands of the group `job`, and `why`, which explains the state of a job."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Submit, wat
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(job, name="job")
     add_command(job, submit_job, "submit", job=SEEDED_JOB)
     app.command()(why)
@@ -83,7 +83,11 @@ def submit_job(
     ] = None,
     params: Annotated[
         list[str] | None,
-        typer.Option("--param", help="Parameter as name=value; the value is JSON or plain text; may be repeated."),
+        typer.Option(
+            "--param",
+            help="Parameter as name=value, where the value is JSON or plain text; may be "
+            "repeated. Default: the defaults of the kind.",
+        ),
     ] = None,
     into: Into = "",
     wait: Wait = True,
@@ -151,7 +155,9 @@ def list_jobs(
     kind: Annotated[
         list[str] | None, typer.Option(help="List only jobs of this kind, such as retarget; may be repeated.")
     ] = None,
-    author: Annotated[str | None, typer.Option(help="List only jobs that this user submitted.")] = None,
+    author: Annotated[
+        str | None, typer.Option(help="List only jobs that this user submitted. Default: of all users.")
+    ] = None,
     tasks_of: Annotated[
         str | None,
         typer.Option(
@@ -181,7 +187,10 @@ def list_jobs(
 
 @job.command("show")
 def show_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
-    """Show a job and its attempts."""
+    """Show a job: its parameters, state and result, the commits of its inputs, and its attempts.
+
+    The option --json also shows the inputs.
+    """
     from marey_schemas.queue.jobs import commits_of
 
     with connect(context) as marey:
@@ -203,7 +212,7 @@ def show_log(
     job_id: JobId,
     go_on: Annotated[bool, typer.Option("--follow", "-f", help="Follow the log until the job has ended.")] = False,
 ) -> None:
-    """Print the log of a job."""
+    """Print the log of a job, of all its attempts."""
     with connect(context) as marey:
         for piece in marey.jobs.log(job_id, follow=go_on):
             typer.echo(piece, nl=False)
@@ -211,7 +220,7 @@ def show_log(
 
 @job.command("cancel")
 def cancel_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
-    """Ask a job to stop; a queued job is cancelled at once."""
+    """Ask a job to stop; a job that does not run yet is cancelled at once."""
     with connect(context) as marey:
         found = marey.jobs.cancel(job_id)
     if as_json:
@@ -303,7 +312,7 @@ def why(
     job_id: Annotated[str, typer.Argument(help="Id of a job that is waiting, slow or failed.")],
     as_json: AsJson = False,
 ) -> None:
-    """Explain the state of a job."""
+    """Explain what a job waits for, which worker runs it, or why it has failed."""
     from marey_client.explanations import explain_job
 
     with connect(context) as marey:

@@ -38,7 +38,7 @@ Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until every j
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.command()(pipeline)
     add_command(app, build_model, propose=PROPOSE, job=SEEDED_JOB)
 
@@ -68,8 +68,16 @@ def build_model(
     name: Annotated[str, typer.Option(help="Name of the model.")],
     propose: Chosen,
     job: Chosen,
-    project: Annotated[str | None, typer.Option(help="Project to which local files are uploaded.")] = None,
-    to: Annotated[str | None, typer.Option(help="Skeleton to retarget the takes to: project/folder/name.")] = None,
+    project: Annotated[
+        str | None,
+        typer.Option(help="Project to which local files are uploaded. Default: the takes are clips on the server."),
+    ] = None,
+    to: Annotated[
+        str | None,
+        typer.Option(
+            help="Skeleton to retarget the takes to: project/folder/name. Default: the takes are not retargeted."
+        ),
+    ] = None,
     into: Annotated[str | None, typer.Option(help="Folder of the results; default: the name of the model.")] = None,
     layer: Annotated[
         str | None,
@@ -77,12 +85,19 @@ def build_model(
             help="Layer of the annotations to use. With --propose: name of the layer for the proposed annotations."
         ),
     ] = None,
-    label: Annotated[list[str] | None, typer.Option(help="Use only segments with this label; may be repeated.")] = None,
+    label: Annotated[
+        list[str] | None, typer.Option(help="Use only segments with this label; may be repeated. Default: all labels.")
+    ] = None,
     whole: Annotated[
         bool,
         typer.Option("--whole", help="Do not cut the takes into pieces; use their annotations only to align them."),
     ] = False,
-    rate: Annotated[float | None, typer.Option(help="Frames per second of the aligned clips.")] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Frames per second of the aligned clips. Default: the most common frame rate of the examples."
+        ),
+    ] = None,
     mirror: Annotated[
         bool, typer.Option("--mirror", help="Also train the model on mirrored copies of the examples.")
     ] = False,
@@ -128,7 +143,7 @@ def build_model(
 
 
 def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Return the parameters that `--set step.parameter=value` sets, by step; `step.a.b=value` sets a nested object."""
+    """Return the parameters that `--set step.parameter=value` gives, by step; `step.a.b=value` sets `b` within `a`."""
     chosen: dict[str, dict[str, Any]] = {}
     for text in choices:
         path, equals, value = text.partition("=")
@@ -223,7 +238,7 @@ def _refused(job: Job) -> list[Mapping[str, Any]]:
 
 
 def _print_shortfalls(run: PipelineRun) -> None:
-    """Print, for each step, its refused inputs, the inputs in which it found nothing, its notes, and its commit."""
+    """Print the refused inputs of each step, the inputs in which it found nothing, its notes, and its commit."""
     for step, job in run.steps.items():
         if refused := _refused(job):
             print_message(f"{step} refused {counted(len(refused), 'input')}:")
@@ -239,7 +254,7 @@ def _print_shortfalls(run: PipelineRun) -> None:
 
 
 def print_steps(run: PipelineRun, as_json: bool) -> None:
-    """Print the state of each job."""
+    """Print a table with the state of the job of each step."""
     if as_json:
         print_json({"jobs": dict(run.steps)})
     else:

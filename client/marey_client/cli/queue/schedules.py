@@ -35,7 +35,7 @@ Description = Annotated[str, typer.Option(help="Purpose of the schedule.")]
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(schedule, name="schedule")
 
 
@@ -103,15 +103,34 @@ def change(
     context: typer.Context,
     project: ProjectName,
     name: Name,
-    cron: Annotated[str | None, typer.Option(metavar="TIMES", help="New times, as for `create`.")] = None,
-    timezone: Annotated[str | None, typer.Option(metavar="ZONE", help="New time zone.")] = None,
-    job: Annotated[Path | None, typer.Option("--job", help="JSON file of the new job.")] = None,
+    cron: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIMES",
+            help="New times: minute, hour, day, month and day "
+            "of the week, as for `marey schedule create`. "
+            "Default: unchanged.",
+        ),
+    ] = None,
+    timezone: Annotated[
+        str | None, typer.Option(metavar="ZONE", help="New time zone, such as Europe/Berlin. Default: unchanged.")
+    ] = None,
+    job: Annotated[
+        Path | None,
+        typer.Option("--job", help="JSON file of the new job to submit; - reads standard input. Default: unchanged."),
+    ] = None,
     overlap: Annotated[
         bool | None,
-        typer.Option("--overlap/--no-overlap", help="Whether to submit a job even if the previous job has not ended."),
+        typer.Option(
+            "--overlap/--no-overlap",
+            help="Submit a job even if the previous job has not ended, or "
+            "skip the time in this case. Default: unchanged.",
+        ),
     ] = None,
-    pause: Annotated[bool | None, typer.Option("--pause/--resume", help="Pause the schedule, or resume it.")] = None,
-    description: Annotated[str | None, typer.Option(help="New purpose of the schedule.")] = None,
+    pause: Annotated[
+        bool | None, typer.Option("--pause/--resume", help="Pause the schedule, or resume it. Default: unchanged.")
+    ] = None,
+    description: Annotated[str | None, typer.Option(help="New purpose of the schedule. Default: unchanged.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Change, pause or resume a schedule.

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 script = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Run commands of Git commits, and compare runs.")
 
 OWN_COLUMNS = ("job", "state", "commit", "seed", "author", "created_at", "finished_at")
-"""Columns of runs that are neither values nor fields."""
+"""Names of columns that every script has, in addition to its parameters and logged fields."""
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     add_command(script, run, job=SCRIPT_RUN)
     app.add_typer(script, name="script")
 
@@ -160,17 +160,19 @@ def list_runs(
         list[str] | None,
         typer.Option(
             "--column",
-            help=f"Column: a parameter, a logged field, {', '.join(OWN_COLUMNS[:-1])} or {OWN_COLUMNS[-1]}; may be "
-            "repeated. Default: job, state, and all parameters and fields.",
+            help=f"Column to show: a parameter, a logged field, {', '.join(OWN_COLUMNS[:-1])} or "
+            f"{OWN_COLUMNS[-1]}; may be repeated. Default: job, state, and all parameters and fields.",
         ),
     ] = None,
     sort: Annotated[
         str,
         typer.Option(
-            metavar="ORDER", help="created_at, fields.NAME or values.NAME; a leading - sorts in descending order."
+            metavar="ORDER",
+            help="Order of the runs: created_at, fields.NAME for a logged field, or values.NAME "
+            "for a parameter; a leading - sorts in descending order.",
         ),
     ] = "-created_at",
-    limit: Annotated[int, typer.Option(min=1, max=1000, help="Greatest number of runs.")] = 50,
+    limit: Annotated[int, typer.Option(min=1, max=1000, help="Greatest number of runs to list.")] = 50,
     as_json: AsJson = False,
 ) -> None:
     """List the runs of a script: a table of their parameters and logged fields."""

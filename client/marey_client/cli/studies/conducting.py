@@ -28,7 +28,7 @@ StudyPlace = Annotated[str, typer.Argument(metavar="STUDY", help="The study: pro
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Add the commands of this module to the application `app`."""
     app.add_typer(study, name="study")
 
 
@@ -48,8 +48,12 @@ def create(
     consent: Annotated[Path, typer.Option(help="Text file to whose content participants consent.")],
     title: Annotated[str | None, typer.Option(help="Title that participants see; default: the name.")] = None,
     trials: Annotated[int, typer.Option(min=1, max=200, help="Number of answered trials of each participant.")] = 63,
-    seconds: Annotated[float, typer.Option(min=1, max=120, help="Time for an answer, in seconds.")] = 10.0,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the trials.")] = 0,
+    seconds: Annotated[
+        float, typer.Option(min=1, max=120, help="Seconds that a participant has to answer a trial.")
+    ] = 10.0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**32 - 1, help="Seed of the random trials; the same seed draws the same trials.")
+    ] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Create a study of four to 100 clips, at their newest revisions."""
@@ -65,7 +69,7 @@ def create(
         project = marey.project(addresses[0].project)
         clips = {clip.id: clip for address in addresses for clip in clips_in(marey, address)}
         if not SHOWN <= len(clips) <= MOST_MOTIONS:
-            raise WrongUsage(f"a study has {SHOWN} to {MOST_MOTIONS} clips, and {len(clips)} are given")
+            raise WrongUsage(f"a study needs {SHOWN} to {MOST_MOTIONS} clips, but {len(clips)} were given")
         made = project.studies.design(
             last, list(clips.values()), consent_text=text, title=title, collection=folder, trials=trials,
             seconds=seconds, seed=seed,
@@ -81,7 +85,10 @@ def show(
     place: Annotated[str, typer.Argument(metavar="STUDY", help="The study: project/folder/name[@revision].")],
     browser: InBrowser = False,
 ) -> None:
-    """Show the design, the participants and the results in a browser. The address signs one browser in, once."""
+    """Print the address of a page with the design, the participants and the results, or open the page with --browser.
+
+    The address signs in the first browser that opens it, once.
+    """
     from marey_schemas.kinds import Kind
     from marey_schemas.sign_ins import STUDY_PATH
 
@@ -97,7 +104,10 @@ def show(
 def invite(
     context: typer.Context,
     place: StudyPlace,
-    count: Annotated[int, typer.Option("--count", "-n", min=1, max=100, help="Number of links.")] = 1,
+    count: Annotated[
+        int,
+        typer.Option("--count", "-n", min=1, max=100, help="Number of links to create; each is for one participant."),
+    ] = 1,
     days: Annotated[
         int, typer.Option(min=1, max=180, help="Number of days within which participants must begin.")
     ] = 30,
@@ -140,9 +150,14 @@ def participants(context: typer.Context, place: StudyPlace, as_json: AsJson = Fa
 def withdraw(
     context: typer.Context,
     place: StudyPlace,
-    participant: Annotated[str, typer.Argument(metavar="PARTICIPANT", help="Pseudonym or id, as in the list.")],
+    participant: Annotated[
+        str,
+        typer.Argument(
+            metavar="PARTICIPANT", help="Pseudonym or id of the participant; `marey study participants` lists both."
+        ),
+    ],
 ) -> None:
-    """Delete consent and trials of a participant, who then counts as withdrawn; the link ends."""
+    """Withdraw a participant: delete the participant's consent and trials, and make the link invalid."""
     with connect(context) as marey:
         found = study_at(marey, place)
         named = [one for one in found.participants() if participant in (one.id, one.participant)]

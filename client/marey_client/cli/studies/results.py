@@ -25,7 +25,7 @@ ANALYSE = OptionsOf("marey_schemas.queue.job_params:AnalyseStudyParams")
 
 
 class ExportForm(StrEnum):
-    """Form of exported judgements."""
+    """Form of the file with exported judgements: trials as JSON or CSV, or compared pairs as CSV."""
 
     JSON = "json"
     CSV = "csv"
@@ -41,12 +41,12 @@ def add_to(_app: typer.Typer) -> None:
 def export(
     context: typer.Context,
     place: StudyPlace,
-    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="File to write.")],
+    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="File that receives the judgements.")],
     form: Annotated[
         ExportForm,
         typer.Option(
-            help="json: participants with their trials; csv: one line for each trial; pairs: one line for each "
-            "comparison of the chosen pair with another pair."
+            help="Form of the file. json: participants with their trials; csv: one line for each trial; pairs: "
+            "one line for each comparison of the chosen pair with another pair."
         ),
     ] = ExportForm.CSV,
     revision: Annotated[int | None, typer.Option(min=1, help="Revision of the study; default: the newest.")] = None,
@@ -72,12 +72,19 @@ def analyse(
     place: StudyPlace,
     params: Chosen,
     job: Chosen,
-    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
-    metric: Annotated[Path | None, typer.Option(help="Write the best fitted metric to this file, as JSON.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "--output", "-o", help="Also write the report of the analysis, an HTML page, to this file."
+        ),
+    ] = None,
+    metric: Annotated[
+        Path | None, typer.Option(help="Also write the best fitted metric to this file, as JSON.")
+    ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Compute differences, order and groups of the motions, and fit metrics. For maintainers and owners."""
+    """Compute perceived differences, order and groups of the motions, and fit metrics. For maintainers and owners."""
     from marey_client.handles.findings import Findings
 
     if (out is not None or metric is not None) and not wait:

@@ -11,7 +11,7 @@ from marey_client.cli.terminal.output import print_message
 
 
 def ask(question: str, *, otherwise: str) -> None:
-    """Ask for confirmation; if the answer is not yes, print `otherwise` and raise `Refused`.
+    """Ask the user to confirm; if the answer is not yes, print the text `otherwise` and raise `Refused`.
 
     Raises `WrongUsage` if standard input is not a terminal.
     """

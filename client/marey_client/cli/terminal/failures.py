@@ -92,7 +92,7 @@ def interrupted_by_sigterm() -> Iterator[None]:
 
 
 def sentence(error: BaseException) -> str:
-    """Return an error in one line, with its code, request id, server and notes if it has them."""
+    """Return an error as one line of text; for an error of the server also its code, request id, address and notes."""
     from marey_client.errors import NotFound, RequestFailed
 
     text = " ".join(_text_of(error).split()) or type(error).__name__

@@ -1,4 +1,4 @@
-"""Commands that submit jobs: their common options, the progress bar, and the output at the end of a job."""
+"""Help for commands that submit jobs: common options, the progress bar, and the output at the end of a job."""
 
 from __future__ import annotations
 
@@ -68,7 +68,12 @@ Sources = Annotated[
     ),
 ]
 Into = Annotated[str, typer.Option(help="Folder for the results, in the same project.")]
-Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")]
+Wait = Annotated[
+    bool,
+    typer.Option(
+        "--wait/--no-wait", help="Wait until the job has ended. With --no-wait, print the id of the job instead."
+    ),
+]
 
 
 def clips_at(marey: Marey, address: Address) -> ExistingInput:

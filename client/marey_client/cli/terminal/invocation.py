@@ -41,7 +41,7 @@ AllowExpiredConsent = Annotated[
 
 @dataclass(frozen=True)
 class Invocation:
-    """Global options of `marey`."""
+    """Values of the global options of `marey` in one call: server, token file, and verbosity."""
 
     server: str | None
     token_file: Path | None
@@ -76,7 +76,7 @@ def refuse_ignored(context: typer.Context, when: str, *names: str) -> None:
 
 @contextmanager
 def connect_other(url: str | None, token_file: Path | None, first: Marey) -> Iterator[Marey]:
-    """Return a connection to the server at `url`, or, without `url`, the given connection to the first server."""
+    """Return a connection to the other server of a command, at `url`; without `url`, the connection `first`."""
     from marey_client.cli.terminal.failures import WrongUsage
     from marey_client.credentials import resolve_other
     from marey_client.errors import Unauthenticated
@@ -130,7 +130,7 @@ def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Mare
 
 
 def _nearest_project(marey: Marey, name: str) -> str:
-    """Return advice about the name of a project that does not exist."""
+    """Return advice for the name of a project that does not exist: the most similar name, or how to list all."""
     from itertools import islice
 
     from marey_schemas.wording import nearest

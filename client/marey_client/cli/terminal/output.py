@@ -58,7 +58,7 @@ def _shown(cell: object) -> str:
 
 
 def ago(moment: datetime, now: datetime) -> str:
-    """Return how long ago a moment was, in its largest unit; a moment after `now`, by another clock, is "0 s ago"."""
+    """Return the time from `moment` to `now` in one unit, such as "3 h ago"; "0 s ago" if `moment` is after `now`."""
     seconds = max(0, int((now - moment).total_seconds()))
     for unit, length_s in (("d", 86_400), ("h", 3_600), ("min", 60)):
         if seconds >= length_s:
@@ -67,7 +67,7 @@ def ago(moment: datetime, now: datetime) -> str:
 
 
 def print_rows(rows: Iterable[tuple[str, str, str]]) -> None:
-    """Print rows of a name, a number aligned to the right, and its unit."""
+    """Print rows, each of a name, a number aligned to the right, and the unit of the number."""
     rows = list(rows)
     widths = [max(len(row[place]) for row in rows) for place in range(2)]
     for name, figure, meaning in rows:

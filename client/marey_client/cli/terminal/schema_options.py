@@ -104,7 +104,7 @@ class OptionsOf:
             yield _Option(path, schema, _several(self.short.get(path[-1], ())), self.nulls.get(name))
 
     def _spelled(self, place: tuple[int | str, ...]) -> str:
-        """Return the spelling of the option for a field, given by its path in the model, for error texts."""
+        """Return the beginning of an error text: the option for the field that has this path in the model."""
         fitting = (one for one in self.options if place[: len(one.path)] == one.path)
         option = next(fitting, None)
         if option is None:
@@ -202,7 +202,7 @@ class _Option:
 
 
 class SchemaCommand(TyperCommand):
-    """Command with options from models; a subclass sets the function, and the models by parameter of the function."""
+    """Command with options from models; a subclass sets the function, and for its parameters the models."""
 
     function: ClassVar[Callable[..., Any]]
     groups: ClassVar[Mapping[str, OptionsOf]]

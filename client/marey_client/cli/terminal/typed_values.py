@@ -24,7 +24,7 @@ MOST_VALUES = 200
 """Greatest number of values in a range if the schema sets no limit."""
 EVEN = 1e-9
 GREATEST_SHOWN_BOUND = 1e15
-"""Bounds of numbers are shown only below this value; larger bounds are the limits of machine integers."""
+"""Bound from which the range of a number is not shown, because it is a limit of integers and not of the parameter."""
 
 
 # -- schemas --
@@ -60,7 +60,7 @@ def _takes(schema: Schema, kind: str) -> bool:
 
 
 def without_null(schema: Schema) -> Schema:
-    """Return the schema of the values other than null."""
+    """Return the schema of a value without the alternative null."""
     others = [one for one in _choices(schema) if one.get("type") != "null"]
     return schema if len(others) == len(_choices(schema)) or len(others) > 1 else others[0]
 
