@@ -50,14 +50,17 @@ from marey_versions.tree.reading import Tree
 
 @dataclass(frozen=True)
 class FolderCommit:
-    """Folder from which a commit is made."""
+    """State of the dataset's folder from which a commit is made."""
 
     rev: int
     """`rev` of the dataset when the folder was read."""
     was: str | None
     """Value of `dataset.folder_commit` when the folder was read."""
     partial: FolderManifest | None
-    """New manifest of the folder, but with the old commit; None if a whole version is checked out in the folder."""
+    """Record of the folder's entries after the commit, still with the commit before it.
+
+    None if a whole version is checked out in the folder.
+    """
 
 
 @dataclass(frozen=True)
@@ -277,10 +280,11 @@ def _require_checked_out(found: Row[Any], manifest: FolderManifest | None, paren
 def _from_folder(
     tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, head: str | None
 ) -> tuple[str, Contents, FolderCommit]:
-    """Store a tree of entries that is made from the items in the dataset's folder.
+    """Store the tree of a new version, made from the items in the dataset's folder.
 
-    If the branch has a commit `head`, only the entries that differ from what was checked out are changed in its tree.
-    Returns the digest of the root of the tree, the content digests of the items, and the state of the folder.
+    If the branch has a newest commit `head`, the tree is that of `head`, changed only in the entries that differ
+    between the folder and what was checked out in it. Returns the digest of the root of the tree, the content digests
+    of the items, and the state of the folder. Raises `ConflictProblem` if another version is checked out in the folder.
     """
     manifest = read_manifest(tx, found)
     _require_checked_out(found, manifest, head)

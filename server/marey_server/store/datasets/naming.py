@@ -182,7 +182,7 @@ def lock_refs(tx: Transaction, dataset_id: str) -> None:
 
 
 def read_ref(tx: Transaction, project: str, name: str, ref: str) -> Ref:
-    """Return a branch or a tag."""
+    """Return a branch or a tag. Raises `NotFoundProblem` if the dataset does not have it."""
     row = find_dataset(tx, projects.require(tx, project), name)
     found = find_ref(tx, row.id, ref)
     if found is None:
@@ -262,9 +262,10 @@ def dataset_replaced(name: str) -> ConflictProblem:
 
 
 def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_rev: ExpectedRev) -> None:
-    """Delete a branch or a tag; the commits stay. The branch `main` cannot be deleted.
+    """Delete a branch or a tag; the commits stay.
 
-    Raises `ConflictProblem` if the branch is protected, or is the source or target of an open proposal.
+    Raises `InvalidProblem` for the branch `main`. Raises `ConflictProblem` if the branch is protected, or is the source
+    or target of an open proposal.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -355,7 +356,10 @@ def first_parents(dataset_id: str, start: str, steps: int) -> CTE:
 
 
 def _commits_by_digits(tx: Transaction, dataset_id: str, name: str) -> Sequence[str]:
-    """Return at most two commits whose digest begins with the digits in `name`; none if `name` is not digits."""
+    """Return the digests of at most two commits that begin with the hexadecimal digits `name`.
+
+    Two digests show that `name` is ambiguous. The result is empty if `name` does not consist of digits.
+    """
     match = _DIGITS.fullmatch(name)
     if match is None:
         return ()

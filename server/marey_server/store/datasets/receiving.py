@@ -64,7 +64,7 @@ class LocalRevisions:
 
     held: Mapping[str, RevisionKey]
     documents: Mapping[str, Mapping[str, str]]
-    """For each revision, by its content digest: the digest of the document of each part, by the name of the part."""
+    """Digests of the revisions' documents: by the content digest of the revision, then by the name of the part."""
     last_purge: int
     """Time of the last purge of the project before the revisions were found."""
     facets: Mapping[str, Mapping[str, float]]
@@ -176,7 +176,7 @@ def store_revisions(
 
 @dataclass(frozen=True)
 class PreparedReceipt:
-    """Commit from an archive or another server, with its computed tree, which has the digest that the commit names."""
+    """Commit from an archive or another server, with the chunks of its tree; the digest of the tree was checked."""
 
     dataset_id: str
     record: CommitRecord

@@ -35,7 +35,7 @@ from marey_server.store.transaction import Transaction
 EXAMINED_AT_ONCE = 100
 """Greatest number of proposals that one call of `WaitingMerges.attempt` examines."""
 IN_VAIN_KEPT = 10_000
-"""Greatest number of proposals for which the last failed merge is remembered."""
+"""Greatest number of proposals whose last failed merge a process remembers."""
 REFUSED_PAUSE_S = 60.0
 """Seconds until a merge that was refused, for example because of a quota, is computed again on the same basis."""
 
@@ -53,9 +53,9 @@ class _PendingMerge(NamedTuple):
 
 
 class _InVain(NamedTuple):
-    """Merge that was computed, but could not be performed: the commits and the rule on which its result depends.
+    """Failed merge of a proposal: `basis` is everything on which the result of the merge depends.
 
-    `again_s` is the monotonic time in seconds before which the merge is not tried again.
+    A merge on the same basis is not tried again before `again_s`, a time in seconds of the monotonic clock.
     """
 
     basis: MergeBasis
@@ -63,13 +63,13 @@ class _InVain(NamedTuple):
 
 
 class WaitingMerges:
-    """Merges waiting proposals in repeated rounds; a round takes the proposals in the order of dataset and number."""
+    """Executor of automatic merges, in rounds: a round takes the proposals in the order of dataset and number."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._last = ("", 0)
         self._in_vain: LruCache[tuple[str, int], _InVain] = LruCache(max_entries=IN_VAIN_KEPT)
-        """Last merge of each proposal that was computed but not performed, by dataset and number of the proposal."""
+        """Last failed merge of each proposal, by the id of the dataset and the number of the proposal."""
 
     def attempt(self) -> int:
         """Examine the next `EXAMINED_AT_ONCE` waiting proposals, and merge those that are ready.
