@@ -70,7 +70,10 @@ def invalid_sign_in() -> NotFoundProblem:
 
 
 def open_in_browser(tx: Transaction, sign_in_id: str, cookie: str, state: str) -> None:
-    """Bind a sign-in to the browser that has a cookie. Raises `NotFoundProblem` if a browser has opened it already."""
+    """Bind a sign-in to the browser that has `cookie`; the provider will send `state` back with this browser.
+
+    Raises `NotFoundProblem` if the sign-in does not exist, has expired, or was opened in a browser already.
+    """
     unopened = browser_sign_in.c.browser_hash.is_(None), browser_sign_in.c.expires_us > tx.now_us
     bound = update(browser_sign_in).where(browser_sign_in.c.id == sign_in_id, *unopened)
     if tx.execute(bound.values(browser_hash=hash_secret(cookie), state_hash=hash_secret(state))).rowcount != 1:
@@ -95,10 +98,12 @@ def use_state(tx: Transaction, state: str, cookie: str) -> tuple[str, int | None
 
 
 def confirm(tx: Transaction, sign_in_id: str, code: str, person: Person, *, creates_users: bool) -> str:
-    """Record that the provider has identified a person, who gets `code`; return the name of the person's user.
+    """Record that the identity provider has identified a person; return the name of the person's user.
 
-    An unknown person becomes a new user if `creates_users` is true. Raises `ForbiddenProblem` if the person has no
-    user or a disabled one, `ConflictProblem` if the name of the new user is taken, and `NotFoundProblem`.
+    The browser then gets `code`, with which the program completes the sign-in. If `creates_users` is true, a new user
+    is created for a person who is not linked with a user. Raises `ForbiddenProblem` if the person has no user, or a
+    disabled user. Raises `ConflictProblem` if the name of the new user is taken, and `NotFoundProblem` if the sign-in
+    cannot continue.
     """
     found = identities.find_identity(tx, person.issuer, person.subject)
     if found is None and not creates_users:
@@ -125,7 +130,10 @@ def confirm(tx: Transaction, sign_in_id: str, code: str, person: Person, *, crea
 
 
 def _name_of(claim: str | None) -> str:
-    """Return the name of a new user: the part before @ of a claim, in lower case. Raises `ForbiddenProblem`."""
+    """Return the name of a new user, from a claim of the identity provider: the part before @, in lower case.
+
+    Raises `ForbiddenProblem` if the result is no valid user name.
+    """
     name = (claim or "").partition("@")[0].lower()
     if not _USER_NAME.fullmatch(name):
         raise ForbiddenProblem(
@@ -137,9 +145,10 @@ def _name_of(claim: str | None) -> str:
 
 
 def redeem(tx: Transaction, sign_in_id: str, request: BrowserSignInCode, attempt: SignInTry) -> NewToken:
-    """Return the token of a sign-in for its code and verifier; this ends the sign-in.
+    """End a sign-in whose code and verifier are given, and return the token.
 
-    `attempt` is the counted try. Raises `NotFoundProblem`, and `ForbiddenProblem` if the user is disabled.
+    `attempt` is the counted try, which no longer counts afterwards. Raises `NotFoundProblem` if the code or the
+    verifier is wrong or the sign-in has expired, and `ForbiddenProblem` if the user is disabled.
     """
     which = (
         browser_sign_in.c.id == sign_in_id,

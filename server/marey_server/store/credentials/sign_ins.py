@@ -24,10 +24,10 @@ from marey_server.store.tables import sign_in_limit
 from marey_server.store.transaction import Transaction
 
 MORE_FOR_MANY = 10
-"""Limit of one address for all accounts, as a multiple of `per_minute`.
+"""Number by which `per_minute` is multiplied for the limit of one address with all accounts.
 
-The limit of one account for all unknown addresses allows the same number of tries at once, but then only `per_minute`
-tries a minute.
+The limit of one account from all unknown addresses together allows the same number of tries at once, and then
+`per_minute` tries a minute.
 """
 KNOWN_FOR_US = 90 * DAY_US
 """Time for which an address is known after a sign-in."""

@@ -192,7 +192,12 @@ def _insert(
 
 
 def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | None:
-    """Return the labels to which a new token is bound: the requested ones, or else the labels of the caller's token."""
+    """Return the labels to which a new token is bound; None if it is not bound to labels.
+
+    They are the requested labels. By default, a token that can claim jobs gets the labels of the caller's token. Raises
+    `InvalidProblem` if a token that cannot claim jobs is to have labels, and `ForbiddenProblem` for a label that the
+    caller's token does not allow.
+    """
     claims_jobs = scopes.reaches_somewhere(request.scopes, "work")
     if request.labels is None:
         return tx.principal.labels if claims_jobs else None
@@ -347,7 +352,10 @@ def revoke_named(tx: Transaction, name: str) -> None:
 
 
 def end_tokens(tx: Transaction, user_id: str, which: EndTokens) -> None:
-    """Revoke tokens of a user, except the token of this request. Does not check whether the principal may do this."""
+    """Revoke the tokens of a user that `which` selects (none, sessions or all), except the token of this request.
+
+    Does not check whether the principal may do this.
+    """
     if which is EndTokens.NONE:
         return
     others = and_(token.c.user_id == user_id, token.c.id != (tx.principal.token_id or ""))
