@@ -117,7 +117,7 @@ def _check_page(
 
 
 def _check_file(tx: Transaction) -> list[StoreDefect]:
-    """Return the faults that SQLite finds in its file and in foreign keys; on Postgres, return none."""
+    """Return the faults of an SQLite file: damaged pages, and references to missing rows. On Postgres, return none."""
     if tx.is_postgres:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
@@ -346,7 +346,10 @@ def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _contents_in(row: Row[Any], digest: str, leaf: Leaf, findings: list[StoreDefect]) -> dict[str, str]:
-    """Return the paths of the entries in a chunk by their content; add a fault to `findings` for each damaged entry."""
+    """Return the paths of the entries in a chunk, by the content digests of the entries.
+
+    For each damaged entry, a fault is added to `findings`.
+    """
     found: dict[str, str] = {}
     for key, value in leaf.entries:
         try:

@@ -78,9 +78,9 @@ def finish(tx: Transaction, key: str, status: int, headers: Mapping[str, str], b
 
 
 def principal_key(principal: Principal) -> str:
-    """Return a text that identifies the owner of the caller's idempotency keys.
+    """Return a text that identifies whose idempotency keys the caller uses.
 
-    The owner is an attempt, a user, or all callers of another kind together.
+    An attempt and a user each have their own keys. All other callers of one kind share their keys.
     """
     if principal.kind == "attempt":
         return f"{principal.job_id}/{principal.fence}"

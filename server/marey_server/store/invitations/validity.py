@@ -21,9 +21,9 @@ DELETED_AT_ONCE = 500
 
 
 def _exists(*which: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return the SQL condition that there is a row that meets all conditions in `which`.
+    """Return the SQL condition EXISTS for rows that meet all conditions in `which`.
 
-    The conditions may compare columns of this row with columns of the invitation in the surrounding query.
+    The conditions may also use columns of the invitation in the surrounding query.
     """
     return exists().where(*which).correlate(invitation)
 
@@ -57,7 +57,7 @@ def is_open(tx: Transaction) -> ColumnElement[bool]:
 
 
 def withdraw_unauthorised(tx: Transaction, *which: ColumnElement[bool]) -> None:
-    """Withdraw invitations that meet `which` and are no longer in force, after a change of rights.
+    """Withdraw the invitations that meet `which` and whose inviter may no longer invite, after a change of rights.
 
     Invitations that are used up or expired are left as they are.
     """

@@ -48,7 +48,11 @@ def prepare_parts(kind: Kind, parts: dict[str, Any]) -> dict[str, PreparedDocume
 
 
 def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
-    """Check and encode the document of one part of an item."""
+    """Check and encode the document of one part of an item.
+
+    Raises `InvalidProblem`, whose JSON Pointers begin with the name of the part, if the kind has no such part or the
+    document is not valid.
+    """
     spec = PARTS[kind].get(part)
     if spec is None:
         detail = f"A {kind} has no part {part!r}; it has {', '.join(PARTS[kind])}."
@@ -167,7 +171,11 @@ def revert_item(
 def change_item(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: ExpectedRev
 ) -> Item:
-    """Rename, move or tag an item. Raises `ConflictProblem` if another item at the new place has the name."""
+    """Rename, move or tag an item.
+
+    Raises `ConflictProblem` if another item of the kind has the name in the collection, `ForbiddenProblem` if the
+    caller may not write to one of the two folders, and `PreconditionFailedProblem` if the item has changed.
+    """
     project_row = projects.require(tx, project)
     rights = rights_of_caller(tx, project_row)
     found = _find_to_change(tx, project_row, kind, item_id)
@@ -190,7 +198,10 @@ def change_item(
 
 
 def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev) -> None:
-    """Hide an item; it can be restored. References to its revisions stay valid."""
+    """Hide an item, which can be restored; references to revisions of the item stay valid.
+
+    Raises `ForbiddenProblem` unless the caller is a maintainer in the folder of the item.
+    """
     project_row = projects.require(tx, project)
     found = _find_to_change(tx, project_row, kind, item_id, Role.MAINTAINER)
     which = (*_in_folder(project_row, kind, found), item.c.deleted_us.is_(None))
@@ -243,7 +254,7 @@ def _find_to_change(
 
 
 def _in_folder(project_row: ProjectRow, kind: Kind, found: Any) -> tuple[Any, ...]:
-    """Return the condition that an item is still in the folder in which the caller's role was checked."""
+    """Return the SQL conditions that an item is still in the folder in which the caller's role was checked."""
     return *_this(project_row, kind, found.id), item.c.collection_id == found.collection_id
 
 

@@ -38,10 +38,10 @@ from marey_server.store.transaction import Transaction
 Tree = dict[str, Any]
 
 DRAFTS_TOGETHER = 256
-"""Greatest number of drafts that are published with the same statements."""
+"""Greatest number of drafts that are published together, with one set of SQL statements."""
 
 _HEAD = (item.c.id, item.c.head, item.c.creator_id, item.c.skeleton_id)
-"""Columns of an item that a draft may use or revise."""
+"""Columns that are read of an item that a draft may use or revise."""
 
 _RACES = 20
 """Greatest number of tries to publish a draft if concurrent writes interfere."""
@@ -59,12 +59,13 @@ def publish(
 ) -> list[Published]:
     """Create items and revisions from drafts, all or none; return them in the order of the drafts.
 
-    In a document, `{"output": name}` refers to another draft and is replaced by the item and revision published from
-    it. The draft of a model may have a sample tree. The tree's `model_digest` may be such a reference, too, and is
-    replaced by the digest of the draft's model. With `refer_to_deleted`, documents may refer to items that are deleted.
+    In a document, `{"output": name}` refers to the draft `name`, and is replaced by the item and revision published
+    from this draft. In the sample tree of a model, `model_digest` may be such a reference, and is replaced by the
+    digest of the draft's model. With `refer_to_deleted`, documents may refer to deleted items.
+
     If an item already has the content of a draft, no new revision is created. Drafts with `same_skeleton` that would
-    change a skeleton (`skeleton_changes`) are left out, also from the result. `rights` are the rights of the user who
-    publishes; they may be None only if all drafts are hidden.
+    change the skeleton of an existing item are left out, and are missing in the result (see `skeleton_changes`).
+    `rights` are the rights of the user who publishes; they may be None only if all drafts are hidden.
 
     Raises `InvalidProblem` for a draft that is not valid, and `ConflictProblem` for a name that is taken. Raises
     `ForbiddenProblem` if `rights` do not allow writing to the folder of a new item or revision.
@@ -283,10 +284,7 @@ class _Publication:
 
     @staticmethod
     def _first_of_equals(new: Sequence[_Ready]) -> list[_Ready]:
-        """Return the first draft of each content.
-
-        The other drafts with this content use the item that the first one creates.
-        """
+        """Return the first of all drafts with the same content; the others then use the item that it creates."""
         firsts: dict[tuple[str | None, ...], _Ready] = {}
         for one in new:
             firsts.setdefault(one.required, one)
@@ -410,10 +408,10 @@ class _Publication:
 
 
 def _names(draft: Draft) -> Iterator[str]:
-    """Yield the names to try for a new item.
+    """Yield the names to try for a new item, until one is free.
 
-    The first is the name that the draft asks for. If the draft reuses items with equal content, an item with other
-    content may have this name; therefore, numbered names follow without end: `walk-2`, `walk-3` and so on.
+    The first is the name of the draft. A draft with `reuse="by_content"` may get another name, because an item with
+    other content may have its name. So numbered names follow for it without end: `walk-2`, `walk-3` and so on.
     """
     yield draft.item_name
     if draft.reuse == "by_content":
