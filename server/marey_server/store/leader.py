@@ -46,7 +46,7 @@ def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | Non
 
 
 def holds_lead(tx: Transaction, lead: Lead) -> bool:
-    """Return whether this process still leads; if so, no other process can take the lead before the transaction ends."""
+    """Return whether this process still leads; if so, nobody else can take the lead until the transaction ends."""
     which = (leader.c.name == lead.name, leader.c.holder == lead.holder, leader.c.fence == lead.fence)
     return tx.execute(select(leader.c.fence).where(*which).with_for_update(read=True)).first() is not None
 

@@ -69,7 +69,10 @@ def _moved_by(one: LoadedDraft) -> Collection[str]:
 
 
 def _rig(given: LoadedDraft | None, stored: _StoredSkeleton | None) -> RigDocument | None:
-    """Return the rig of a skeleton that is either another draft or stored; None if it is neither."""
+    """Return the rig of the skeleton that a draft refers to: another draft (`given`) or a stored skeleton.
+
+    Returns None if it is neither.
+    """
     if given is not None and "hierarchy" in given.contents:
         return RigDocument(given.contents["hierarchy"].digest, given.bodies["hierarchy"])
     return None if stored is None else stored.rig
@@ -78,10 +81,10 @@ def _rig(given: LoadedDraft | None, stored: _StoredSkeleton | None) -> RigDocume
 def _on_own_skeletons(
     tx: Transaction, loaded: Sequence[LoadedDraft], own: Mapping[str, _StoredSkeleton]
 ) -> list[LoadedDraft]:
-    """Return the drafts; a draft named in `own` refers to the skeleton given there, which its item already uses.
+    """Return the drafts, of which those named in `own` now refer to the skeletons in `own`, as their items do already.
 
-    If only such drafts used a new skeleton, the draft of the new skeleton gets the rig of an existing skeleton, so that
-    no skeleton is created from it.
+    If no other draft uses a new skeleton any more, the draft of the new skeleton gets the rig of the skeleton in `own`,
+    so that no skeleton is created from it.
     """
     others = {name for one in loaded if one.draft.name_in_batch not in own for name in one.refers}
     replaced: dict[str, RigDocument] = {}
@@ -115,7 +118,8 @@ def _on_skeleton(tx: Transaction, one: LoadedDraft, reference: Tree) -> LoadedDr
 
 
 def _skeletons_before(tx: Transaction, project: ProjectRow, drafts: Sequence[LoadedDraft]) -> dict[str, str]:
-    """Return the ids of the skeletons of the items that drafts would revise, by the names of the drafts."""
+    """Return the ids of the skeletons that existing items use, by the names of the drafts that would revise the items.
+    """
     found = {}
     for some in in_lists(drafts):
         places = {(one.draft.kind.value, one.draft.collection, one.draft.item_name): one for one in some}

@@ -43,12 +43,12 @@ from marey_server.store.transaction import Transaction, in_lists
 Tree = dict[str, Any]
 
 _LOADED_TOGETHER = 50
-"""Number of items whose documents are loaded at once; few, because often the first item decides the result."""
+"""Number of items whose documents are loaded at once. It is small, because often the first item decides the result."""
 
 
 @dataclass
 class _Skeleton:
-    """Skeleton of the project, with the numbers of items whose newest revision uses it, by kind."""
+    """Skeleton of the project, with the number of items of each kind whose newest revision uses it (`users`)."""
 
     row: Any
     rig: RigDocument
@@ -85,7 +85,7 @@ class _User:
 
     @property
     def moved(self) -> frozenset[str]:
-        """The joints whose offsets the motion replaces."""
+        """Names of the joints whose offsets the motion of the item replaces with translations."""
         return frozenset(self.bodies[SKELETON_PARTS[self.kind]].get("translated_joints", ()))
 
 
@@ -161,7 +161,7 @@ def _find_skeletons(tx: Transaction, project: ProjectRow, request: SkeletonMerge
 
 
 def _uses(project: ProjectRow, skeletons: Sequence[str]) -> ColumnElement[bool]:
-    """Return the SQL condition that an item uses one of the skeletons, so that a merge must change the item."""
+    """Return the SQL condition for items of the project that use one of the skeletons, so that a merge changes them."""
     return and_(
         item.c.project_id == project.id, item.c.skeleton_id.in_(skeletons), item.c.deleted_us.is_(None),
         item.c.kind.in_([kind.value for kind in SKELETON_PARTS]),
@@ -202,7 +202,9 @@ def _rigs(
 ) -> list[tuple[_Skeleton, list[_Skeleton]]]:
     """Return each skeleton that is kept, with the skeletons that are merged into it.
 
-    The documents of clips and other items are read only if skeletons differ in offsets, which motions may replace.
+    Skeletons may differ in offsets that motions replace. Only in this case, the documents of clips and other items are
+    read. Raises `InvalidProblem` if named skeletons are not one rig, `ConflictProblem` if joint maps that somebody
+    edited differ, and `TooLargeProblem` if more than `MOST_MOVED` items would change.
     """
     best_first = sorted(
         skeletons,
@@ -242,7 +244,7 @@ def _rigs(
 
 
 def _moved(tx: Transaction, project: ProjectRow, skeleton: _Skeleton) -> frozenset[str]:
-    """Return the joints whose offsets the motions of all items that use a skeleton replace.
+    """Return the joints whose offsets are replaced by the motion of every item that uses a skeleton.
 
     The result is empty if no item uses the skeleton, or if more than `MOST_MOVED` items do.
     """
@@ -270,7 +272,11 @@ def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonM
 
 
 def _move(tx: Transaction, project: ProjectRow, merged: _Skeleton, kept: _Skeleton) -> None:
-    """Use the kept skeleton in new revisions of all items that use the merged one; move clips' annotations to them."""
+    """Replace the merged skeleton by the kept one, in new revisions of all items that use the merged skeleton.
+
+    The annotations of clips get revisions that refer to the new revisions of the clips. Raises `ConflictProblem` if
+    another request has changed one of the items.
+    """
     reference = {"item": kept.row.id, "revision": kept.row.head}
     message = f"The skeleton {merged.named['path']} was merged into {kept.named['path']}"
     users = list(_users(tx, project, merged.row.id, lock=True))
@@ -293,7 +299,7 @@ def _publish(tx: Transaction, project: ProjectRow, drafts: Sequence[Draft]) -> l
 
 
 def _draft(tx: Transaction, user: _User, reference: Tree, message: str) -> Draft:
-    """Return the draft of an item's revision with another skeleton; the arrays of its documents are the same."""
+    """Return the draft of a new revision of an item that refers to another skeleton; its arrays are the same."""
     part = SKELETON_PARTS[user.kind]
     changed = {part: {**user.bodies[part], "skeleton": reference}}
     if "tree" in user.bodies:
@@ -311,9 +317,10 @@ def _revised(tx: Transaction, row: Any, digests: Mapping[str, str], changed: Map
 
 
 def _moved_annotations(tx: Transaction, project: ProjectRow, clips: Mapping[str, int], message: str) -> Iterator[Draft]:
-    """Yield drafts of the annotations of clips; `clips` are the revisions of the clips before the merge.
+    """Yield drafts in which the annotations of clips refer to the next revisions of the clips.
 
-    Annotations of earlier revisions stay as they are.
+    `clips` maps the ids of the clips to their newest revisions before the merge. Annotations that refer to earlier
+    revisions are left out.
     """
     for some in in_lists(sorted(clips)):
         of_clips = item.c.summary["clip"].as_string().in_(some)

@@ -55,7 +55,7 @@ def _deferred_jobs(tx: Transaction) -> list[str]:
 
 
 def _commit_one(database: Database, job_id: str) -> bool:
-    """Commit the outputs of one job, and end it; return whether it has ended."""
+    """Commit the outputs of one job, and end it; return whether this call has ended it. Errors are only logged."""
     try:
         for _ in range(MOST_PLANS):
             plan = database.read(SYSTEM, _plan, job_id)
@@ -82,7 +82,7 @@ def _portions(chunks: Mapping[str, bytes]) -> Iterator[Mapping[str, bytes]]:
 
 @dataclass(frozen=True)
 class _JobPlan:
-    """Outputs of a job, and their planned commit; or the reason why no commit was planned."""
+    """Planned commit of the outputs of a job, or the reason why no commit was planned."""
 
     job_id: str
     project_id: str
@@ -93,7 +93,7 @@ class _JobPlan:
     commit: PlannedCommit | None = None
     """The planned commit; None if the branch does not exist any more."""
     failure: dict[str, Any] | None = None
-    """Failure of the job, because its commit cannot be computed."""
+    """Failure with which the job must end, because its commit cannot be computed; None if it can."""
 
     @property
     def chunks(self) -> Mapping[str, bytes]:
@@ -105,7 +105,10 @@ _COLUMNS = (*commits.JOB_COLUMNS, job.c.cancel_requested_us)
 
 
 def _plan(tx: Transaction, job_id: str) -> _JobPlan | None:
-    """Plan the commit of a job; None if the job has ended already. No commit is planned for a cancelled job."""
+    """Plan the commit of a job; return None if the job has ended already.
+
+    For a job whose cancellation was requested, the result contains no commit.
+    """
     row = tx.execute(select(*_COLUMNS).where(job.c.id == job_id, DEFERRED)).first()
     if row is None:
         return None

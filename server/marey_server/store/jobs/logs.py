@@ -20,7 +20,7 @@ MOST_READ_BYTES = 2**20
 
 
 class LogOffset(ConflictProblem):
-    """The data was sent for an offset that is not the end of the log."""
+    """Error for data that were sent for an offset that is not the end of the log."""
 
     code = "log-offset"
 
@@ -30,7 +30,9 @@ def append_log(
 ) -> LogAnswer:
     """Append `data` at `offset`, which must be the end of the attempt's log; a repeated append changes nothing.
 
-    Raises `LogOffset` with the current end, and `LeaseLostProblem` if the attempt no longer holds the job.
+    A log that reaches the limit of the policy is closed with a note, and ignores further data (`capped`). Raises
+    `LogOffset`, with the end of the log, for any other offset, and `LeaseLostProblem` if the attempt no longer holds
+    the job.
     """
     require_attempt(tx.principal, job_id, fence)
     hold(tx, job_id, fence)
@@ -63,11 +65,11 @@ def _is_said(tx: Transaction, job_id: str, fence: int, offset: int, data: bytes)
 
 @dataclass(frozen=True, slots=True)
 class LogPage:
-    """Page of a job's log, which joins the output of all attempts."""
+    """Page of a job's log, which is the output of all attempts, one after the other."""
 
     data: bytes
     offset: int
-    """Offset of the next page."""
+    """Offset in bytes at which the next page begins."""
     sealed: bool
     """Whether the log is complete and this page reaches its end."""
 

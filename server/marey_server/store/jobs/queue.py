@@ -126,9 +126,10 @@ _CLAIMED_BEFORE = Prepared(
 
 
 def _read_turns(tx: Transaction, claim_id: str | None, wanted: _Wanted) -> tuple[list[tuple[str, int]], list[Turn]]:
-    """Return the attempts of an earlier claim with the same `claim_id`, if any, and the projects that have jobs.
+    """Return the attempts of an earlier claim with the same `claim_id`, and the projects that have jobs.
 
-    Two concurrent claims with the same `claim_id` run one after the other.
+    The attempts are given by job and fence; there are none without an earlier claim. Concurrent claims with the same
+    `claim_id` run one after the other.
     """
     if claim_id is None:
         return [], turns_of(tx.run(wanted.turns, wanted.of_turns))
@@ -155,10 +156,10 @@ def _leases_again(
 
 
 def _issue_token(tx: Transaction, claim_id: str | None, row: Row[Any]) -> IssuedToken:
-    """Return a token for the attempt.
+    """Return a new token for an attempt.
 
-    If the claim has a `claim_id`, it may be repeated. Then the token is derived from the caller's token, the claim and
-    the attempt. So a repetition gets the same token although no secret is stored.
+    A claim with a `claim_id` may be repeated. So its token is derived from the caller's token, the `claim_id` and the
+    attempt: a repetition gets the same token, although the server stores no secret.
     """
     if claim_id is None:
         return issue_attempt_token()
@@ -190,10 +191,11 @@ def heartbeat(
 
 
 def _renewed(tx: Transaction, policy: QueuePolicy) -> dict[str, Any]:
-    """Return the values that renew a lease.
+    """Return the values of the columns of a job that renew its lease.
 
-    The time for which the lease had expired does not count towards the time limit: the clock of the database may have
-    jumped. The worker measures the limit with its own clock; the server's limit is for workers that do not stop.
+    If the lease has expired, the time since then does not count towards the time limit of the job, because the clock of
+    the database may have jumped. Workers stop at the limit by their own clocks; the server's limit is only for workers
+    that do not stop.
     """
     late = and_(job.c.lease_expires_us < tx.now_us, job.c.cancel_requested_us.is_(None))
     deadline_us = job.c.deadline_us + case((late, tx.now_us - job.c.lease_expires_us), else_=0)
@@ -229,7 +231,7 @@ _LEASE_COLUMNS = (
 
 
 def _claim_statement(*, one_job: bool) -> ReturningUpdate[*tuple[Any, ...]]:
-    """Return the statement that picks jobs of one project and claims them."""
+    """Return the statement that claims jobs of one project; with `one_job`, only the job that a claim names."""
     pick = _pick(one_job=one_job)
     now_us = bindparam("now_us", type_=BigInteger)
     deadline_us = now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US
@@ -285,7 +287,7 @@ _CLAIM_STATEMENTS = {one_job: Prepared(_claim_statement(one_job=one_job)) for on
 
 
 class _Wanted(NamedTuple):
-    """Statements of a claim, and their parameters, such as the kinds and labels in the request."""
+    """Statements that find projects with jobs for a claim (`turns`) and claim jobs (`claim`), with their parameters."""
 
     turns: Prepared
     of_turns: Mapping[str, Any]
@@ -316,9 +318,9 @@ def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], polic
 
 
 def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most: int) -> list[Row[Any]]:
-    """Claim up to `most` jobs, from each project as many as it has turns in this claim; return the rows of the jobs.
+    """Claim up to `most` jobs, from each project as many as `next_projects` gives to it; return the rows of the jobs.
 
-    If a project has fewer jobs than turns, the other projects share its turns.
+    If a project has fewer jobs, the remaining ones are taken from the other projects.
     """
     rows: list[Row[Any]] = []
     served: set[Turn] = set()
@@ -369,7 +371,7 @@ def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
 
 
 def _trace(tx: Transaction, row: Row[Any]) -> JobTrace | None:
-    """Return the trace of a job, with the seconds for which the job could have run before it was claimed."""
+    """Return the trace of a job, or None without a trace; it contains how long the job was ready before the claim."""
     header = trace_header(row.environment)
     return None if header is None else JobTrace(traceparent=header, waited_s=_delay_s(tx, row))
 

@@ -114,7 +114,7 @@ class _Family:
             raise ConflictProblem(detail, code="too-many")
 
     def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
-        """Return the jobs that ended only because one of the given jobs did not succeed.
+        """Return the jobs that could not run because one of the given jobs, on which they depend, did not succeed.
 
         Jobs that have a retry already, or that the caller may not retry, are left out.
         """
@@ -145,7 +145,8 @@ class _Family:
 def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_ins: Mapping[str, str]) -> Submission:
     """Return the submission that retries a job under the id `new`.
 
-    `stand_ins` maps each dependency of the job to the retry of this dependency, on which the new job depends instead.
+    `stand_ins` maps each dependency of the old job to the job on which the new job depends instead: its newest retry.
+    Raises `ConflictProblem` if the kind is unknown now, the script has changed, or an input was purged.
     """
     try:
         kind = find_kind(row.kind)
@@ -179,10 +180,9 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
 
 
 def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
-    """Return the inputs for the retry of a job that ended before outputs of other jobs were pinned as its inputs.
+    """Return the inputs for the retry of a job that ended while some inputs were still outputs of unfinished jobs.
 
-    Inputs that refer to the results of another job then refer to the results of the retry of that job. `stand_ins` maps
-    the ids of jobs to the ids of their retries.
+    In these inputs, the retry of such a job takes its place; `stand_ins` maps the ids of jobs to the ids of retries.
     """
     return {
         name: [{"job": stand_ins[entry["job"]]} if "job" in entry else entry for entry in entries]
@@ -224,9 +224,9 @@ def _states(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 
 
 def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str, str]]:
-    """Return, for each job, its dependencies, each mapped to its newest retry.
+    """Return, for each job, its dependencies, each mapped to its newest retry or, without a retry, to itself.
 
-    A job on which another depends only to share its result is left out.
+    The job whose result a job only waited to share is left out.
     """
     needs: dict[str, dict[str, str]] = {one: {} for one in rows}
     statement = select(job_dependency).order_by(job_dependency.c.on_job_id)
@@ -252,9 +252,9 @@ def _latest_tries(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 def _select_in(
     tx: Transaction, statement: Select[*tuple[Any, ...]], column: ColumnElement[str], values: Iterable[str]
 ) -> Iterator[Row[Any]]:
-    """Select the rows whose `column` is among `values`, page by page, in the order of the statement.
+    """Yield the rows whose `column` is among `values`, with several statements, because `values` may be a million.
 
-    A thousand jobs may each depend on a thousand others, and databases limit the parameters of a statement.
+    Each statement has its own order: the rows of all statements together are not sorted.
     """
     wanted = sorted(set(values))
     for some in in_lists(wanted):

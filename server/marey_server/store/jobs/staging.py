@@ -33,10 +33,10 @@ from marey_server.store.transaction import Transaction, in_lists
 MOST_STAGED = 20_000
 
 StagedDraft = dict[str, Any]
-"""Stored draft: an object with kind, name, collection below `into`, tags, reuse, sources, and digests of the parts."""
+"""Draft as an attempt stages it: kind, name, collection below `into`, tags, `reuse`, sources, digests of the parts."""
 
 _FACETS = ""
-"""Name of the staged draft that contains the facets of an attempt (numbers about its inputs), and no result."""
+"""Name of the entry in the table of staged drafts that contains the facets of an attempt (numbers about inputs)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,11 @@ def _staged_draft(prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
 
 
 def _pinned_sources(output: StagedOutput, pins: PinnedInputs) -> dict[str, list[list[Any]]]:
-    """Return the inputs that an output names as sources, as pairs of item and revision; by default, all inputs."""
+    """Return the inputs from which an output was made, by name of the input, as pairs of item and revision.
+
+    These are the inputs that the output names as its sources; if it names none, they are all inputs. Raises
+    `InvalidProblem` for a source that is no input.
+    """
     if not output.sources:
         return {role: [[pin["item"], pin["revision"]] for pin in many] for role, many in pins.items()}
     return {role: [_pinned_source(role, source, pins) for source in named] for role, named in output.sources.items()}
@@ -209,7 +213,7 @@ def drop_staged_facets(tx: Transaction, job_ids: Sequence[str]) -> None:
 
 
 def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
-    """Return the parameters with which `_BY_ATTEMPTS` selects the outputs of attempts.
+    """Return the parameters of the condition `_BY_ATTEMPTS`, which selects the staged drafts of attempts.
 
     An attempt is given by the id of its job and its fence (number of the claim).
     """
@@ -299,7 +303,7 @@ def _draft(name: str, draft: StagedDraft, row: Any) -> Draft:
 
 
 def named_blobs(tree: Any) -> Iterator[str]:
-    """Yield the digest in each member named `blob`, at any depth of parameters or of a result."""
+    """Yield the digests in all members named `blob`, at any depth of `tree`: parameters, or a result."""
     if isinstance(tree, Mapping):
         for name, value in tree.items():
             if name == "blob" and isinstance(value, str) and is_digest(value):
@@ -312,7 +316,7 @@ def named_blobs(tree: Any) -> Iterator[str]:
 
 
 def keep_named_blobs(tx: Transaction, job_id: str, digests: set[str]) -> None:
-    """Keep garbage collection from deleting the blobs that a job names.
+    """Keep the blobs that a job names, and let readers of the project read them; garbage collection spares them.
 
     Raises `ConflictProblem` (`missing-blobs`) for blobs that the caller has not sent and may not read.
     """

@@ -32,10 +32,10 @@ from marey_server.store.transaction import Transaction
 MOST_REMEMBERED = 5000
 MOST_BYTES = 16 * MIB
 LARGEST_CLAIM_BYTES = 64 * KIB
-"""Greatest number and total size of the claims that a process remembers, and greatest size of one such claim.
+"""Limits of the claims that a process remembers: their number, their total size in bytes, and the size of one claim.
 
-Beyond the first two limits, the oldest claim of the user with the most workers is forgotten. A larger claim is not
-remembered.
+If there are too many claims, or they are too large together, the oldest claim of the user with the most workers is
+forgotten. A single claim that is too large is not remembered.
 """
 MOST_OF_USER = 2000
 """Default of the greatest number of workers of one user that are alive, in one server process."""
@@ -207,7 +207,7 @@ def _document(tx: Transaction, key: WorkerKey, heard: HeardWorker | None, runnin
 
 
 def _running_workers(tx: Transaction, policy: QueuePolicy) -> dict[WorkerKey, _Running]:
-    """Return the workers whose leases have not expired."""
+    """Return the workers that run jobs with a valid lease, each with the number of these jobs."""
     rows = tx.execute(
         select(
             attempt.c.claimed_by,
