@@ -43,9 +43,9 @@ def hold_off_purges(tx: Transaction, *project_ids: str) -> None:
 
 
 def hold_off_purges_of_jobs(tx: Transaction, job_ids: Iterable[str]) -> None:
-    """Call `hold_off_purges` for the projects of jobs that this write is going to end.
+    """Prevent purges of the projects of jobs that this write is going to end (`hold_off_purges`).
 
-    The end of a job can publish results, and use them as inputs of jobs that have waited for this job.
+    This is necessary because the end of a job can publish items, and use them as inputs of waiting jobs.
     """
     if not tx.is_postgres:
         return
@@ -60,7 +60,10 @@ def hold_off_purges_of_jobs(tx: Transaction, job_ids: Iterable[str]) -> None:
 
 
 def require_no_purge_since(tx: Transaction, project_id: str, last: int) -> None:
-    """Hold off purges, and raise `ConflictProblem` if the last purge of the project was not at the time `last`."""
+    """Prevent purges until this write ends, and raise `ConflictProblem` if the project was purged after `last`.
+
+    `last` is the time that `last_purge` returned when the request was prepared.
+    """
     hold_off_purges(tx, project_id)
     if last_purge(tx, project_id) != last:
         raise ConflictProblem(

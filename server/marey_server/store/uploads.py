@@ -56,7 +56,7 @@ class StoredUpload:
 
     @property
     def is_received(self) -> bool:
-        """Return whether all bytes were received, and the upload was not stored as a blob or refused yet."""
+        """Whether all bytes were received, and `finish` was not called yet."""
         return self.offset == self.length and self.digest is None and self.actual_digest is None
 
 

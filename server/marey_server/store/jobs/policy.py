@@ -46,7 +46,8 @@ class QueuePolicy:
     def backoff_us(self, failures: int) -> int:
         """Return the wait in microseconds before a retry, which begins with `first_backoff_s`.
 
-        Each failure makes the wait four times as long, up to `longest_backoff_s`. The wait also varies randomly.
+        Each failure makes the wait four times as long, up to `longest_backoff_s`. Up to a quarter of
+        the wait is subtracted at random.
         """
         backoff = Backoff(
             self.first_backoff_s, self.longest_backoff_s, factor=4.0, jitter=0.25, random_unit=self.random_unit

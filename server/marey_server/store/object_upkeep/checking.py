@@ -30,7 +30,10 @@ class StoreDefect:
 
 
 def check_blob(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a defect if the bytes of a blob are damaged; blobs in object storage are left to `check_objects`."""
+    """Return a defect if the bytes of a blob are damaged; return none for blobs in object storage.
+
+    `check_objects` checks those.
+    """
     if row.object_id is not None:
         return []
     return _compare(row, tx.blobs.read(tx.connection, row.digest, 0, row.size_bytes))
@@ -45,7 +48,7 @@ def _compare(row: Row[Any], pieces: Iterable[bytes]) -> list[StoreDefect]:
 
 
 def check_objects(database: Database) -> Iterator[list[StoreDefect]]:
-    """Read the objects of all blobs without a transaction; yield the faults of each blob."""
+    """Read the objects of all blobs, outside of transactions; yield the defects of each blob, often an empty list."""
     behind = ""
     while rows := database.read(SYSTEM, _in_objects, behind):
         for row in rows:

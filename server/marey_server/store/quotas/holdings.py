@@ -21,7 +21,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Number of items, and number of bytes of their revisions."""
+    """Numbers that the quotas count: of items, and of the bytes of their revisions."""
 
     items: int = 0
     stored_bytes: int = 0
@@ -121,7 +121,7 @@ def show_quotas(tx: Transaction, of: Literal["project", "user"], owner_id: str) 
 
 
 def change_limits(tx: Transaction, owner_id: str, change: QuotaChange) -> dict[str, int]:
-    """Change the limits of items and bytes, and return those that differ from the settings."""
+    """Change the limits of items and bytes of a project or user; return all limits that an administrator has set."""
     changed = _add(tx, owner_id, Held()).limits | change.model_dump(exclude_unset=True, include=set(COUNTED))
     limits = {name: limit for name, limit in changed.items() if limit is not None}
     tx.execute(update(holding).where(holding.c.owner_id == owner_id).values(limits=limits))
@@ -144,7 +144,7 @@ BYTES_OF_ITEM = (
     .correlate(item)
     .scalar_subquery()
 )
-"""Bytes of all revisions of an item; a part counts in each revision that changed it."""
+"""SQL expression for the bytes of all revisions of an item; a part counts in each revision that changed it."""
 
 
 _SUMS = (func.count().label("items"), func.coalesce(func.sum(item.c.stored_bytes), 0).label("stored_bytes"))

@@ -38,7 +38,7 @@ _NO_HASH = hash_secret("")  # of no code, because secrets are not empty
 
 
 def _rows() -> Select[*tuple[Any, ...]]:
-    """Return a query for participants with the name and project of their study, and whether the study still exists."""
+    """Return a query for participants, each with the name and the project of the study, and `study_exists`."""
     alive = item.c.deleted_us.is_(None) & project.c.deleted_us.is_(None)
     return (
         select(study_participant, item.c.name, item.c.project_id, alive.label("study_exists"))
@@ -75,7 +75,10 @@ def try_of(code: str, address: str, per_minute: int) -> SignInTry:
 
 
 def _find_link(tx: Transaction, code: str) -> Row[Any]:
-    """Lock and return the participant of a link, who may have begun the study already. Raises `NotFoundProblem`."""
+    """Lock and return the row of the participant who has a link and may have begun the study already.
+
+    Raises `NotFoundProblem` if the link is wrong or expired, the participant has withdrawn, or the study was deleted.
+    """
     prefix, secret = split_study_link(code) or ("", "")
     locked = _rows().where(study_participant.c.link_prefix == prefix).with_for_update(of=study_participant)
     row = tx.execute(locked).first()
