@@ -66,7 +66,9 @@ def check_length(path: str) -> None:
     """Raise `InvalidProblem` if a path is too long to be stored."""
     if len(path) > MAX_PATH_LENGTH or len(path.encode()) > MAX_PATH_BYTES:
         raise InvalidProblem(
-            f"A path may have at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes.", code="long-path"
+            f"The path of a folder may have at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes; this path "
+            f"has {len(path)} characters and {len(path.encode())} bytes.",
+            code="long-path",
         )
 
 
@@ -192,9 +194,9 @@ def create_collection(tx: Transaction, project: str, request: CollectionCreate) 
 
 def _path_taken(path: str) -> ConflictProblem:
     return ConflictProblem(
-        f"There is already a collection {path!r}.",
+        f"There is already a collection {path!r}; choose another path.",
         code="path-taken",
-        unnamed="There is already a collection with this path.",
+        unnamed="There is already a collection with this path; choose another path.",
     )
 
 

@@ -66,7 +66,9 @@ def find(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
 
 def _answer(stored: Row[Any], fingerprint: str) -> StoredAnswer:
     if stored.fingerprint != fingerprint:
-        detail = "This Idempotency-Key was used for another request, or with a token that has other scopes."
+        detail = (
+            "This Idempotency-Key was used for another request, or with a token that has other scopes; use another key."
+        )
         raise InvalidProblem(detail, code="idempotency-key-reused")
     return StoredAnswer(stored.status, dict(stored.headers), bytes(stored.body))
 

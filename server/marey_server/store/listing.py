@@ -96,7 +96,8 @@ def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> li
 
 
 def _bad_cursor() -> BadRequestProblem:
-    return BadRequestProblem("This is no cursor of this server; start again without one.", code="bad-cursor")
+    detail = "The cursor does not come from this server; start again without a cursor."
+    return BadRequestProblem(detail, code="bad-cursor")
 
 
 def _fingerprint(identity: Any) -> str:

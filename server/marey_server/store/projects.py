@@ -326,7 +326,7 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
 
 
 def _name_taken(name: str) -> ConflictProblem:
-    return ConflictProblem(f"The name {name!r} is taken by another project.", code="name-taken")
+    return ConflictProblem(f"The name {name!r} is taken by another project; choose another name.", code="name-taken")
 
 
 def change_project(tx: Transaction, name: str, request: ProjectChange, *, expected_rev: ExpectedRev) -> Project:

@@ -388,5 +388,8 @@ def _take_away(state: dict[str, Value | None], one: RemoveEntry | MoveEntry) -> 
     if isinstance(one, MoveEntry):
         target = key_of(one.to, one.kind)
         if state.get(target) is not None:
-            raise ConflictProblem(f"The version has a {one.kind.value} at {one.to!r} already.", code="path-taken")
+            raise ConflictProblem(
+                f"The version already has a {one.kind.value} at {one.to!r}; move it away or remove it first.",
+                code="path-taken",
+            )
         state[target] = entry_of(key, value).value  # a damaged entry is not copied

@@ -97,7 +97,8 @@ def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dat
         "description": request.description, "collection_id": folder,
         "created_us": tx.now_us, "updated_us": tx.now_us, "rev": 1,
     }  # fmt: skip
-    with taken(ConflictProblem(f"There is a dataset {request.name!r} already.", code="name-taken")):
+    name_taken = f"There is already a dataset {request.name!r}; choose another name."
+    with taken(ConflictProblem(name_taken, code="name-taken")):
         tx.execute(insert(dataset).values(**row))
     tx.execute(insert(dataset_ref).values(**new_ref(tx, dataset_id, MAIN, RefKind.BRANCH, None)))
     tx.emit("dataset.created", dataset_id, project_id=project_row.id, name=request.name)
@@ -202,7 +203,8 @@ def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> 
     _require_no_commit(tx, row.id, request.name)
     held = tx.execute(select(func.count()).where(dataset_ref.c.dataset_id == row.id)).scalar_one()
     _require_room(held, MOST_REFS, "branches and tags in a dataset", "too-many-refs")
-    with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
+    name_taken = f"There is already a branch or tag {request.name!r}; choose another name."
+    with taken(ConflictProblem(name_taken, code="name-taken")):
         row_of_ref = new_ref(tx, row.id, request.name, request.kind, digest)
         made = tx.execute(insert(dataset_ref).values(**row_of_ref).returning(*dataset_ref.c)).one()
     created: OrdinaryEventKind = "branch.created" if request.kind is RefKind.BRANCH else "tag.created"

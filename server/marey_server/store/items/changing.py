@@ -186,7 +186,8 @@ def change_item(
         rights.require(request.collection, Role.CONTRIBUTOR)
         values["collection_id"] = collections.ensure(tx, project_row, request.collection)
     which = (*_in_folder(project_row, kind, found), item.c.deleted_us.is_(None))
-    with taken(ConflictProblem(f"There is already a {kind} with this name in the collection.", code="name-taken")):
+    name_taken = f"There is already a {kind} with this name in the collection; choose another name."
+    with taken(ConflictProblem(name_taken, code="name-taken")):
         change_row(tx, item, which, values, expected_rev=expected_rev, absent=_moved_away(kind, item_id))
     if request.tags is not None:
         tx.execute(delete(item_tag).where(item_tag.c.item_id == item_id))
@@ -227,9 +228,9 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None), item.c.purged_us.is_(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
     name_taken = ConflictProblem(
-        f"The collection now contains another {kind} named {gone.name!r}.",
+        f"The collection now contains another {kind} named {gone.name!r}. Rename it, then restore this one.",
         code="name-taken",
-        unnamed=f"The collection now contains another {kind} with the same name.",
+        unnamed=f"The collection now contains another {kind} with the same name. Rename it, then restore this one.",
     )
     with taken(name_taken):
         row = change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))

@@ -102,9 +102,9 @@ def _versions(environment: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[LineageEdge, ...]:
-    """Return the revisions at one end of the rows of `lineage` that meet `condition`.
+    """Return the revisions that the rows of `lineage` which meet `condition` name, at most `MAX_EDGES`.
 
-    `other` and `number` are the columns of `lineage` that contain the item and the number of these revisions.
+    A row names two revisions, an input and a result. `other` and `number` are the columns of the wanted one.
     """
     statement = (
         select(other.label("item"), number.label("revision"), item.c.kind, item.c.name)
@@ -120,7 +120,7 @@ def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[Li
 
 
 def _has_newer_content(item_id: Any, number: Any) -> ColumnElement[bool]:
-    """Return the condition that an item has a later revision which was not made by a merge of skeletons."""
+    """Return the SQL condition that an item has a revision after `number` that no merge of skeletons made."""
     later, merge = revision.alias("later"), lineage.alias("merge")
     is_merge = and_(
         merge.c.item_id == later.c.item_id, merge.c.number == later.c.number, merge.c.role == SKELETON_MERGE

@@ -185,8 +185,8 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
         if spec is None:
             raise LateInputError(
                 "unknown-input",
-                f"In this version of the server, jobs of the kind {kind.name} have no input {name!r}. Submit a job "
-                f"with the inputs that they have: {', '.join(map(repr, kind.inputs)) or 'none'}.",
+                f"In this version of the server, jobs of the kind {kind.name} have no input {name!r}. Submit a new "
+                f"job; its inputs may be: {', '.join(map(repr, kind.inputs)) or 'none'}.",
             )
         chosen: dict[tuple[str, int], Pin] = {}
         for entry in entries:

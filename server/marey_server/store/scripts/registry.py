@@ -79,10 +79,10 @@ def delete_script(tx: Transaction, project: str, name: str) -> None:
 
 
 def resolve_params(tx: Transaction, project: ProjectRow, params: ScriptParams, at: str) -> ScriptParams:
-    """Return the parameters of a job with the declaration of its script; `at` is the place of the job in the request.
+    """Return the parameters of a job with the registered declaration of its script, and with default values.
 
-    Raises `InvalidProblem` with a pointer to each fault: an unknown script, another declaration than the registered
-    one, a missing or wrong value.
+    `at` is the JSON Pointer to the job in the request. Raises `InvalidProblem` with a pointer to each fault: an unknown
+    script, another declaration than the registered one, or a missing or wrong value.
     """
     try:
         found = find_script(tx, project, params.script)
@@ -104,7 +104,7 @@ def resolve_params(tx: Transaction, project: ProjectRow, params: ScriptParams, a
 
 
 def require_unchanged(tx: Transaction, project: ProjectRow, params: Mapping[str, Any]) -> None:
-    """Raise `ConflictProblem` if the script of an earlier job is not registered any more in the same form."""
+    """Raise `ConflictProblem` if the script of an earlier job was deleted, or registered again in another form."""
     earlier = ScriptParams.model_validate(params)
     try:
         resolve_params(tx, project, earlier, "")
