@@ -135,7 +135,7 @@ def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[En
         if row.cached_from is not None:
             (orphans if missed else shared if upstream[row.id][0].shareable else alone).append(row)
         elif missed:
-            following += _doom(tx, row, missed[0])
+            following += _end_unrunnable(tx, row, missed[0])
         else:
             left[row.id] = row.dependencies_left - len(upstream[row.id])
     _store_counts(tx, left)
@@ -152,7 +152,7 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
         tx.execute(statement, [{"of_job": job_id, "left": count} for job_id, count in left.items()])
 
 
-def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
+def _end_unrunnable(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
     """End a waiting job because the job `cause`, on which it depends, did not succeed; return the ended jobs.
 
     The waiting job fails, or is cancelled if its `on_failure` is `skip`. Its tasks are cancelled.

@@ -84,7 +84,7 @@ class _Family:
         """Add the jobs that ended only because one of the jobs in this set did not succeed, recursively."""
         behind: Collection[str] = list(self._rows)
         while behind:
-            rows = {row.id: row for row in self._doomed_after(behind)}
+            rows = {row.id: row for row in self._ended_because_of(behind)}
             needs = _needs(self._tx, rows)
             others = {latest for one in needs.values() for latest in one.values()} - self._rows.keys()
             missing = {one for one, state in _states(self._tx, others).items() if state in UNSUCCESSFUL}
@@ -113,7 +113,7 @@ class _Family:
             )
             raise ConflictProblem(detail, code="too-many")
 
-    def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
+    def _ended_because_of(self, ids: Collection[str]) -> Iterable[Row[Any]]:
         """Return the jobs that could not run because one of the given jobs, on which they depend, did not succeed.
 
         Jobs that have a retry already, or that the caller may not retry, are left out.
@@ -134,8 +134,8 @@ class _Family:
         )
         whole = roles.includes(self._project.role, Role.MAINTAINER)
         for row in self._tx.execute(statement):
-            doomed = row.failure is None or row.failure["reason"] == FailureReason.DEPENDENCY_FAILED
-            if doomed and row.id not in self._rows and (whole or row.author_id == self._tx.principal.user_id):
+            could_not_run = row.failure is None or row.failure["reason"] == FailureReason.DEPENDENCY_FAILED
+            if could_not_run and row.id not in self._rows and (whole or row.author_id == self._tx.principal.user_id):
                 yield row
 
 
