@@ -289,7 +289,7 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
         .values(deleted_us=tx.now_us, rev=item.c.rev + 1)
         .returning(item.c.creator_id, item.c.stored_bytes)
     )
-    holdings.release(tx, project_row.id, holdings.by_creator(gone))
+    holdings.count_removed(tx, project_row.id, holdings.by_creator(gone))
     tx.audit("collection.deleted", collection_id, about=path, project_id=project_row.id, path=path)
 
 
@@ -327,7 +327,7 @@ def restore_collection(
         .values(deleted_us=None, rev=item.c.rev + 1)
         .returning(item.c.creator_id, item.c.stored_bytes)
     )
-    holdings.hold(tx, project_row.id, holdings.by_creator(back))
+    holdings.count_added(tx, project_row.id, holdings.by_creator(back))
     tx.audit("collection.restored", collection_id, about=gone.path, project_id=project_row.id, path=gone.path)
     return _shown(tx, project_row, row)
 

@@ -80,7 +80,7 @@ def publish(
     loaded = on_known_rigs(tx, project_row, without_skeleton_changes(tx, project_row, load_drafts(tx, drafts)))
     for together in _in_turns(loaded):
         publication.add(together)
-    holdings.hold(tx, project_row.id, publication.added)
+    holdings.count_added(tx, project_row.id, publication.added)
     faults.point("publish.before_commit")
     tx.after_commit(lambda: faults.point("publish.after_commit"))
     return [publication.done[draft.name_in_batch] for draft in drafts if draft.name_in_batch in publication.done]

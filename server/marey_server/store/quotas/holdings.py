@@ -55,7 +55,7 @@ def by_creator(rows: Iterable[Row[Any]]) -> dict[str | None, Held]:
     return held
 
 
-def hold(tx: Transaction, project_id: str, more: Mapping[str | None, Held]) -> None:
+def count_added(tx: Transaction, project_id: str, more: Mapping[str | None, Held]) -> None:
     """Add items and bytes to the counters of a project and of the creators of these items.
 
     The counters are locked until the transaction ends, so that no concurrent writes exceed a quota together. Raises
@@ -64,12 +64,12 @@ def hold(tx: Transaction, project_id: str, more: Mapping[str | None, Held]) -> N
     total = sum(more.values(), Held())
     if total == Held():
         return
-    _hold(tx, "project", project_id, total)
+    _count_added(tx, "project", project_id, total)
     for creator_id in sorted(filter(None, more)):
-        _hold(tx, "user", creator_id, more[creator_id])
+        _count_added(tx, "user", creator_id, more[creator_id])
 
 
-def _hold(tx: Transaction, of: str, owner_id: str, more: Held) -> None:
+def _count_added(tx: Transaction, of: str, owner_id: str, more: Held) -> None:
     row = _add(tx, owner_id, more)
     for name in COUNTED:
         used, added, limit = getattr(row, name), getattr(more, name), limit_of(tx, of, name, row.limits)
@@ -88,7 +88,7 @@ def limit_of(tx: Transaction, of: str, name: str, limits: Mapping[str, int]) -> 
     return limits.get(name, getattr(tx.quotas, f"{of}_{name}"))
 
 
-def release(tx: Transaction, project_id: str, less: Mapping[str | None, Held]) -> None:
+def count_removed(tx: Transaction, project_id: str, less: Mapping[str | None, Held]) -> None:
     """Subtract items and bytes from the counters of a project and of the creators of these items."""
     total = sum(less.values(), Held())
     for owner_id, held in ((project_id, total), *sorted((one, less[one]) for one in less if one is not None)):
