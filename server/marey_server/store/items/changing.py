@@ -32,7 +32,7 @@ from marey_server.store.items.revisions import (
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import daily, holdings
-from marey_server.store.quotas.holdings import Held
+from marey_server.store.quotas.holdings import ItemTotals
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
 from marey_server.store.tables import item, item_tag
 from marey_server.store.transaction import Transaction
@@ -115,7 +115,7 @@ def put_part(
         if write_head(tx, kind, item_id, parts, bodies, unchanged, added_bytes=added):
             made = NewRevision(item_id, found.head + 1, parts, message)
             write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
-            holdings.count_added(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
+            holdings.count_added(tx, project_row.id, {found.creator_id: ItemTotals(stored_bytes=added)})
             daily.count_sent(tx, tx.new_document_bytes)
             shown = _shown(tx, project_row, kind, item_id)
             tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
@@ -142,7 +142,7 @@ def set_parts(
         raise moved_on(found.rev)
     made = NewRevision(item_id, found.head + 1, parts, message)
     write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
-    holdings.count_added(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
+    holdings.count_added(tx, project_row.id, {found.creator_id: ItemTotals(stored_bytes=added)})
     shown = _shown(tx, project_row, kind, item_id)
     tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
 
@@ -209,7 +209,7 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
     gone = shown_items(tx, [found])[0]
     absent = _moved_away(kind, item_id)
     row = change_row(tx, item, which, {"deleted_us": tx.now_us}, expected_rev=expected_rev, absent=absent)
-    holdings.count_removed(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
+    holdings.count_removed(tx, project_row.id, {row.creator_id: ItemTotals(1, row.stored_bytes)})
     tx.audit("item.deleted", about=gone.name, **event_of_item(project_row, gone))
 
 
@@ -234,7 +234,7 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     )
     with taken(name_taken):
         row = change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
-    holdings.count_added(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
+    holdings.count_added(tx, project_row.id, {row.creator_id: ItemTotals(1, row.stored_bytes)})
     shown = _shown(tx, project_row, kind, item_id)
     tx.audit("item.restored", about=shown.name, **event_of_item(project_row, shown))
     return shown

@@ -31,7 +31,7 @@ from marey_server.store.items.summaries import skeleton_of, summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import holdings
-from marey_server.store.quotas.holdings import Held
+from marey_server.store.quotas.holdings import ItemTotals
 from marey_server.store.tables import item, item_tag, lineage, revision_part
 from marey_server.store.transaction import Transaction
 
@@ -166,7 +166,7 @@ class _Publication:
     job_id: str | None
     refer_to_deleted: bool
     done: dict[str, Published] = field(default_factory=dict)
-    added: dict[str | None, Held] = field(default_factory=dict)
+    added: dict[str | None, ItemTotals] = field(default_factory=dict)
     """Numbers of new items and their bytes, by the creator of the items; hidden or deleted items do not count."""
     _collection_ids: dict[str, str] = field(default_factory=dict)
 
@@ -322,7 +322,7 @@ class _Publication:
         created = [(one, at) for at, one in zip(ids, new, strict=True) if at in made]
         self._write("item.created", [(one, _Head(at, 1, one.digests, self.author_id)) for one, at in created])
         counted = [at for one, at in created if not one.draft.hidden]
-        self._add(self.author_id, Held(len(counted), sum(rows[at]["stored_bytes"] for at in counted)))
+        self._add(self.author_id, ItemTotals(len(counted), sum(rows[at]["stored_bytes"] for at in counted)))
         for one in new:
             if one.draft.reuse == "new" and one.draft.name_in_batch not in self.done:
                 place = "/".join(filter(None, (one.draft.collection, one.draft.item_name)))
@@ -355,7 +355,7 @@ class _Publication:
         unchanged = item.c.head == head.number
         if write_head(self.tx, one.draft.kind, head.id, parts, one.bodies, unchanged, added_bytes=added):
             self._write("item.revised", [(one, replace(head, number=head.number + 1, parts=parts))])
-            self._add(head.creator_id, Held(stored_bytes=added))
+            self._add(head.creator_id, ItemTotals(stored_bytes=added))
 
     def _with_earlier_facts(self, one: _Ready, head: _Head) -> _Ready:
         """Return the draft of a clip, with empty facts about the recording filled in from the existing clip.
@@ -372,8 +372,8 @@ class _Publication:
         kept = {**one.digests, "info": digest_of_body(body)}
         return replace(one, digests=kept, bodies={**one.bodies, "info": body})
 
-    def _add(self, creator_id: str | None, more: Held) -> None:
-        self.added[creator_id] = self.added.get(creator_id, Held()) + more
+    def _add(self, creator_id: str | None, more: ItemTotals) -> None:
+        self.added[creator_id] = self.added.get(creator_id, ItemTotals()) + more
 
     def _write(self, event: OrdinaryEventKind, made: Sequence[tuple[_Ready, _Head]]) -> None:
         """Insert the newest revisions of items, with their tags, sources and events."""
