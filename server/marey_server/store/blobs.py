@@ -190,7 +190,7 @@ def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
         tx.execute(tx.insert_or_ignore(blob_holder), rows)
 
 
-def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
+def lock_usable(tx: Transaction, digests: Iterable[str]) -> set[str]:
     """Return those of the digests that the caller may refer to, and lock their blobs.
 
     Garbage collection cannot delete the locked blobs before the end of this transaction.
@@ -204,7 +204,7 @@ def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
     Raises `ConflictProblem` (`missing-blobs`) if a blob is not stored or the caller may not refer to it.
     """
     wanted = set(digests)
-    if lacking := wanted - hold(tx, wanted):
+    if lacking := wanted - lock_usable(tx, wanted):
         raise missing_blobs(lacking)
     _name_for_job(tx, job_id, wanted)
 

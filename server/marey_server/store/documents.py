@@ -118,7 +118,7 @@ def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> Non
 def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
     """Check that the caller may use the files to which documents refer; return the sizes of the files in bytes."""
     naming = [one.files for one in contents if one.files]
-    held = blobs.hold(tx, {digest for files in naming for digest in files.values()}) if naming else set()
+    held = blobs.lock_usable(tx, {digest for files in naming for digest in files.values()}) if naming else set()
     for files in naming:
         lacking = {pointer: digest for pointer, digest in files.items() if digest not in held}
         if lacking:
