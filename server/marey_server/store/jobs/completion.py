@@ -32,8 +32,8 @@ from marey_server.store.jobs.fencing import (
     HELD,
     held,
     held_parameters,
-    hold,
     lease_lost,
+    lock_held_job,
     require_attempt,
     stored_answer,
 )
@@ -320,7 +320,7 @@ def fail(
         if earlier["state"] == JobState.SUCCEEDED:
             raise lease_lost(job_id, fence)
         return FailAnswer(**earlier)
-    row = hold(tx, job_id, fence, *ENDING_COLUMNS)
+    row = lock_held_job(tx, job_id, fence, *ENDING_COLUMNS)
     outcome = decide_outcome(row, request, policy, poisoned=_is_poisoned(tx, job_id, request.signature))
     answer = FailAnswer(
         job=job_id,

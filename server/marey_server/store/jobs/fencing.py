@@ -103,7 +103,7 @@ def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
         raise lease_lost(job_id, fence)
 
 
-def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
+def lock_held_job(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
     """Lock the job of an attempt until the transaction ends, and return `columns` of the job's row.
 
     If this is the first write of the attempt, the attempt is counted towards `max_attempts`. Raises `LeaseLostProblem`

@@ -10,7 +10,7 @@ from sqlalchemy import Row, insert, select, update
 from marey_schemas.queue.jobs import JobState
 from marey_schemas.queue.worker_protocol import LogAnswer
 from marey_server.errors import ConflictProblem
-from marey_server.store.jobs.fencing import hold, require_attempt
+from marey_server.store.jobs.fencing import lock_held_job, require_attempt
 from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.tables import attempt, job_log
 from marey_server.store.transaction import Transaction
@@ -35,7 +35,7 @@ def append_log(
     the job.
     """
     require_attempt(tx.principal, job_id, fence)
-    hold(tx, job_id, fence)
+    lock_held_job(tx, job_id, fence)
     of_attempt = (attempt.c.job_id == job_id) & (attempt.c.fence == fence)
     length: int = tx.execute(select(attempt.c.log_bytes).where(of_attempt)).scalar_one()
     if length >= policy.log_limit_bytes:

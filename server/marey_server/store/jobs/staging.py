@@ -24,7 +24,7 @@ from marey_server.store.folder_roles.rights import rights_of_author
 from marey_server.store.items.drafts import Draft, StoredDocument
 from marey_server.store.items.facets import StoredFacets, publish_facets, stored_facets, with_revisions
 from marey_server.store.items.publishing import publish
-from marey_server.store.jobs.fencing import hold, require_attempt
+from marey_server.store.jobs.fencing import lock_held_job, require_attempt
 from marey_server.store.jobs.inputs import PinnedInputs
 from marey_server.store.projects import find_by_id
 from marey_server.store.tables import document, job, staged_output
@@ -70,7 +70,7 @@ def stage(
     `stored_facets`, too.
     """
     require_attempt(tx.principal, job_id, fence)
-    held = hold(tx, job_id, fence, job.c.inputs, job.c.kind, job.c.project_id)
+    held = lock_held_job(tx, job_id, fence, job.c.inputs, job.c.kind, job.c.project_id)
     if facets:
         _stage_facets(tx, job_id, fence, stored_facets(tx, held, facets))
     return _stage_outputs(tx, job_id, fence, outputs, held.inputs)
