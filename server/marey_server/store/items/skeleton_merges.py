@@ -72,7 +72,7 @@ class _Skeleton:
 
 
 @dataclass(frozen=True)
-class _User:
+class _UsingItem:
     """Item that uses a skeleton, with the documents of its newest revision."""
 
     row: Any
@@ -178,7 +178,7 @@ def _count_users(tx: Transaction, project: ProjectRow, skeletons: Sequence[str])
     return counts
 
 
-def _users(tx: Transaction, project: ProjectRow, skeleton: str, *, lock: bool) -> Iterator[_User]:
+def _items_using(tx: Transaction, project: ProjectRow, skeleton: str, *, lock: bool) -> Iterator[_UsingItem]:
     """Yield the items whose newest revision uses a skeleton, each with its documents; with `lock`, lock their rows."""
     statement = item_rows().where(_uses(project, [skeleton])).order_by(item.c.id).limit(MOST_MOVED)
     rows = tx.execute(statement.with_for_update(of=item) if lock else statement).all()
@@ -190,7 +190,7 @@ def _users(tx: Transaction, project: ProjectRow, skeleton: str, *, lock: bool) -
         )
         for row in some:
             parts = digests[row.id, row.head]
-            yield _User(row, parts, {part: bodies[digest] for part, digest in parts.items() if digest in bodies})
+            yield _UsingItem(row, parts, {part: bodies[digest] for part, digest in parts.items() if digest in bodies})
 
 
 def _locked(statement: Any, request: SkeletonMergeRequest) -> Any:
@@ -251,8 +251,8 @@ def _moved(tx: Transaction, project: ProjectRow, skeleton: _Skeleton) -> frozens
     if skeleton.user_count > MOST_MOVED:
         return frozenset()
     common: frozenset[str] | None = None
-    for user in _users(tx, project, skeleton.row.id, lock=False):
-        common = user.moved if common is None else common & user.moved
+    for one in _items_using(tx, project, skeleton.row.id, lock=False):
+        common = one.moved if common is None else common & one.moved
         if not common:
             break  # most motions replace no offset, so the first one decides
     return common or frozenset()
@@ -279,15 +279,15 @@ def _move(tx: Transaction, project: ProjectRow, merged: _Skeleton, kept: _Skelet
     """
     reference = {"item": kept.row.id, "revision": kept.row.head}
     message = f"The skeleton {merged.named['path']} was merged into {kept.named['path']}"
-    users = list(_users(tx, project, merged.row.id, lock=True))
-    if Counter(user.row.kind for user in users) != merged.users or any(not merged.odd <= user.moved for user in users):
+    found = list(_items_using(tx, project, merged.row.id, lock=True))
+    if Counter(one.row.kind for one in found) != merged.users or any(not merged.odd <= one.moved for one in found):
         raise ConflictProblem(
             f"Other requests changed items that use the skeleton {merged.named['path']} at the same time; try again.",
             code="contended",
             unnamed="Other requests changed items that use a skeleton at the same time; try again.",
         )
-    _publish(tx, project, [_draft(tx, user, reference, message) for user in users])
-    clips = {user.row.id: user.row.head for user in users if user.kind is Kind.CLIP}
+    _publish(tx, project, [_draft(tx, one, reference, message) for one in found])
+    clips = {one.row.id: one.row.head for one in found if one.kind is Kind.CLIP}
     _publish(tx, project, list(_moved_annotations(tx, project, clips, message)))
 
 
@@ -298,13 +298,13 @@ def _publish(tx: Transaction, project: ProjectRow, drafts: Sequence[Draft]) -> l
     return made
 
 
-def _draft(tx: Transaction, user: _User, reference: Tree, message: str) -> Draft:
+def _draft(tx: Transaction, one: _UsingItem, reference: Tree, message: str) -> Draft:
     """Return the draft of a new revision of an item that refers to another skeleton; its arrays are the same."""
-    part = SKELETON_PARTS[user.kind]
-    changed = {part: {**user.bodies[part], "skeleton": reference}}
-    if "tree" in user.bodies:
-        changed["tree"] = {**user.bodies["tree"], "model_digest": digest_of_body(changed["model"])}
-    return _revised(tx, user.row, user.digests, changed, message)
+    part = SKELETON_PARTS[one.kind]
+    changed = {part: {**one.bodies[part], "skeleton": reference}}
+    if "tree" in one.bodies:
+        changed["tree"] = {**one.bodies["tree"], "model_digest": digest_of_body(changed["model"])}
+    return _revised(tx, one.row, one.digests, changed, message)
 
 
 def _revised(tx: Transaction, row: Any, digests: Mapping[str, str], changed: Mapping[str, Tree], message: str) -> Draft:
