@@ -86,11 +86,11 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
         raise InvalidProblem(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
     scopes = require_worker(tx.principal, request)
     claim_id = request.claim_id if tx.principal.token_key else None
-    wanted = _wanted(tx, request, scopes, policy)
-    places, turns = _read_turns(tx, claim_id, wanted)
+    queries = _claim_queries(tx, request, scopes, policy)
+    places, turns = _read_turns(tx, claim_id, queries)
     if claim_id is not None and places:
         return _leases_again(tx, claim_id, places, policy)
-    rows = _claim_in_turn(tx, wanted, turns, request.max)
+    rows = _claim_in_turn(tx, queries, turns, request.max)
     if not rows:
         return []
     tokens = [_issue_token(tx, claim_id, row) for row in rows]
@@ -125,18 +125,20 @@ _CLAIMED_BEFORE = Prepared(
 )
 
 
-def _read_turns(tx: Transaction, claim_id: str | None, wanted: _Wanted) -> tuple[list[tuple[str, int]], list[Turn]]:
+def _read_turns(
+    tx: Transaction, claim_id: str | None, queries: _ClaimQueries
+) -> tuple[list[tuple[str, int]], list[Turn]]:
     """Return the attempts of an earlier claim with the same `claim_id`, and the projects that have jobs.
 
     The attempts are given by job and fence; there are none without an earlier claim. Concurrent claims with the same
     `claim_id` run one after the other.
     """
     if claim_id is None:
-        return [], turns_of(tx.run(wanted.turns, wanted.of_turns))
+        return [], turns_of(tx.run(queries.turns, queries.of_turns))
     token_id = tx.principal.token_id
     tx.lock(f"claim {token_id} {claim_id}")
     before, rows = tx.run_together(
-        (_CLAIMED_BEFORE, {"token": token_id, "claim": claim_id}), (wanted.turns, wanted.of_turns)
+        (_CLAIMED_BEFORE, {"token": token_id, "claim": claim_id}), (queries.turns, queries.of_turns)
     )
     return [(row.job_id, row.fence) for row in before], turns_of(rows)
 
@@ -286,7 +288,7 @@ def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
 _CLAIM_STATEMENTS = {one_job: Prepared(_claim_statement(one_job=one_job)) for one_job in (False, True)}
 
 
-class _Wanted(NamedTuple):
+class _ClaimQueries(NamedTuple):
     """Statements that find projects with jobs for a claim (`turns`) and claim jobs (`claim`), with their parameters."""
 
     turns: Prepared
@@ -295,7 +297,7 @@ class _Wanted(NamedTuple):
     of_claim: Mapping[str, Any]
 
 
-def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], policy: QueuePolicy) -> _Wanted:
+def _claim_queries(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], policy: QueuePolicy) -> _ClaimQueries:
     caller = tx.principal
     own_projects = caller.kind == "user" and not caller.administrator
     restriction = Restriction(request.job is not None, "work" not in scopes, own_projects)
@@ -312,12 +314,12 @@ def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], polic
     if restriction.own_projects:
         projects["user"] = caller.user_id
     lease = {"lease_ttl": policy.lease_ttl_us, "end_grace": policy.end_grace_us}
-    return _Wanted(
+    return _ClaimQueries(
         statement_of_turns(restriction), jobs | projects, _CLAIM_STATEMENTS[restriction.one_job], jobs | lease
     )
 
 
-def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most: int) -> list[Row[Any]]:
+def _claim_in_turn(tx: Transaction, queries: _ClaimQueries, turns: Sequence[Turn], most: int) -> list[Row[Any]]:
     """Claim up to `most` jobs, from each project as many as `next_projects` gives to it; return the rows of the jobs.
 
     If a project has fewer jobs, the remaining ones are taken from the other projects.
@@ -329,7 +331,7 @@ def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most
         for turn, share in shares.items():
 
             def take(number: int, turn: Turn = turn) -> list[Row[Any]]:
-                return tx.run(wanted.claim, {**wanted.of_claim, "of_project": turn.project_id, "most": number})
+                return tx.run(queries.claim, {**queries.of_claim, "of_project": turn.project_id, "most": number})
 
             taken = take_within_limit(tx, turn, share, take, may_wait=not rows)
             rows += taken
