@@ -274,7 +274,7 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
     tx.shared_outputs += len(drafts) + staging.number_measured(drafts) // MEASURED_PER_OUTPUT
     named = set(staging.named_blobs(row.result))
-    if not staging.take_up_documents(tx, drafts) or not blobs.share_with_job(tx, row.id, named):
+    if not staging.renew_documents(tx, drafts) or not blobs.share_with_job(tx, row.id, named):
         return []
     made = commits.publish_outputs(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
     if made.failure is not None:

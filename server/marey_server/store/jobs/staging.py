@@ -185,7 +185,7 @@ def staged_drafts(
     return drafts
 
 
-def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
+def renew_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
     """Reset the age of documents that an earlier job staged, so that garbage collection keeps them.
 
     Returns whether all of them are still stored.
