@@ -87,7 +87,7 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[*tuple[Any, ...]]
     if quota == "user_uploads":
         return select(func.count()).select_from(upload).where(*_open(user_id))
     if quota == "user_upload_bytes":
-        taking_space = or_(and_(*_open(user_id)), and_(*_useless(user_id)))
+        taking_space = or_(and_(*_open(user_id)), and_(*_stored_twice(user_id)))
         return select(func.coalesce(func.sum(upload.c.length), 0)).where(taking_space)
     if quota == "user_tokens":
         valid = or_(token.c.expires_us.is_(None), token.c.expires_us > tx.now_us)
@@ -105,7 +105,7 @@ def _open(user_id: str) -> tuple[Any, ...]:
     return upload.c.user_id == user_id, upload.c.finished_digest.is_(None), upload.c.dropped.is_(False)
 
 
-def _useless(user_id: str) -> tuple[Any, ...]:
+def _stored_twice(user_id: str) -> tuple[Any, ...]:
     """Return the SQL conditions for finished uploads of a user whose bytes are stored twice.
 
     Their bytes were a blob already, so no blob uses the pieces of the upload, and they do not count towards
