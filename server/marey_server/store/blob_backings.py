@@ -92,7 +92,7 @@ class BlobBacking(Protocol):
         ...
 
     def expect(self, connection: Connection, digests: Iterable[str]) -> None:
-        """Prepare to read all bytes of several blobs, if reading them together is faster than one by one."""
+        """Announce that all bytes of several blobs will be read, so that the backing can read them together."""
         ...
 
     def release(self, connection: Connection, digest: str) -> None:

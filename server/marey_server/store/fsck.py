@@ -71,9 +71,10 @@ MISCOUNTED = "counter-wrong"
 def check_store(
     database: Database, *, progress: Callable[[str, int], None] | None = None, repair: bool = False
 ) -> Iterator[StoreDefect]:
-    """Yield all defects as they are found; call `progress(check, count)` after each page.
+    """Yield all defects as they are found.
 
-    With `repair`, wrong counters of items and bytes are yielded as defects, too, and then corrected.
+    From time to time, `progress` is called with the name of a check and the number of rows that it has examined. With
+    `repair`, wrong counters of items and bytes are corrected at the end; they are yielded as defects, too.
     """
     yield from database.read(SYSTEM, _check_file)
     passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[StoreDefect]]], ...] = (

@@ -47,7 +47,7 @@ class FoundIndex(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FoundClip:
-    """Clip in an answer: its path, and its newest revision."""
+    """Clip that a search has found: its path, and the number of its newest revision."""
 
     path: str
     head: int

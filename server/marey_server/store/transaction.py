@@ -182,9 +182,9 @@ class Transaction:
         statement.run_each(self.connection, many)
 
     def insert_or_ignore(self, table: Table, row: Mapping[str, Any] | None = None) -> postgresql.Insert | sqlite.Insert:
-        """Return an INSERT that does nothing if a unique index refuses the row; `returning` then gives no row.
+        """Return an INSERT that skips rows that violate a unique index; `returning` gives no row for them.
 
-        Without `row`, the rows are given at execution.
+        Without `row`, the rows are passed to `execute`.
         """
         return self.insert_into(table, row).on_conflict_do_nothing()
 
@@ -239,7 +239,7 @@ class Transaction:
         self._after_commit.append(action)
 
     def run_after_commit(self) -> None:
-        """Run the actions registered with `after_commit`, and announce that there are events."""
+        """Run the actions that were passed to `after_commit`; if events were recorded, announce them."""
         for action in self._after_commit:
             action()
         if self._has_emitted:

@@ -61,7 +61,10 @@ class StoredUpload:
 
 
 def create_upload(tx: Transaction, length: int, *, digest: str | None = None) -> StoredUpload:
-    """Create an upload of `length` bytes; if `digest` is given, the bytes must have it."""
+    """Create an upload of `length` bytes; if `digest` is given, the bytes must have this digest.
+
+    Raises `TooLargeProblem` if `length` is not between 1 and `MAX_UPLOAD_BYTES`.
+    """
     sender = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
         raise TooLargeProblem(f"The size of an upload must be 1 to {MAX_UPLOAD_BYTES} bytes.")
@@ -149,7 +152,7 @@ def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> S
 
 
 def require_intact(found: StoredUpload) -> None:
-    """Raise `InvalidProblem` if the bytes do not have the announced digest."""
+    """Raise `InvalidProblem` if the bytes of a finished upload do not have the announced digest."""
     if found.actual_digest is not None:
         detail = (
             f"The bytes have the digest {found.actual_digest}, not {found.announced}. Delete this upload and "

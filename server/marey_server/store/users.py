@@ -240,7 +240,10 @@ def authenticated(tx: Transaction, name: str, verified_hash: str) -> Principal:
 
 
 def active_principal(tx: Transaction, user_id: str) -> Principal:
-    """Return the principal of a user whom an identity provider has signed in. Raises `ForbiddenProblem` if disabled."""
+    """Return the principal of a user whom an identity provider has signed in.
+
+    Raises `ForbiddenProblem` if the user is disabled.
+    """
     row = tx.execute(select(user).where(user.c.id == user_id, user.c.disabled.is_(False))).first()
     if row is None:
         raise ForbiddenProblem("Your user is disabled; ask an administrator.", code="user-disabled")

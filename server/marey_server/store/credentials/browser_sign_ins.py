@@ -38,9 +38,10 @@ _USER_NAME = re.compile(UserName.__metadata__[0].pattern)
 
 
 def begin(tx: Transaction, request: BrowserSignInCreate, address: str, per_minute: int, longest_s: int) -> str:
-    """Begin a sign-in, and return its id. One address may begin at most `per_minute` sign-ins a minute.
+    """Begin a sign-in, and return its id. Its token will be valid for `longest_s` seconds at most.
 
-    Raises `TooManyRequestsProblem`, and `UnavailableProblem` if too many sign-ins of all addresses are not complete.
+    Raises `TooManyRequestsProblem` if the address begins more than `per_minute` sign-ins a minute, and
+    `UnavailableProblem` if `MOST_WAITING` sign-ins of all addresses are not complete.
     """
     if wait_s := rate_limits.count(tx, RateLimit(key_of("browser", address), per_minute, MINUTE_US // per_minute)):
         raise TooManyRequestsProblem(
@@ -81,9 +82,10 @@ def open_in_browser(tx: Transaction, sign_in_id: str, cookie: str, state: str) -
 
 
 def use_state(tx: Transaction, state: str, cookie: str) -> tuple[str, int | None]:
-    """Use up the state that the provider sent back with the browser; return the sign-in's id and port.
+    """Use up the state that the provider sent back with the browser; return the id and the port of the sign-in.
 
-    Raises `NotFoundProblem` if the state is not valid in the browser with this cookie.
+    At this port of the person's machine, the program waits for the code; None if it does not. Raises `NotFoundProblem`
+    if the state is not valid in the browser with this cookie.
     """
     which = (
         browser_sign_in.c.state_hash == hash_secret(state),

@@ -286,7 +286,9 @@ def _id_of(tx: Transaction, name: str) -> str:
 
 
 def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) -> None:
-    """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
+    """Revoke a token of the caller; administrators may revoke any token.
+
+    Raises `NotFoundProblem` if there is no such token that the caller may revoke.
 
     With `with_created`, also revoke the successors and predecessors of this token, all tokens that were created with
     any of these, and so on.

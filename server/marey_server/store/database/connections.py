@@ -111,7 +111,7 @@ class Database:
 
     @property
     def lanes(self) -> dict[str, Lane | WriteLane]:
-        """The lanes by name."""
+        """Lanes of this process by name: groups of threads that run the calls for this database."""
         lanes: dict[str, Lane | WriteLane] = {"database": self._ordinary, "database-reserved": self._reserved}
         if isinstance(self.blobs, ObjectBlobs):
             lanes["object-storage"] = self._moving

@@ -15,7 +15,7 @@ WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
 """Greatest number of runs of a read; only a broken connection makes it run again, at once, on a new connection."""
 FAILURES = (exc.DBAPIError, exc.TimeoutError, OSError, OverflowError, UnicodeEncodeError)
-"""Errors with which a transaction can fail."""
+"""Types of the errors that the database, its driver or the connection raises during a transaction."""
 
 
 def worth_retrying(error: Exception) -> bool:

@@ -48,7 +48,7 @@ class StoredChunks:
 
 
 def store_chunks(tx: Transaction, chunks: Mapping[str, bytes]) -> None:
-    """Store chunks by digest. Storing a chunk again has no effect."""
+    """Store chunks by digest. If a chunk is stored already, only its time is renewed, so that no purge deletes it."""
     compressor = zstandard.ZstdCompressor(level=1)
     rows = [
         {

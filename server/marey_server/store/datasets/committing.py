@@ -55,7 +55,7 @@ class FolderCommit:
     rev: int
     """`rev` of the dataset when the folder was read."""
     was: str | None
-    """Value of `dataset.folder_commit` when the folder was read."""
+    """Version that was checked out in the folder when it was read, as stored in `dataset.folder_commit`."""
     partial: FolderManifest | None
     """Record of the folder's entries after the commit, still with the commit before it.
 

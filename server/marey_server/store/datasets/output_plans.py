@@ -52,7 +52,7 @@ class OutputEntries:
     message: str
     job_id: str
     author_id: str | None
-    """Author of the job."""
+    """Id of the user who is the author of the job; None for a job of the server itself."""
     replaced: str | None = None
     """Folder whose other entries of `kinds` the commit removes, except outputs of the job; None removes nothing."""
     kinds: Collection[str] = ()

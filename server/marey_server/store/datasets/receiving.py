@@ -60,7 +60,7 @@ IMPORTED = "imported"
 
 @dataclass(frozen=True)
 class LocalRevisions:
-    """Revisions of the project that a request refers to, by content digest."""
+    """Revisions of the project that a request contains or refers to (`held`), by content digest, with their data."""
 
     held: Mapping[str, RevisionKey]
     documents: Mapping[str, Mapping[str, str]]

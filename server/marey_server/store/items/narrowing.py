@@ -140,6 +140,6 @@ def _in_range(condition: Condition, project_id: str, kind: Kind) -> Select[*tupl
 RANGES: dict[str, Comparison] = {
     "frames": frames_in_range, "created": COMPARISONS["created"], "updated": COMPARISONS["updated"],
 }  # fmt: skip
-"""Comparisons for the number and the times by which lists can be sorted; these fields are columns of an index."""
+"""Functions that convert conditions to SQL, for those fields with numbers or times for which there is an index."""
 CANDIDATES: dict[str, Candidates] = {**dict.fromkeys(INDEXED_FACTS, _with_fact), "tag": _with_tag}
-"""Functions that return the candidates for a condition, by the name of the field."""
+"""Functions that return the query for the items that may meet a condition `=`, by the name of the field."""

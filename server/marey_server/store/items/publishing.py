@@ -376,7 +376,7 @@ class _Publication:
         self.added[creator_id] = self.added.get(creator_id, ItemTotals()) + more
 
     def _write(self, event: OrdinaryEventKind, made: Sequence[tuple[_Ready, _Head]]) -> None:
-        """Insert the newest revisions of items, with their tags, sources and events."""
+        """Insert new revisions, which become the newest of their items, with their tags, sources and events."""
         if not made:
             return
         revisions = [NewRevision(head.id, head.number, head.parts, one.draft.message) for one, head in made]

@@ -371,5 +371,5 @@ COMPARISONS: dict[str, Comparison] = {
     "capture_system": _text_of("capture_system"),
     "consent_until": _day_of("consent_until"),
 }
-"""Comparisons by the name of the field."""
+"""Functions that convert a condition to SQL, by the name of the field."""
 assert set(COMPARISONS) == set(FIELDS), "every field of queries needs a comparison"

@@ -42,7 +42,10 @@ class StartGrace:
         self._seen_us = 0
 
     def over(self, now_us: int) -> bool:
-        """Return whether leases may be reclaimed; `now_us` is the time of the database."""
+        """Return whether the delay has passed, so that leases may be reclaimed; `now_us` is the time of the database.
+
+        The delay starts again if the last call was too long ago, or at a later time than `now_us`.
+        """
         with self._lock:
             if self._since_us is None or not 0 <= now_us - self._seen_us <= self._longest_silence_us:
                 self._since_us = now_us

@@ -85,14 +85,14 @@ READY_COLUMNS = (*CANDIDATE_COLUMNS, job.c.kind, job.c.size, job.c.unbound, job.
 """Columns of waiting jobs that are read to make the jobs ready."""
 
 _BY_ID = job.c.id.concat("")
-"""Id of a job for ORDER BY. With the plain column, SQLite would read all jobs by the index of the ids."""
+"""SQL expression for the id of a job in ORDER BY; with the plain column, SQLite would read all jobs by their ids."""
 
 _task = job.alias("task")
 _KEY_OF_TASKS = select(_task.c.concurrency_key).where(_task.c.parent_id == job.c.id).limit(1).scalar_subquery()
 _KEY_OF_SOURCE = case(
     (and_(job.c.size.is_not(None), job.c.state == RUNNING), _KEY_OF_TASKS), else_=job.c.concurrency_key
 ).label("concurrency_key")
-"""Concurrency key of a job. For a parent job whose tasks run, the key of the tasks: its own row has no key."""
+"""SQL expression for the concurrency key of a job; for a parent job whose tasks run, it is the key of the tasks."""
 _SOURCE_COLUMNS = (*_COMMON_COLUMNS, _KEY_OF_SOURCE, job.c.state, job.c.lease_expires_us)
 
 

@@ -31,12 +31,15 @@ UNSUCCESSFUL = ("failed", "cancelled")
 
 
 def retry_job(tx: Transaction, job_id: str) -> Job:
-    """Submit a failed or cancelled job again, and return the new job; results of the old job's tasks are used again.
+    """Submit a failed or cancelled job again, and return the new job.
 
-    The new job has the same inputs. If other jobs should have created an input but did not, the retries of these jobs
-    create it. Unsuccessful dependencies are retried before the job. Dependants that ended only because of this job are
-    retried after it, so that the rest of a pipeline continues. Jobs that the caller may not retry are left out. Raises
-    `ConflictProblem` for a task, and for a job that has not ended or has succeeded.
+    The new job has the same inputs, and can share the results of tasks of the old job that have succeeded. If other
+    jobs should have created an input but did not, the retries of these jobs create it. Unsuccessful dependencies are
+    retried before the job. Dependants that ended only because of this job are retried after it, so that the rest of a
+    pipeline continues; dependants that the caller may not retry are left out.
+
+    Raises `ConflictProblem` for a task, and for a job that has not ended or has succeeded. Raises `ForbiddenProblem`
+    for a job, or a dependency, of another user, unless the caller is a maintainer.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
@@ -60,7 +63,7 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
 
 
 class _Family:
-    """Set of jobs that are retried together."""
+    """Set of jobs that are retried together, with what each of them depends on."""
 
     def __init__(self, tx: Transaction, project: ProjectRow) -> None:
         self._tx = tx

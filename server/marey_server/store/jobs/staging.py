@@ -48,7 +48,10 @@ class PreparedOutput:
 
 
 def prepare_output(output: StagedOutput) -> PreparedOutput:
-    """Check and encode the documents of an output. Raises `InvalidProblem`."""
+    """Check and encode the documents of an output.
+
+    Raises `InvalidProblem` if the kind has no such part, or a document is not valid.
+    """
     specs = PARTS[output.kind]
     unknown = [part for part in output.parts if part not in specs]
     if unknown:

@@ -38,7 +38,7 @@ If there are too many claims, or they are too large together, the oldest claim o
 forgotten. A single claim that is too large is not remembered.
 """
 MOST_OF_USER = 2000
-"""Default of the greatest number of workers of one user that are alive, in one server process."""
+"""Greatest number of workers of one user that may be alive in one server process, unless the settings change it."""
 FORGOTTEN_AFTER_S = 24 * 3600.0
 ALIVE_S = 60.0
 """Seconds after a claim in which a worker counts as alive. Workers claim again at least every 30 seconds, or every 15

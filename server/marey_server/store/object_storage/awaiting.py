@@ -39,7 +39,7 @@ class WantedBytes(NamedTuple):
 
 @dataclass
 class Carried:
-    """Bytes that were moved for one call of a function, which may need several transactions."""
+    """Bytes that were moved so far for one call of a function; the function runs again after each move."""
 
     stored: dict[str, StoredObject] = field(default_factory=dict)
     """Objects that were stored, by the digest of their bytes."""

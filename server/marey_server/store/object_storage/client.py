@@ -149,7 +149,7 @@ class ObjectStorage:
             obstore.put(self._store, name, data, use_multipart=False)
 
     def read(self, name: str, start: int, stop: int) -> bytes | None:
-        """Return bytes `start` to `stop` of an object, fewer if the object is shorter; None if there is no object."""
+        """Return the bytes `start` to `stop - 1` of an object, fewer if it is shorter; None if there is no object."""
         import obstore
         from obstore.exceptions import BaseError
 

@@ -69,7 +69,7 @@ def link_invalid() -> NotFoundProblem:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try to use the code of a link, which must be counted for rate limits before the code is checked."""
+    """Return the sign-in try for the code of a link; the caller must count the try before checking the code."""
     prefix, _ = split_study_link(code) or ("", "")
     return SignInTry(f"study {prefix}", address, per_minute)
 

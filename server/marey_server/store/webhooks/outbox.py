@@ -95,7 +95,7 @@ class Delivery:
 
 @dataclass(frozen=True)
 class Batch:
-    """Next deliveries of a webhook in order."""
+    """Next deliveries of a webhook in order, with its position and its number of attempts when they were read."""
 
     sharer: str
     """Id of the user who created the webhook, or of the webhook if the user is unknown.

@@ -158,7 +158,7 @@ def statement_of_turns(restriction: Restriction) -> Prepared:
 
 
 def turns_of(rows: Iterable[Any]) -> list[Turn]:
-    """Return the turns for the rows of a statement of `statement_of_turns`."""
+    """Convert the rows of the statement from `statement_of_turns` to turns."""
     return [Turn(row.project_id, row.running, row.most_running, row.served_us) for row in rows]
 
 
