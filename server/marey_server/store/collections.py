@@ -73,7 +73,7 @@ def check_length(path: str) -> None:
 
 
 def at_or_below(path: str) -> ColumnElement[bool]:
-    """Return the condition for rows of `collection`: the folder at `path` and all folders below it."""
+    """Return the SQL condition for the rows of the folder at `path` and of all folders below it."""
     if not path:
         return literal(True)
     return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(path) + 1) == f"{path}/")

@@ -193,7 +193,7 @@ def number_of(tx: Transaction) -> ColumnElement[int]:
 
 
 def follows(tx: Transaction, after: int) -> ColumnElement[bool]:
-    """Return the condition for events after the one numbered `after`."""
+    """Return the SQL condition for events with a number greater than `after`."""
     if tx.is_postgres:
         return event.c.number > after
     return and_(_UNNUMBERED, event.c.seq > after)  # the first condition makes the index of the feed usable

@@ -321,7 +321,7 @@ def _check_folder(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault for each entry that is damaged, or whose content is not that of any revision of the project."""
+    """Return a fault for each entry that is damaged, or whose content no revision of the project has."""
     trees = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     waiting = set(tx.execute(trees).scalars())
     seen: set[str] = set()

@@ -35,7 +35,7 @@ class Order:
         return [column.desc() if falls else column.asc() for column, falls in self.columns]
 
     def after(self, values: Sequence[Any]) -> ColumnElement[bool]:
-        """Return the condition for the rows after the row with these values.
+        """Return the SQL condition for the rows that follow the row with these values in the order.
 
         The first term of the condition restricts the first column to a range, so that an index can be used.
         """
@@ -48,7 +48,11 @@ class Order:
 
 
 def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str = "id") -> Order:
-    """Return the order for `sort=-created_at,name`. Raises `BadRequestProblem` for an unknown or repeated key."""
+    """Parse the parameter `sort` of a list, such as `-created_at,name`; a minus means descending order.
+
+    `keys` maps the allowed keys to columns. The column of the key `unique` is added at the end, so that the order is
+    complete. Raises `BadRequestProblem` for an unknown or repeated key.
+    """
     names = [part.strip() for part in text.split(",") if part.strip()]
     bare = [name.removeprefix("-") for name in names]
     if unknown := [name for name in bare if name not in keys]:

@@ -123,7 +123,10 @@ def require_all_clips(tx: Transaction, project: str, found: FoundIndex) -> None:
 
 
 def name_clips(tx: Transaction, project: str, ids: Collection[str]) -> dict[str, FoundClip]:
-    """Return, by id, the paths and newest revisions of those of the clips that exist and that the caller may read."""
+    """Return the paths and newest revisions of clips, by id.
+
+    Clips that do not exist, or that the caller may not read, are left out.
+    """
     project_row = projects.require(tx, project)
     refused = reach.unreachable_items(tx, ids)
     found: dict[str, FoundClip] = {}

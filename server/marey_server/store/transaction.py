@@ -96,7 +96,7 @@ IGNORED = Observer()
 
 
 class Transaction:
-    """Transaction with the principal on whose behalf it runs."""
+    """Database transaction that runs on behalf of a principal, such as a user, a worker or an attempt of a job."""
 
     def __init__(
         self,

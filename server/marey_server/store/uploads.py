@@ -200,7 +200,10 @@ def delete_dropped(tx: Transaction, limit: int) -> int:
 
 
 def _sender(tx: Transaction) -> dict[str, Any]:
-    """Return the columns of a new upload that record the sender, and the projects in which the bytes can be used."""
+    """Return the columns of a new upload that name the sender, and the projects in which the bytes can be used.
+
+    Raises `ForbiddenProblem` if the caller may not upload data.
+    """
     caller = tx.principal
     blobs.require_sender(caller)
     if caller.kind == "attempt":

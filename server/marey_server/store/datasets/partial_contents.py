@@ -133,7 +133,7 @@ class _Described(NamedTuple):
 
 
 def _described(value: Any, part: str) -> _Described | None:
-    """Return a description of the array that `value`, a partial array or an array difference, stands for.
+    """Return the base and the size of the array that `value`, a partial array or an array difference, describes.
 
     Returns None for other values of a document. Raises `InvalidProblem` if `value` is malformed.
     """

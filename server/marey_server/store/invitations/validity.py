@@ -47,12 +47,12 @@ IN_FORCE = and_(
 
 
 def is_unspent(tx: Transaction) -> ColumnElement[bool]:
-    """Return the condition for invitations that are neither used up nor expired."""
+    """Return the SQL condition for invitations that are neither used up nor expired."""
     return and_(invitation.c.used < invitation.c.uses, invitation.c.expires_us > tx.now_us)
 
 
 def is_open(tx: Transaction) -> ColumnElement[bool]:
-    """Return the condition for invitations that somebody can still use."""
+    """Return the SQL condition for invitations that somebody can still use."""
     return and_(is_unspent(tx), IN_FORCE)
 
 

@@ -79,7 +79,7 @@ def read_lineage(
 ) -> Lineage:
     """Return the inputs of a revision, the job that created it, and the revisions that were made from it.
 
-    Without `revision_number`, the newest revision is meant. Items that the caller may not see are left out.
+    If `revision_number` is None, this is the newest revision. Items that the caller may not see are left out.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     number = revision_number or found.head

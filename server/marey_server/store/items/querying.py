@@ -104,7 +104,7 @@ def _any(made: list[ColumnElement[bool]]) -> ColumnElement[bool]:
 
 
 def _is_true(condition: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return the condition with null replaced by false."""
+    """Return an SQL condition with null replaced by false."""
     return func.coalesce(condition, false())
 
 
@@ -270,7 +270,7 @@ def _path(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def _folder(condition: Condition, project_id: str) -> ColumnElement[bool]:
-    """Return the condition on the folder of an item.
+    """Return the SQL condition on the folder of an item.
 
     `=` matches items in the given folder and in folders below it; `~` matches a part of the folder's path.
     """
@@ -290,7 +290,7 @@ def _tag(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def frames_in_range(condition: Condition, _: str) -> ColumnElement[bool]:
-    """Return the condition on the number of frames, written so that a database can use the index of this column.
+    """Return the SQL condition on the number of frames, written so that a database can use the index of the column.
 
     It selects the same items as the condition in `COMPARISONS`, but compares the column with whole numbers. A list must
     not use this form, unless it reads only few items. Otherwise SQLite uses this index instead of the index by which
@@ -322,7 +322,7 @@ def _facet(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def _warning(condition: Condition, _: str) -> ColumnElement[bool]:
-    """Return the condition on the codes of warnings, which are stored as the text of a list: `["foot-slide", "gap"]`.
+    """Return the SQL condition on the codes of warnings, stored as the text of a list: `["foot-slide", "gap"]`.
 
     Codes contain no quotation marks or commas.
     """

@@ -81,10 +81,10 @@ def _rig(given: LoadedDraft | None, stored: _StoredSkeleton | None) -> RigDocume
 def _on_own_skeletons(
     tx: Transaction, loaded: Sequence[LoadedDraft], own: Mapping[str, _StoredSkeleton]
 ) -> list[LoadedDraft]:
-    """Return the drafts, of which those named in `own` now refer to the skeletons in `own`, as their items do already.
+    """Let the drafts that `own` names refer to the skeletons of their existing items, which `own` contains.
 
-    If no other draft uses a new skeleton any more, the draft of the new skeleton gets the rig of the skeleton in `own`,
-    so that no skeleton is created from it.
+    If then no draft uses a new skeleton any more, the draft of the new skeleton gets the rig of the existing skeleton,
+    so that no skeleton is created from it. Returns all drafts in the same order.
     """
     others = {name for one in loaded if one.draft.name_in_batch not in own for name in one.refers}
     replaced: dict[str, RigDocument] = {}

@@ -96,9 +96,10 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
     newest revision of the kept skeleton. Annotations of the clips get revisions that refer to the new revisions of the
     clips. The merged skeletons are deleted.
 
-    Raises `NotFoundProblem` for an unknown skeleton, `InvalidProblem` for named skeletons that are not the same rig,
-    `ConflictProblem` for a joint map made by hand that would be lost, `TooLargeProblem` for too many skeletons or
-    items, and `ForbiddenProblem` unless the caller is a maintainer of all folders.
+    Raises `NotFoundProblem` for an unknown skeleton, and `InvalidProblem` if the named skeletons are not one rig.
+    Raises `ConflictProblem` if a joint map that somebody has made or confirmed would be lost, or if another request
+    changes the items. Raises `TooLargeProblem` for too many skeletons or items, and `ForbiddenProblem` unless the
+    caller is a maintainer of all folders.
     """
     row = projects.require(tx, project)
     if request.dry_run:

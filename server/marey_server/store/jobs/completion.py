@@ -180,7 +180,7 @@ def _keep_from_sharing(
     """Remove the cache keys of completed jobs whose results must not be shared.
 
     A result must not be shared if the worker reports that it is not shareable, or if the worker has another version of
-    the job kind. The result of a parent job must not be shared if that of one of its tasks must not. Returns all
+    the job kind. The result of a parent job must not be shared if the result of a task must not be shared. Returns all
     completed attempts whose jobs have no cache key.
     """
     unshared = {(row.id, row.fence) for row in won if row.cache_key is None}

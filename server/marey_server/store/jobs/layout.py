@@ -281,7 +281,7 @@ def _has_key(submission: Submission) -> bool:
 def _cache_key(one: NewJob, parts: Mapping[tuple[str, int], dict[str, str]], newest: Mapping[str, int]) -> str:
     """Return the digest that is equal for all jobs that must compute the same result.
 
-    `parts` is the result of `_part_digests`, and `newest` that of `_newest_revisions`.
+    `parts` is the result of `_part_digests`; `newest` is the result of `_newest_revisions`.
     """
     submission, kind, params = one.submission, one.submission.kind, one.submission.params
     inputs = _input_contents(kind, one.pins, parts)

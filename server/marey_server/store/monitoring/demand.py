@@ -54,7 +54,8 @@ def read_demand(
     reach : jobs that the workers can run
     workers : names of the workers that exist already
     limit : number of queued jobs at which counting stops
-    others : reaches of the other pools; a job counts only for the pools with the fewest labels that can run it
+    others : jobs that the workers of the other pools can run; if several pools can run a job, it counts only for the
+        pool with the fewest labels
     """
     return Demand(_count_queued(tx, _wanted(reach, others), limit), _count_running(tx, workers))
 

@@ -97,8 +97,8 @@ def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
 def holders_of(tx: Transaction, citing: Collection[str]) -> FoundHolders:
     """Return the holders of the versions that the jobs `citing` have read; they prevent the deletion of the versions.
 
-    Holders are those of the jobs that have not ended, and the items that the jobs have made, except purged items. The
-    retries and the tasks of the jobs are included.
+    Two kinds of objects are holders: jobs that have not ended, and items that the jobs have made, except purged items.
+    The retries and the tasks of the jobs are included.
     """
     held = FoundHolders()
     ordered = sorted(_with_retries(tx, citing))
