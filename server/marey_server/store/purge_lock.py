@@ -4,8 +4,8 @@ Such a write reads items and then stores something that refers to them: a revisi
 reading and storing, another request could delete and purge the items. So each of these writes first acquires a lock
 that excludes purges of its project. The write does so before it reads items and before it locks any row. Many such
 writes run side by side. A purge waits until the writes that hold the lock have ended, and later writes wait until the
-purge has ended. While a purge or such a write waits for this lock, it holds no row that the other side needs. So there
-are no deadlocks.
+purge has ended. While a purge or such a write waits for this lock, it has locked no row that the other side needs. So
+there are no deadlocks.
 
 A commit is prepared in one transaction and recorded in a later one. The preparation reads the time of the project's
 last purge. Recording fails if another purge has followed.

@@ -305,7 +305,9 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
         which = and_(which, token.c.user_id == principal.user_id)
     found = tx.execute(select(token.c.user_id, token.c.created_by, token.c.successor_of).where(which)).first()
     if found is None:
-        raise NotFoundProblem(f"There is no token {token_id!r} that you may revoke.", code="no-token")
+        raise NotFoundProblem(
+            f"There is no token {token_id!r} that you may revoke; `marey token ls` lists your tokens.", code="no-token"
+        )
     _lock_tokens(tx, found.user_id)
     if with_created:
         _revoke(tx, token.c.id.in_(_connected_with(which)))

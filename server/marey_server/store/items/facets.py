@@ -36,7 +36,8 @@ def stored_facets(tx: Transaction, job_row: Any, facets: Sequence[ItemFacets]) -
     for one in facets:
         if (one.item, one.revision) in stated:
             raise InvalidProblem(
-                f"The job states facets of {one.item} at revision {one.revision} twice.", code="no-facet-input"
+                f"The job states facets of {one.item} at revision {one.revision} twice; state them once.",
+                code="no-facet-input",
             )
         if (one.item, one.revision) not in given:
             raise InvalidProblem(

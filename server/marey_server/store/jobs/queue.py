@@ -82,7 +82,10 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     worker uses another version of the protocol.
     """
     if request.protocol != PROTOCOL_VERSION:
-        detail = f"The worker uses version {request.protocol} of the protocol, but the server uses {PROTOCOL_VERSION}."
+        detail = (
+            f"The worker uses version {request.protocol} of the protocol, but the server uses version "
+            f"{PROTOCOL_VERSION}. Install the same version of Marey for both."
+        )
         raise InvalidProblem(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
     scopes = require_worker(tx.principal, request)
     claim_id = request.claim_id if tx.principal.token_key else None

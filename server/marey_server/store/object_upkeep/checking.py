@@ -44,7 +44,8 @@ def _compare(row: Row[Any], pieces: Iterable[bytes]) -> list[StoreDefect]:
     digest, size = digest_of_chunks(pieces)
     if size != row.size_bytes:
         return [StoreDefect("blob-incomplete", row.digest, f"only {size} of {row.size_bytes} bytes are stored")]
-    return [] if digest == row.digest else [StoreDefect("blob-corrupt", row.digest, "the bytes have another digest")]
+    intact = digest == row.digest
+    return [] if intact else [StoreDefect("blob-corrupt", row.digest, "the bytes do not have this digest")]
 
 
 def check_objects(database: Database) -> Iterator[list[StoreDefect]]:

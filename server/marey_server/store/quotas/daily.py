@@ -46,7 +46,7 @@ def take_back_sent(tx: Transaction, size_bytes: int) -> None:
 def require_submittable(tx: Transaction, inputs: int) -> None:
     """Raise `QuotaExceededProblem` if jobs have more inputs than the caller may submit in a whole day.
 
-    Use `count_submitted` as well; this function spares the work for jobs that can never be submitted.
+    Call `count_submitted` as well. This early check avoids work for jobs that can never be submitted.
     """
     if _caller(tx) is not None:
         _require(tx, _INPUTS, inputs, 0)
