@@ -37,7 +37,7 @@ class NewStream:
     """Initial state of a coverage stream.
 
     `settings` are the fields of `CoverageStream` that never change. `rig` is the encoded skeleton of the stream's
-    poses, and `state` the encoded state.
+    poses with its joint mapping, or None without a skeleton. `state` is the encoded state.
     """
 
     settings: Tree

@@ -105,9 +105,9 @@ def _changed_since(tx: Transaction, project_id: str, since_us: int) -> dict[str,
 
 
 def require_all_clips(tx: Transaction, project: str, found: FoundIndex) -> None:
-    """Raise `ConflictProblem` if the index does not cover all clips of the project, except recently changed clips.
+    """Raise `ConflictProblem` if the project has more clips than the index contains.
 
-    An index that was built for some folders does not cover the clips in other folders.
+    This is so if the index was built for some folders only, or if clips were created since it was built.
     """
     project_row = projects.require(tx, project)
     existing = (item.c.project_id == project_row.id, item.c.kind == Kind.CLIP.value, item.c.deleted_us.is_(None))

@@ -302,7 +302,7 @@ class Database:
     def submit_signed_url(self, object_name: str, valid_s: int) -> Future[str]:
         """Sign a URL with which anybody can read an object for `valid_s` seconds; return the future of the URL.
 
-        May be called only if the setting `blobs` names an object storage.
+        May be called only if the settings name a bucket of an object storage.
         """
         assert isinstance(self.blobs, ObjectBlobs)
         return self.submit_move(partial(self.blobs.storage.signed_url, object_name, valid_s))

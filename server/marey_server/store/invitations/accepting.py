@@ -126,8 +126,8 @@ def needs_password_check(tx: Transaction, code: str, name: str) -> bool:
     """Return whether a request to sign up as `name` must check the password and call `sign_up_again`, not `sign_up`.
 
     The result is true if the user `name` has used the code. It is also true, for every name, if the code cannot create
-    an account any more. So the answer to a used code does not show who has used it. Raises `NotFoundProblem` if the
-    code is wrong.
+    an account, for example because it is used up. So the answer to a used code does not show who has used it. Raises
+    `NotFoundProblem` if the code is wrong.
     """
     row = _find(tx, code)
     user_id = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()

@@ -58,10 +58,10 @@ class Narrowing(NamedTuple):
 def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrowing:
     """Return the condition by which the fewest items have to be read for a query.
 
-    Each operand of the outermost `and` is a candidate if an index finds its items. If one of them has at most
-    `MOST_ITEMS` items, the one with the fewest items is returned as `few`. Otherwise, only operands that compare a
-    member of the summary with a single value are considered. Of these, the rarest is returned as `ordered`: the one
-    whose newest `MOST_ITEMS` items reach furthest back in time.
+    Each operand of the outermost `and` is a candidate if an index finds its items, or if it is a condition `like(...)`,
+    whose clips are known. If one of them has at most `MOST_ITEMS` items, the one with the fewest items is returned as
+    `few`. Otherwise, only operands that compare a member of the summary with a single value are considered. Of these,
+    the rarest is returned as `ordered`: the one whose newest `MOST_ITEMS` items reach furthest back in time.
     """
     fewest, few = MOST_ITEMS + 1, None
     oldest_us, ordered = None, None

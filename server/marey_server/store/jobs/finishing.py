@@ -55,7 +55,10 @@ def _deferred_jobs(tx: Transaction) -> list[str]:
 
 
 def _commit_one(database: Database, job_id: str) -> bool:
-    """Commit the outputs of one job, and end it; return whether this call has ended it. Errors are only logged."""
+    """Commit the outputs of one job, and end it; return whether it has ended now.
+
+    Errors are only logged, except `UnavailableProblem`, which is raised.
+    """
     try:
         for _ in range(MOST_PLANS):
             plan = database.read(SYSTEM, _plan, job_id)

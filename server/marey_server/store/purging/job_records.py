@@ -14,7 +14,7 @@ from marey_server.store.transaction import Transaction, in_lists
 
 
 def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) -> None:
-    """Remove what the records of `jobs` contain of `items`: names, imported files, staged facets and cached results.
+    """Remove what the records of `jobs` contain of `items`: names, files, staged facets and cached results.
 
     Call this before the documents of the items are deleted.
     """
