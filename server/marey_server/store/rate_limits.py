@@ -76,7 +76,7 @@ def count(tx: Transaction, limit: RateLimit) -> int:
     return 0 if tx.execute(counted.returning(until)).first() is not None else wait_s(tx, limit)
 
 
-def take_back(tx: Transaction, limit: RateLimit) -> None:
+def uncount(tx: Transaction, limit: RateLimit) -> None:
     """Undo the count of one event, so that it does not use up the limit."""
     values = {"until_us": sign_in_limit.c.until_us - limit.interval_us}
     tx.execute(update(sign_in_limit).where(sign_in_limit.c.key == limit.key).values(**values))

@@ -27,7 +27,7 @@ from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.database.clock import DAY_US
 from marey_server.store.ids import new_id
 from marey_server.store.quotas.counting import require_room
-from marey_server.store.quotas.daily import count_sent, take_back_sent
+from marey_server.store.quotas.daily import count_sent, uncount_sent
 from marey_server.store.tables import blob, job, upload, upload_chunk
 from marey_server.store.transaction import Transaction
 
@@ -145,7 +145,7 @@ def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> S
             tx.blobs.adopt(copy, digest)
         blobs.add_holder(tx, digest, _places(found))
         if not is_new:
-            take_back_sent(tx, found.length)
+            uncount_sent(tx, found.length)
     faults.point("upload.finish.before_commit")
     tx.after_commit(lambda: faults.point("upload.finish.after_commit"))
     return _shown(_find(tx, upload_id))
@@ -166,7 +166,7 @@ def abandon(tx: Transaction, upload_id: str) -> None:
     found = _find(tx, upload_id)
     dropped = update(upload).where(upload.c.id == found.id, upload.c.dropped.is_(False)).values(dropped=True)
     for row in tx.execute(dropped.returning(upload.c.length, upload.c.offset)).all():
-        take_back_sent(tx, row.length - row.offset)
+        uncount_sent(tx, row.length - row.offset)
 
 
 # -- garbage ----------------------------------------------------------------------------------------------------------

@@ -98,7 +98,7 @@ def redeem_link(tx: Transaction, code: str, attempt: SignInTry) -> IssuedSession
     if tx.execute(begun).rowcount != 1:
         raise _invalid_link()
     tx.principal = users.active_principal(tx, row.user_id)
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     (project,) = projects_of(row.scopes, "read")
     return IssuedSession(BrowserSession(project=project, expires_at=datetime_of(expires_us)), issued.text)
 

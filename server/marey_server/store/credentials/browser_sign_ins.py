@@ -164,7 +164,7 @@ def redeem(tx: Transaction, sign_in_id: str, request: BrowserSignInCode, attempt
         raise invalid_sign_in()
     owner = select(identity.c.user_id).where(identity.c.id == row.identity_id)
     tx.principal = users.active_principal(tx, tx.execute(owner).scalar_one())
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     return tokens.create_session(tx, row.lifetime_s)
 
 

@@ -69,16 +69,16 @@ def count(tx: Transaction, attempt: SignInTry) -> None:
 
 def forgive(tx: Transaction, attempt: SignInTry) -> None:
     """Remove a try with the right password from the counts, and remember the client's address as known."""
-    take_back(tx, attempt)
+    uncount(tx, attempt)
     row = {"key": _known_key(attempt), "until_us": tx.now_us + KNOWN_FOR_US}
     remembered = tx.insert_into(sign_in_limit, row)
     tx.execute(remembered.on_conflict_do_update(index_elements=["key"], set_={"until_us": row["until_us"]}))
 
 
-def take_back(tx: Transaction, attempt: SignInTry) -> None:
+def uncount(tx: Transaction, attempt: SignInTry) -> None:
     """Remove a try from the counts, because its password or code was right."""
     for limit, _scope in _limits(attempt, known=is_known(tx, attempt)):
-        rate_limits.take_back(tx, limit)
+        rate_limits.uncount(tx, limit)
 
 
 def _limits(attempt: SignInTry, *, known: bool) -> Iterator[tuple[RateLimit, LimitScope]]:

@@ -88,11 +88,11 @@ def accept_invitation(tx: Transaction, code: str, attempt: SignInTry) -> Accepte
     elif used_before or not row.open:
         raise invitation_invalid()
     elif present is not None and includes(present, role):
-        sign_ins.take_back(tx, attempt)
+        sign_ins.uncount(tx, attempt)
         return AcceptedInvitation(project=row.project, role=present, joined=False)
     else:
         _use(tx, row, user_id, user_name)
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     return AcceptedInvitation(project=row.project, role=role, joined=True)
 
 
@@ -173,7 +173,7 @@ def sign_up_again(
 
 
 def _signed_up(tx: Transaction, row: Row[Any], request: SignUp, attempt: SignInTry) -> SignedUp:
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     role = None if row.project_id is None else members.find_role(tx, row.project_id, str(tx.principal.user_id))
     made = tokens.create_session(tx, request.expires_in_s)
     return SignedUp(**made.model_dump(), project=None if role is None else row.project, role=role)

@@ -37,10 +37,10 @@ def count_sent(tx: Transaction, size_bytes: int) -> None:
     _count(tx, _BYTES, _caller(tx), size_bytes)
 
 
-def take_back_sent(tx: Transaction, size_bytes: int) -> None:
+def uncount_sent(tx: Transaction, size_bytes: int) -> None:
     """Undo the count of bytes that the caller has announced, but never sent."""
     if (limit := _part_of_day(tx, _BYTES, _caller(tx), size_bytes)) is not None:
-        rate_limits.take_back(tx, limit)
+        rate_limits.uncount(tx, limit)
 
 
 def require_submittable(tx: Transaction, inputs: int) -> None:

@@ -93,7 +93,7 @@ def _find_link(tx: Transaction, code: str) -> Row[Any]:
 def welcome(tx: Transaction, code: str, attempt: SignInTry) -> StudyWelcome:
     """Return what a person with a link sees before consenting. Raises `NotFoundProblem` if the link is not valid."""
     row = _find_link(tx, code)
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     design = load_design(tx, row.item_id, row.revision)
     return StudyWelcome(
         title=design.title, consent_text=design.consent_text, clips=len(design.motions), trials=design.trials,
@@ -116,7 +116,7 @@ def begin(tx: Transaction, request: ParticipationCreate, attempt: SignInTry) -> 
         tx.execute(update(study_participant).where(study_participant.c.id == row.id).values(**begun))
     elif issued.secret_hash != row.token_hash:
         raise link_invalid()
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     return NewParticipation(token=issued.text, participation=_shown(row, load_design(tx, row.item_id, row.revision)))
 
 
