@@ -67,7 +67,7 @@ def count(tx: Transaction, attempt: SignInTry) -> None:
             raise too_many_sign_ins(scope, wait_s)
 
 
-def forgive(tx: Transaction, attempt: SignInTry) -> None:
+def record_success(tx: Transaction, attempt: SignInTry) -> None:
     """Remove a try with the right password from the counts, and remember the client's address as known."""
     uncount(tx, attempt)
     row = {"key": _known_key(attempt), "until_us": tx.now_us + KNOWN_FOR_US}

@@ -168,7 +168,7 @@ def sign_up_again(
     tx.principal = users.authenticated(tx, request.name, verified_hash)
     if not _has_used(tx, row, tx.principal.user_id):
         raise invitation_invalid()
-    sign_ins.forgive(tx, login)
+    sign_ins.record_success(tx, login)
     return _signed_up(tx, row, request, attempt)
 
 
