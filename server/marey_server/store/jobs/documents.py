@@ -38,7 +38,7 @@ def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
     return [found[one] for one in ids]
 
 
-_UNSAID = {column.key: getattr(column.default, "arg", None) for column in job.c}
+_DEFAULTS = {column.key: getattr(column.default, "arg", None) for column in job.c}
 """Initial values of columns, for those columns that `new_row` omits."""
 
 
@@ -49,7 +49,7 @@ def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], 
     not have tasks. The result equals that of `job_documents`.
     """
     names = {"project_name": project_name, "author_name": tx.principal.user_name}
-    return _document(SimpleNamespace(**{**_UNSAID, **row, **names}), tuple(sorted(after)), {}, None)
+    return _document(SimpleNamespace(**{**_DEFAULTS, **row, **names}), tuple(sorted(after)), {}, None)
 
 
 def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
