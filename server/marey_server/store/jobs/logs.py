@@ -41,7 +41,7 @@ def append_log(
     if length >= policy.log_limit_bytes:
         return LogAnswer(offset=length, capped=True)
     if offset != length:
-        if _is_said(tx, job_id, fence, offset, data):
+        if _is_repeated(tx, job_id, fence, offset, data):
             return LogAnswer(offset=length)
         detail = f"The log has {length} bytes; the next piece must begin there, not at {offset}."
         raise LogOffset(detail, context={"offset": length})
@@ -55,7 +55,7 @@ def append_log(
     return LogAnswer(offset=length + len(data), capped=capped)
 
 
-def _is_said(tx: Transaction, job_id: str, fence: int, offset: int, data: bytes) -> bool:
+def _is_repeated(tx: Transaction, job_id: str, fence: int, offset: int, data: bytes) -> bool:
     statement = select(job_log.c.data).where(
         job_log.c.job_id == job_id, job_log.c.fence == fence, job_log.c.offset == offset
     )
