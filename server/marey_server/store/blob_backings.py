@@ -1,8 +1,8 @@
-"""Backings that store the bytes of blobs; the rows of the table `blob` say which blobs exist.
+"""Backings: places that store the bytes of blobs, such as the database or a folder of files.
 
-A backing is called inside the transaction that inserts or deletes the blob's row. This row is the lock: no other
-transaction can write or remove the same bytes before this transaction ends. Bytes that are being received are in a
-`Spool`. The package `object_storage` contains a further backing, for S3.
+The rows of the table `blob` say which blobs exist. A backing is called inside the transaction that inserts or deletes
+the row of a blob. This row is the lock: no other transaction can write or remove the same bytes before this transaction
+ends. Bytes that are being received are in a `Spool`. The package `object_storage` contains a further backing, for S3.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Spool:
 
 
 class BlobBacking(Protocol):
-    """Interface of a place that stores the bytes of blobs."""
+    """Interface of a backing, a place that stores the bytes of blobs."""
 
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
         """Store the bytes of blobs.

@@ -291,7 +291,7 @@ _MOST_READ = 100
 def _waiting_for_place(tx: Transaction, projects: Collection[str]) -> set[str]:
     """Return the kinds of the first queued jobs of those projects that have a limit on running jobs.
 
-    A job of such a project has ended or was queued again, so one of these jobs may start.
+    After another job of such a project has stopped running, one of these jobs may start.
     """
     limited = select(queue_share.c.project_id).where(queue_share.c.most_running.is_not(None))
     found: set[str] = set()

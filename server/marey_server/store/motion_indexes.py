@@ -180,8 +180,8 @@ class IndexFiles:
     def copy(self, tx: Transaction, stored: StoredFile) -> None:
         """Copy a file of an index that the caller may read; a copy appears only when it is complete.
 
-        Raises `NotFoundProblem` if bytes are missing, or if the file has another size than the index states: anybody
-        may write an index, and `missing` has made room for the stated size.
+        Raises `NotFoundProblem` if bytes are missing, or if the file does not have the size that the index states. An
+        index may state a wrong size, because anybody may write one, but there is only room for the stated size.
         """
         digest = stored.blob
         size = tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one()
