@@ -95,7 +95,8 @@ def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredU
         raise _elsewhere(found.offset)
     if offset + len(data) > found.length:
         raise TooLargeProblem(
-            f"The upload was created for {found.length} bytes, but would have {offset + len(data)} after this piece."
+            f"The upload was created for {found.length} bytes, but would have {offset + len(data)} after this piece; "
+            f"send at most {found.length - offset} bytes."
         )
     if not data:
         return _shown(found)

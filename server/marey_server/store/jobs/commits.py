@@ -332,7 +332,9 @@ def _commit(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]]) -> 
     except ApiProblem as error:
         raise _CommitRefused(row.commit_to, error) from None
     except DamagedChunk as error:
-        problem = DamagedProblem(f"The stored data of the dataset are damaged: {error}.")
+        problem = DamagedProblem(
+            f"The stored data of the dataset are damaged: {error}. Ask the operator to run `marey db fsck`."
+        )
         raise _CommitRefused(row.commit_to, problem) from error
 
 

@@ -126,7 +126,7 @@ def _plan(tx: Transaction, job_id: str) -> _JobPlan | None:
         return replace(plan, failure=commits.refused_commit(row.commit_to, error.error_code, error.detail))
     except DamagedChunk as error:
         log.exception("the outputs of %s cannot be committed", job_id)
-        detail = f"The stored data of the dataset are damaged: {error}."
+        detail = f"The stored data of the dataset are damaged: {error}. Ask the operator to run `marey db fsck`."
         return replace(plan, failure=commits.refused_commit(row.commit_to, DamagedProblem.code, detail))
 
 
