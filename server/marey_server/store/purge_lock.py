@@ -43,7 +43,7 @@ def hold_off_purges(tx: Transaction, *project_ids: str) -> None:
 
 
 def hold_off_purges_of_jobs(tx: Transaction, job_ids: Iterable[str]) -> None:
-    """Prevent purges of the projects of jobs that this write is going to end (`hold_off_purges`).
+    """Prevent purges, as `hold_off_purges` does, of the projects of jobs that this write is going to end.
 
     This is necessary because the end of a job can publish items, and use them as inputs of waiting jobs.
     """

@@ -17,7 +17,7 @@ OUTPUTS_TO_COMMIT = "outputs to commit"
 """Topic that is announced when the tasks of a job have ended and the server must commit their many outputs."""
 
 NUMBERED_EVENTS = "numbered events"
-"""Topic that is announced when new events can be read; on Postgres, when they have got their numbers."""
+"""Topic that is announced when new events can be read. On Postgres, this is when their numbers are assigned."""
 
 
 def events_topic(project_id: str) -> str:

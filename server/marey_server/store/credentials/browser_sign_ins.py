@@ -84,8 +84,8 @@ def open_in_browser(tx: Transaction, sign_in_id: str, cookie: str, state: str) -
 def use_state(tx: Transaction, state: str, cookie: str) -> tuple[str, int | None]:
     """Use up the state that the provider sent back with the browser; return the id and the port of the sign-in.
 
-    At this port of the person's machine, the program waits for the code; None if it does not. Raises `NotFoundProblem`
-    if the state is not valid in the browser with this cookie.
+    The port is the one at which the program on the person's machine waits for the code, or None if it does not wait.
+    Raises `NotFoundProblem` if the state is not valid in the browser with this cookie.
     """
     which = (
         browser_sign_in.c.state_hash == hash_secret(state),

@@ -102,9 +102,10 @@ def _versions(environment: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[LineageEdge, ...]:
-    """Return the revisions that the rows of `lineage` which meet `condition` name, at most `MAX_EDGES`.
+    """Return at most `MAX_EDGES` revisions that are named in the rows of `lineage` that meet `condition`.
 
-    A row names two revisions, an input and a result. `other` and `number` are the columns of the wanted one.
+    A row names two revisions: an input and a result. `other` and `number` are the two columns, item id and revision
+    number, of the revision that is returned. Revisions in projects that the caller may not see are left out.
     """
     statement = (
         select(other.label("item"), number.label("revision"), item.c.kind, item.c.name)

@@ -284,7 +284,7 @@ class _Publication:
 
     @staticmethod
     def _first_of_equals(new: Sequence[_Ready]) -> list[_Ready]:
-        """Return the first of all drafts with the same content; the others then use the item that it creates."""
+        """Return, of each group of drafts with equal content, the first; the others use the item that it creates."""
         firsts: dict[tuple[str | None, ...], _Ready] = {}
         for one in new:
             firsts.setdefault(one.required, one)

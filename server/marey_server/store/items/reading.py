@@ -24,9 +24,9 @@ from marey_server.store.transaction import Transaction
 
 
 def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests: Collection[str]) -> set[str]:
-    """Return those of `digests` that are the document of the part `part` in the newest revision of an item of the kind.
+    """Return the digests, among `digests`, of documents that items of the project contain as their part `part`.
 
-    Deleted items are not searched.
+    Only the newest revisions of items of the kind `kind` are searched, without deleted items.
     """
     row = projects.require(tx, project)
     statement = (

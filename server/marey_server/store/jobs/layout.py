@@ -181,7 +181,8 @@ def _spread(head: NewJob) -> list[NewJob]:
 def _shares(submission: Submission) -> list[PinnedInputs]:
     """Return the inputs of each task.
 
-    If the kind splits an input, each task gets a share of this input and all other inputs; else, all inputs.
+    If the job kind splits an input, each task gets a share of this input, and the whole of every other input.
+    Otherwise, each task gets all inputs.
     """
     fanned = submission.kind.fan_out
     if fanned is None:

@@ -203,7 +203,7 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
     """Cancel the tasks that have not started, of parent jobs of which a task has failed; return the cancelled tasks.
 
-    Does so only for parent jobs for which a worker would combine the results of the tasks.
+    Only parent jobs are concerned for which a worker would combine the results of the tasks.
     """
     if not parents:
         return []

@@ -368,7 +368,7 @@ def _leases(
 
 
 def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
-    """Return, for each parent job of the given tasks, its number of tasks, by the id of the parent job."""
+    """Return the numbers of tasks of the parent jobs of the given tasks, by the id of the parent job."""
     parents = {row.parent_id for row in rows if row.parent_id is not None}
     if not parents:
         return {}

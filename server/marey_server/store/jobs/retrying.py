@@ -185,7 +185,7 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
 def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
     """Return the inputs for the retry of a job that ended while some inputs were still outputs of unfinished jobs.
 
-    In these inputs, the retry of such a job takes its place; `stand_ins` maps the ids of jobs to the ids of retries.
+    In these inputs, each unfinished job is replaced by its retry; `stand_ins` maps the ids of jobs to those of retries.
     """
     return {
         name: [{"job": stand_ins[entry["job"]]} if "job" in entry else entry for entry in entries]

@@ -69,7 +69,7 @@ class LookAgain(BytesAwaited):
     """Signal that bytes are not where the transaction has looked for them; perhaps another process has moved them."""
 
     def move(self, carried: Carried) -> None:
-        """Record that the transaction is repeated for this reason, so that this happens only once; move nothing."""
+        """Record that the transaction is repeated because of `LookAgain`, which is done only once; move nothing."""
         carried.looked_again = True
 
 

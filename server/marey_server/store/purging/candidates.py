@@ -38,7 +38,7 @@ assert set(_ORDER) == set(Kind), "every kind needs a place in the order of a pur
 
 @dataclass(frozen=True)
 class PreparedPurge:
-    """Items that a request may purge, with the searches for what prevents their purge or contains copies of them."""
+    """Items that a request may purge, with a search for dataset versions and one for indexes that contain them."""
 
     ids: tuple[str, ...]
     search: VersionSearch

@@ -36,8 +36,7 @@ Plan = list[list[int]]
 
 @dataclass(frozen=True, slots=True)
 class PlannedDraw:
-    """What the random draw of trials for new participants depends on: the design, and all earlier participants' trials.
-    """
+    """Values from which trials for new participants are drawn: the design, and the trials of earlier participants."""
 
     revision: int
     design: StudyDocument
@@ -50,7 +49,7 @@ def pseudonym(number: int) -> str:
 
 
 def plan_links(tx: Transaction, project: str, kind: Kind, item_id: str, request: StudyLinksCreate) -> PlannedDraw:
-    """Return what the draw of trials for new links depends on; the draw itself runs outside of transactions.
+    """Return the values from which trials for new links are drawn; the draw itself runs outside of transactions.
 
     Raises `NotFoundProblem` if there is no such study, `QuotaExceededProblem` if the project has too many participants,
     and `ConflictProblem` if the consent for a motion has ended.

@@ -316,10 +316,9 @@ def _note(tx: Transaction, delivery: Delivery, result: DeliveryResult, outcome: 
 
 
 def count_missed(tx: Transaction, last: int) -> None:
-    """Count, for each webhook, the undelivered events up to the one numbered `last`, before they are deleted.
+    """Count, for each webhook, the undelivered events with numbers up to `last`, which are about to be deleted.
 
-    If there are any, the webhook has missed them: its position moves to `last`, and a later delivery reports the number
-    of missed events.
+    A webhook misses these events: its position moves to `last`, and a later delivery reports how many it has missed.
     """
     for row in tx.execute(select(webhook).where(webhook.c.position < last).with_for_update()).all():
         number = events.number_of(tx)
