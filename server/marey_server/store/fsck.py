@@ -191,7 +191,7 @@ def _check_item(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
             detail = f"the document {found.document_digest} of the part {found.part} of revision {row.head} is missing"
             findings.append(StoreDefect("document-lost", row.id, detail))
     lacking = [part for part, spec in PARTS[kind].items() if spec.required and part not in bodies]
-    findings += [StoreDefect("part-lost", row.id, f"revision {row.head} has no {part}") for part in lacking]
+    findings += [StoreDefect("part-lost", row.id, f"revision {row.head} has no part {part}") for part in lacking]
     if complete and not lacking:
         summary = summarise(kind, bodies)
         if (summary.shown, summary.frames, summary.skeleton_id) != (row.summary, row.frames, row.skeleton_id):

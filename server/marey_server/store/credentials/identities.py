@@ -79,7 +79,8 @@ def insert_identity(tx: Transaction, user_id: str, name: str, person: Person) ->
     """
     present = tx.execute(select(func.count()).where(identity.c.user_id == user_id)).scalar_one()
     if present >= MOST_OF_USER:
-        raise QuotaExceededProblem(f"A user can have at most {MOST_OF_USER} identities.", code="quota-exceeded")
+        detail = f"A user can have at most {MOST_OF_USER} identities; remove one first (`marey user unlink`)."
+        raise QuotaExceededProblem(detail, code="quota-exceeded")
     row = {
         "id": new_id("identity"), "user_id": user_id, "issuer": person.issuer, "subject": person.subject,
         "created_us": tx.now_us,

@@ -203,7 +203,8 @@ class PublishedOutputs:
         try:
             return published_result(result, {one["name"]: JobOutput.model_validate(one) for one in self.outputs})
         except ValidationError as error:
-            raise InvalidProblem("An entry for a file in the result of the job is not valid.") from error
+            detail = "The result of the job is not valid: each of its `entries` must have the fields of an `ImportEntry`."
+            raise InvalidProblem(detail) from error
 
 
 JOB_COLUMNS = (

@@ -201,9 +201,10 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel the tasks that have not started, of parent jobs of which a task has failed; return the cancelled tasks.
+    """Cancel those tasks of the given parent jobs that have not started, and return the cancelled tasks.
 
-    Only parent jobs are concerned for which a worker would combine the results of the tasks.
+    Called when a task of each of these jobs did not succeed. Only jobs whose results a worker combines are concerned:
+    the worker needs the results of all tasks.
     """
     if not parents:
         return []

@@ -138,7 +138,9 @@ class ObjectsToRead(BytesAwaited):
         data = self._storage.read(one.name, wanted.start, wanted.stop)
         if data is not None and wanted.is_whole and digest_of_chunks([data])[0] != wanted.digest:
             raise DamagedProblem(
-                f"The bytes of the blob {wanted.digest} were changed in the object storage.", code="blob-damaged"
+                f"The bytes of the blob {wanted.digest} were changed in the object storage. "
+                "Ask the operator to run `marey db fsck`.",
+                code="blob-damaged",
             )
         return data
 

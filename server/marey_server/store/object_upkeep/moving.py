@@ -148,7 +148,7 @@ def _to_file(database: Database, target: DirectoryBlobs, row: Row[Any]) -> bool:
 
 
 def _hashed(chunks: Iterator[bytes], found: list[tuple[str, int]]) -> Iterator[bytes]:
-    """Yield the chunks unchanged; after the last one, append the digest and the size in bytes of all to `found`."""
+    """Yield the chunks unchanged; after the last, append the digest and the size in bytes of all bytes to `found`."""
     hashed, size_bytes = hashlib.sha256(), 0
     for chunk in chunks:
         hashed.update(chunk)
