@@ -203,7 +203,7 @@ class PublishedOutputs:
         try:
             return published_result(result, {one["name"]: JobOutput.model_validate(one) for one in self.outputs})
         except ValidationError as error:
-            detail = "The result of the job is not valid: each of its `entries` must have the fields of an `ImportEntry`."
+            detail = "The result of the job is not valid: each of its `entries` must be a valid `ImportEntry`."
             raise InvalidProblem(detail) from error
 
 

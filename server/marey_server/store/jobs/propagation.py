@@ -203,8 +203,8 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
     """Cancel those tasks of the given parent jobs that have not started, and return the cancelled tasks.
 
-    Called when a task of each of these jobs did not succeed. Only jobs whose results a worker combines are concerned:
-    the worker needs the results of all tasks.
+    Called when a task of each of these jobs has failed. Tasks are cancelled only if a worker would have combined the
+    results of all tasks, so that the results of the remaining tasks are not needed any more.
     """
     if not parents:
         return []
