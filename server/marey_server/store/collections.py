@@ -143,7 +143,10 @@ def _children(directly_in: str | None, name: str | None) -> list[ColumnElement[b
 
 
 def find_collection(tx: Transaction, project_row: ProjectRow, collection_id: str, *, lock: bool = False) -> Row[Any]:
-    """Return the row of a folder that is not deleted; with `lock`, lock the row. Raises `NotFoundProblem`."""
+    """Return the row of a folder that is not deleted; with `lock`, lock the row.
+
+    Raises `NotFoundProblem` if there is no such folder.
+    """
     return _find(tx, project_row, collection_id, _ALIVE, lock=lock)
 
 

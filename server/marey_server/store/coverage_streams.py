@@ -112,12 +112,12 @@ def list_streams(
 
 
 def read_stream(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """Return a stream to a caller who may read it. Raises `NotFoundProblem`."""
+    """Return a stream to a caller who may read it. Raises `NotFoundProblem` if it does not exist."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
 def read_to_advance(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """Return a stream to a caller who may send frames to it. Raises `NotFoundProblem`."""
+    """Return a stream to a caller who may send frames to it. Raises `NotFoundProblem` if it does not exist."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
@@ -158,7 +158,7 @@ def _elsewhere(stream: Stream) -> CoverageOffset:
 
 
 def delete_stream(tx: Transaction, project: str, stream_id: str) -> None:
-    """Delete a stream. Raises `NotFoundProblem`."""
+    """Delete a stream. Raises `NotFoundProblem` if it does not exist."""
     project_row = projects.require(tx, project)
     found = _find(tx, project_row.id, stream_id)
     tx.execute(delete(coverage_stream).where(coverage_stream.c.id == found.id))

@@ -23,7 +23,7 @@ class Lead:
 
 
 def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | None:
-    """Become or stay the leader for the task `name` during `ttl_us`.
+    """Become or stay the leader for the task `name`, for `ttl_us` microseconds.
 
     Returns the fence (a number that each new leader increases), or None if another process is the leader.
     """

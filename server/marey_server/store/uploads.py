@@ -81,7 +81,7 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
 
 
 def read_upload(tx: Transaction, upload_id: str) -> StoredUpload:
-    """Return the state of an upload of the caller. Raises `NotFoundProblem`."""
+    """Return the state of an upload of the caller. Raises `NotFoundProblem` if it does not exist."""
     return _shown(_find(tx, upload_id))
 
 

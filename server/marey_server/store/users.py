@@ -73,7 +73,10 @@ def _insert(
 
 
 def find_user(tx: Transaction, name: str) -> User:
-    """Return a user. Only administrators may read other users. Raises `NotFoundProblem`."""
+    """Return a user. Raises `NotFoundProblem` if the caller may not read the user, or if there is no such user.
+
+    Users may read themselves, and administrators all users.
+    """
     if tx.principal.kind != "user" or tx.principal.user_name != name:
         require_administrator(tx.principal, hidden=_no_user(name))
     row = tx.execute(select(user).where(user.c.name == name)).first()

@@ -52,7 +52,7 @@ class SignInTry:
 
 
 def is_known(tx: Transaction, attempt: SignInTry) -> bool:
-    """Return whether somebody has signed in to the account from this address in the last `KNOWN_FOR_US`."""
+    """Return whether somebody signed in to the account from this address in the last `KNOWN_FOR_US` microseconds."""
     statement = select(sign_in_limit.c.until_us).where(sign_in_limit.c.key == _known_key(attempt))
     return int(tx.execute(statement).scalar() or 0) > tx.now_us
 

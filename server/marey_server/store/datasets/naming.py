@@ -46,7 +46,10 @@ _ALIVE = dataset.c.deleted_us.is_(None)
 
 
 def find_dataset(tx: Transaction, project_row: ProjectRow, name: str) -> Row[Any]:
-    """Return the row of a dataset, with the path of its folder as `path`. Raises `NotFoundProblem`."""
+    """Return the row of a dataset, with the path of its folder as `path`.
+
+    Raises `NotFoundProblem` if there is no such dataset.
+    """
     row = tx.execute(_shown_rows(project_row).where(dataset.c.name == name)).first()
     if row is None:
         raise NotFoundProblem(f"There is no dataset {name!r} in this project.", code="no-dataset")

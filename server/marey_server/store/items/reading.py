@@ -44,7 +44,7 @@ def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests:
 
 
 def read_item(tx: Transaction, project: str, kind: Kind, item_id: str) -> Item:
-    """Return an item at its newest revision. Raises `NotFoundProblem`."""
+    """Return an item at its newest revision. Raises `NotFoundProblem` if it does not exist."""
     project_row = projects.require(tx, project)
     if reach.unreachable_items(tx, [item_id]):
         raise no_item(kind, item_id)

@@ -56,7 +56,7 @@ class JobFilters:
 
 
 def read_job(tx: Transaction, job_id: str) -> Job:
-    """Return a job with its state and progress. Raises `NotFoundProblem`."""
+    """Return a job with its state and progress. Raises `NotFoundProblem` if it does not exist."""
     row, _ = find_job(tx, job_id)
     return as_documents(tx, [row])[0]
 

@@ -40,7 +40,7 @@ def list_schedules(tx: Transaction, project: str, *, cursor: str | None, limit: 
 
 
 def read_schedule(tx: Transaction, project: str, name: str) -> Schedule:
-    """Return a schedule. Raises `NotFoundProblem`."""
+    """Return a schedule. Raises `NotFoundProblem` if it does not exist."""
     return _shown(project, _find(tx, projects.require(tx, project), name))
 
 

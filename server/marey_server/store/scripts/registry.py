@@ -30,7 +30,7 @@ def list_scripts(tx: Transaction, project: str, *, cursor: str | None, limit: in
 
 
 def read_script(tx: Transaction, project: str, name: str) -> Script:
-    """Return a script. Raises `NotFoundProblem`."""
+    """Return a script. Raises `NotFoundProblem` if it does not exist."""
     return _shown(project, find_script(tx, projects.require(tx, project), name))
 
 
@@ -127,7 +127,7 @@ def record_runs(tx: Transaction, project_id: str, jobs: Iterable[tuple[str, str,
 
 
 def find_script(tx: Transaction, row: ProjectRow, name: str) -> Row[Any]:
-    """Return the row of a script. Raises `NotFoundProblem`."""
+    """Return the row of a script. Raises `NotFoundProblem` if it does not exist."""
     found = tx.execute(_rows(row).where(script.c.name == name)).first()
     if found is None:
         raise NotFoundProblem(f"The project has no script {name!r}.", code="no-script")

@@ -48,7 +48,7 @@ def read_webhook(tx: Transaction, project: str, webhook_id: str) -> Webhook:
 
 
 def find_webhook(tx: Transaction, project_row: ProjectRow, webhook_id: str) -> Row[Any]:
-    """Return the row of a webhook of a project, without its secrets. Raises `NotFoundProblem`."""
+    """Return the row of a webhook of a project, without its secrets. Raises `NotFoundProblem` if it does not exist."""
     row = tx.execute(_rows(project_row).where(webhook.c.id == webhook_id)).first()
     if row is None:
         raise no_webhook(webhook_id)
