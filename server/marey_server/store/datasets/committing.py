@@ -282,9 +282,9 @@ def _from_folder(
 ) -> tuple[str, Contents, FolderCommit]:
     """Store the tree of a new version, made from the items in the dataset's folder.
 
-    If the branch has a newest commit `head`, the tree of `head` is changed, but only in the entries that differ
-    between the folder and what was checked out in it. Returns the digest of the root of the tree, the content digests
-    of the items, and the state of the folder. Raises `ConflictProblem` if another version is checked out in the folder.
+    If the branch has a newest commit `head`, the new tree is the tree of `head` with the changes of the folder since
+    the checkout. Returns the digest of the root of the new tree, the content digests of the items, and the state of the
+    folder. Raises `ConflictProblem` if another version is checked out in the folder.
     """
     manifest = read_manifest(tx, found)
     _require_checked_out(found, manifest, head)

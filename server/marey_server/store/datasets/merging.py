@@ -124,7 +124,7 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
 def _repeated(tx: Transaction, project: str, found: Row[Any], request: CombineRequest) -> PreparedMerge | None:
     """Return the merge that an earlier request with the same `write_id` has recorded; None if there is none.
 
-    The branch and the version of the request may be gone meanwhile, so neither is looked up.
+    The branch and the version of the request may have been deleted since, so neither is looked up.
     """
     recorded = recorded_as(tx, found.id, request.write_id)
     if recorded is None:

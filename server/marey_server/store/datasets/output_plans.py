@@ -219,8 +219,8 @@ def _is_in_folder(
 ) -> bool:
     """Return whether the dataset's folder already has all changes of a new commit, which then counts as checked out.
 
-    This is so if the parent `head` of the new commit is checked out in the folder, and if each entry in `changes` is
-    the newest revision of an item at the entry's path in the folder. A removed entry makes the result false.
+    For this, two conditions must be met. The parent `head` of the new commit is checked out in the folder. Each entry
+    in `changes` is the newest revision of an item at its path in the folder. A removed entry makes the result false.
     """
     followed = (dataset.c.id == wanted.dataset_id, dataset.c.folder_commit.is_not_distinct_from(head))
     folder = tx.execute(FOLDER.where(*followed)).scalar()

@@ -25,9 +25,10 @@ Tree = dict[str, Any]
 def without_skeleton_changes(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
     """Prevent drafts with `same_skeleton` from changing the skeletons of existing items; return the changed drafts.
 
-    If the skeleton of a draft is the same rig (`is_same_rig`) as the skeleton of the existing item, the draft refers to
-    the skeleton of the item instead, unless that is deleted. If it is another rig, the draft is left out, together with
-    the annotations of its clip, and with its skeleton if no other draft uses this skeleton.
+    If the skeletons of a draft and of the existing item are the same rig (`is_same_rig`), the draft refers to the
+    skeleton of the item instead. It does not if the skeleton of the item is deleted. If the rigs are different, the
+    draft is left out, together with the annotations of its clip. The skeleton of the draft is left out, too, if no
+    other draft uses it.
     """
     before = _skeletons_before(tx, project, [one for one in loaded if one.draft.same_skeleton])
     if not before:
@@ -83,8 +84,8 @@ def _on_own_skeletons(
 ) -> list[LoadedDraft]:
     """Let the drafts that `own` names refer to the skeletons of their existing items, which `own` contains.
 
-    If then no draft uses a new skeleton any more, the draft of the new skeleton gets the rig of the existing skeleton,
-    so that no skeleton is created from it. Returns all drafts in the same order.
+    After this, a new skeleton may have no draft left that uses it. The draft of this skeleton then gets the rig of the
+    existing skeleton, so that no skeleton is created from it. Returns all drafts in the same order.
     """
     others = {name for one in loaded if one.draft.name_in_batch not in own for name in one.refers}
     replaced: dict[str, RigDocument] = {}

@@ -54,8 +54,8 @@ from marey_versions.tree.chunks import DamagedChunk
 Target = dict[str, Any]
 """Commit that a job is to make, in the form in which the job stores it.
 
-It has the fields of `OutputsCommit`, and `dataset_id`, `base` (the newest commit of the branch when the job's input
-revisions were fixed), `within` (the path of the dataset's folder), and `kinds` (the kinds of the outputs).
+It has the fields of `OutputsCommit` and four others: `dataset_id`; `base`, the newest commit of the branch when the
+job's input revisions were fixed; `within`, the path of the dataset's folder; and `kinds`, the kinds of the outputs.
 """
 
 
@@ -178,8 +178,8 @@ def _joined(*names: str) -> str:
 class PublishedOutputs:
     """Published outputs of a job, and the values of the columns of the job that record its commit.
 
-    If `failure` is set, nothing was published, because the author of the job may not write to a folder of the outputs
-    any more, or because the commit is not allowed.
+    If `failure` is set, nothing was published. Either the author of the job may not write to a folder of the outputs
+    any more, or the commit is not allowed.
     """
 
     outputs: list[dict[str, Any]] = field(default_factory=list)

@@ -1,10 +1,10 @@
 """Rows for checked submissions: one job, or a parent job with its tasks; and the cache keys of jobs.
 
 Jobs with the same cache key are identical: kind, version of the kind, parameters, seed and inputs are equal. Inputs are
-equal if the item, its name, its path, and the content of the documents that the kind reads are equal, because results
-are named after inputs and refer to them. A kind can require that further values are equal: the collection of the
-results, or the newest revision of an item that the parameters name. Jobs whose result depends on data that is read
-while they run have no cache key.
+equal if four things are equal: the item, its name, its path, and the content of the documents that the kind reads. The
+item, its name and its path count, because results refer to inputs and are named after them. A kind can require that
+further values are equal: the collection of the results, or the newest revision of an item that the parameters name.
+Jobs whose result depends on data that is read while they run have no cache key.
 """
 
 from __future__ import annotations

@@ -181,8 +181,8 @@ MOST_PARTS = 100
 def _parts(project_id: str, filters: JobFilters, order: listing.Order) -> list[Select[*tuple[Any, ...]]]:
     """Return queries for the ids of the jobs in a list; together, they select all jobs of the list.
 
-    If possible, there is one query for each pair of a state and a kind, because an index contains the jobs of such a
-    pair in the order of the list. Otherwise, a list of few jobs, such as waiting jobs, would read all jobs of the
+    If possible, there is one query for each pair of a state and a kind: an index contains the jobs of each pair in the
+    order of the list. Without these queries, a list of few jobs, such as waiting jobs, would read all jobs of the
     project. There is no index of succeeded jobs by state, because most jobs have succeeded.
     """
     pairs = [(state, kind) for state in filters.states or (None,) for kind in filters.kinds or (None,)]

@@ -77,10 +77,10 @@ class _Remembered(NamedTuple):
 class WorkerMemory:
     """Last claim of each worker that claimed jobs from this process. It is thread-safe.
 
-    A worker chooses its name, so one user could send claims with any number of names. So the number of workers of each
-    user that are alive is limited, and if there are too many claims, workers of the user with the most workers are
-    forgotten first. A worker that has sent no claim for `ALIVE_S` does not count, so workers may be replaced by workers
-    with new names.
+    A worker chooses its name, so one user could send claims with any number of names. So the number of live workers of
+    each user is limited. If there are too many claims, workers of the user with the most workers are forgotten first. A
+    worker that has sent no claim for `ALIVE_S` seconds does not count, so workers may be replaced by workers with new
+    names.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ def read_script(tx: Transaction, project: str, name: str) -> Script:
 def register_script(tx: Transaction, project: str, request: ScriptCreate, allowed: Sequence[str]) -> Script:
     """Register a script. `allowed` are the repositories that the server allows.
 
-    Raises `ForbiddenProblem` if no scripts are allowed, `InvalidProblem` if repository or image is not allowed,
+    Raises `ForbiddenProblem` if no scripts are allowed, `InvalidProblem` if the repository or the image is not allowed,
     `ConflictProblem` if the name is taken, and `QuotaExceededProblem` if the project has too many scripts.
     """
     row = projects.require(tx, project)
