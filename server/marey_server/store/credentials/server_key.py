@@ -22,7 +22,7 @@ def read_server_key(tx: Transaction) -> bytes:
 
 
 def read_seal_key(tx: Transaction) -> bytes:
-    """Return the key with which servers sign the tokens of attempts, so that they recognize such a token as issued."""
+    """Return the key with which servers sign the tokens of attempts, and recognize the tokens that they signed."""
     return hmac.digest(read_server_key(tx), b"tokens of attempts", "sha256")
 
 

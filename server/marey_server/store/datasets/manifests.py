@@ -1,8 +1,9 @@
 """Manifests of folders: which version a folder has, and which part of the version was checked out there.
 
-If a whole version is checked out, `dataset.folder_commit` is the digest of its commit. If a part was checked out, it is
-the digest of a chunk that contains a manifest. The entries that the folder has then have a tree of their own, so that
-entries that are not in the folder are never taken for removed ones.
+If a whole version is checked out, `dataset.folder_commit` is the digest of its commit. If only a part was checked out,
+`dataset.folder_commit` is the digest of a chunk that contains a manifest. The manifest names a tree of the entries that
+were checked out. A commit compares the folder with this tree, so the other entries of the version do not count as
+removed.
 """
 
 from __future__ import annotations

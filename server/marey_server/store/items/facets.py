@@ -109,8 +109,8 @@ def with_revisions(facets: StoredFacets, revisions: Mapping[tuple[str, int], int
 def publish_facets(tx: Transaction, project_id: str, facets: StoredFacets) -> None:
     """Record the facets that a job states.
 
-    If another job has published the same facet of the same revision, its value is replaced. Items that were purged
-    meanwhile are left out.
+    If another job has published a facet of this name for the same revision, its value is replaced. Items that were
+    purged since the job stated their facets are left out.
     """
     hold_off_purges(tx, project_id)
     stated: dict[str, list[tuple[int, dict[str, float]]]] = {}

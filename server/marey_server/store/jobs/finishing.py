@@ -2,8 +2,8 @@
 
 A read transaction plans the commit. Several short writes store the chunks of its tree. A last write ends the job and
 moves the branch. If others have committed since the plan was computed, the last write adds their changes to the plan.
-If their changes concern the same entries, the commit is planned again. The same happens if items of the project were
-purged meanwhile. If the server stops in between, nothing but chunks has been stored, and the next server begins again.
+If their changes concern the same entries, or if items of the project were purged since, the commit is planned again. If
+the server stops before the last write, nothing but chunks has been stored, and the next server begins again.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class ObjectBlobs:
     def new_copy(self) -> Path | None:
         """Return a new file for the copy of an upload; None if `local` needs no copy, or if new blobs become objects.
 
-        In the latter case, uploads stay in the database until they are moved.
+        If new blobs become objects, uploads stay in the database until they are moved.
         """
         return None if self.stores_objects else self.local.new_copy()
 
