@@ -154,7 +154,7 @@ class IndexFiles:
         return self._folder / digest.removeprefix("sha256:")
 
     def missing(self, document: MotionIndexDocument) -> list[StoredFile]:
-        """Return the files of an index that have no copy yet, and make room for them by removing old copies.
+        """Return the files of an index that have no copy yet, and free space for them by removing old copies.
 
         Raises `TooLargeProblem` if the index is too large to be searched.
         """

@@ -179,7 +179,7 @@ def _requested(tx: Transaction, webhook_id: str) -> list[Delivery]:
 
 
 def _missed(row: Row[Any], now_us: int) -> Delivery:
-    """Return the delivery that tells a webhook how many events were deleted before they could be delivered."""
+    """Return the delivery that reports to a webhook how many events were deleted before they could be delivered."""
     delivery_id = f"{row.id}-missed-{row.position}"
     message = WebhookMessage(
         id=delivery_id, kind=MISSED_KIND, seq=row.position, project=row.project, at=datetime_of(now_us),
