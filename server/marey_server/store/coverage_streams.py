@@ -27,7 +27,7 @@ Tree = dict[str, Any]
 
 
 class CoverageOffset(ConflictProblem):
-    """Error for frames that were sent for another offset than the current offset of the stream."""
+    """Frames were sent for an offset that is not the current offset of the stream."""
 
     code = "coverage-offset"
 

@@ -100,8 +100,9 @@ def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> li
 
 
 def _bad_cursor() -> BadRequestProblem:
-    detail = "The cursor does not come from this server; start again without a cursor."
-    return BadRequestProblem(detail, code="bad-cursor")
+    return BadRequestProblem(
+        "The cursor does not come from this server; start again without a cursor.", code="bad-cursor"
+    )
 
 
 def _fingerprint(identity: Any) -> str:

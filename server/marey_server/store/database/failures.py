@@ -46,11 +46,11 @@ def translated(error: Exception) -> Exception:
     if isinstance(error, exc.TimeoutError):
         return no_answer("All connections to the database are in use; nothing was written. Try again.")
     if isinstance(error, OverflowError | UnicodeEncodeError | exc.DataError):
-        detail = (
+        return InvalidProblem(
             "The request contains a number or text that the database cannot store, such as an integer of more than 64 "
-            "bits or a text with the character NUL."
+            "bits or a text with the character NUL.",
+            code="bad-value",
         )
-        return InvalidProblem(detail, code="bad-value")
     if not isinstance(error, exc.DBAPIError):
         return error
     message = str(error.orig)

@@ -73,8 +73,10 @@ def publish(
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):
         twice = Counter(draft.name_in_batch for draft in drafts).most_common(1)[0][0]
-        detail = f"Two results in the request have the name {twice!r}; give each result another name."
-        raise InvalidProblem(detail, code="duplicate-output")
+        raise InvalidProblem(
+            f"Two results in the request have the name {twice!r}; give each result another name.",
+            code="duplicate-output",
+        )
     hold_off_purges(tx, project_row.id)
     require_places((draft for draft in drafts if draft.reuse != "by_content"), rights)
     publication = _Publication(tx, project_row, author_id, rights, job_id, refer_to_deleted)

@@ -20,7 +20,7 @@ MOST_READ_BYTES = 2**20
 
 
 class LogOffset(ConflictProblem):
-    """Error for data that were sent for an offset that is not the end of the log."""
+    """The data was sent for an offset that is not the end of the log."""
 
     code = "log-offset"
 

@@ -92,8 +92,10 @@ def _stage_outputs(
     names = [one.output.name for one in outputs]
     if len(set(names)) != len(names):
         twice = Counter(names).most_common(1)[0][0]
-        detail = f"Two results in the request have the name {twice!r}; give each result another name."
-        raise InvalidProblem(detail, code="duplicate-output")
+        raise InvalidProblem(
+            f"Two results in the request have the name {twice!r}; give each result another name.",
+            code="duplicate-output",
+        )
     of_attempt = (staged_output.c.job_id == job_id) & (staged_output.c.fence == fence)
     last = tx.execute(select(func.max(staged_output.c.position)).where(of_attempt)).scalar()
     replaced = tx.execute(

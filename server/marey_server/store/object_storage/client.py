@@ -107,7 +107,7 @@ class StoredObject:
 
 
 class ObjectStorageProblem(UnavailableProblem):
-    """Error of an object storage that does not answer, or that refuses a request."""
+    """The object storage does not answer, or refuses a request."""
 
     code = "object-storage-unavailable"
 
