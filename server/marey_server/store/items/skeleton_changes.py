@@ -119,7 +119,7 @@ def _on_skeleton(tx: Transaction, one: LoadedDraft, reference: Tree) -> LoadedDr
 
 
 def _skeletons_before(tx: Transaction, project: ProjectRow, drafts: Sequence[LoadedDraft]) -> dict[str, str]:
-    """Return the ids of the skeletons that existing items use, by the names of the drafts that would revise the items."""
+    """Return the ids of the skeletons that existing items use, by the names of the drafts that revise the items."""
     found = {}
     for some in in_lists(drafts):
         places = {(one.draft.kind.value, one.draft.collection, one.draft.item_name): one for one in some}
