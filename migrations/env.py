@@ -10,7 +10,7 @@ from marey_server.store.tables import metadata
 
 
 def migrate(connection: Connection) -> None:
-    """Migrate the database at `connection` to the requested revision."""
+    """Migrate the database of `connection` to the revision that the command requests."""
     context.configure(connection=connection, target_metadata=metadata, render_as_batch=True, transactional_ddl=True)
     with context.begin_transaction():
         context.run_migrations()

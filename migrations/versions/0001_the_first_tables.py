@@ -1,4 +1,4 @@
-"""The first tables."""
+"""First tables of the database: users, projects, items, documents, blobs, jobs and events."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -18,7 +18,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Create the tables."""
+    """Create the first tables of the database, with their indexes."""
     op.create_table(
         "blob",
         sa.Column("digest", DIGEST, nullable=False),
@@ -473,7 +473,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the tables."""
+    """Drop all tables that `upgrade` has created, with their data."""
     op.drop_table("revision_part")
     op.drop_table("lineage")
     op.drop_table("staged_output")

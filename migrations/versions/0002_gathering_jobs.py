@@ -15,5 +15,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the column."""
+    """Drop the column `gathers` of `job`."""
     op.drop_column("job", "gathers")

@@ -14,7 +14,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Create the table."""
+    """Create the table `coverage_stream`."""
     op.create_table(
         "coverage_stream",
         sa.Column("id", ID, nullable=False),
@@ -38,5 +38,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the table."""
+    """Drop the table `coverage_stream`."""
     op.drop_table("coverage_stream")

@@ -17,6 +17,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the index and the column."""
+    """Drop the index of retries and the column `unbound` of `job`."""
     op.drop_index("ix_job_retry", "job")
     op.drop_column("job", "unbound")

@@ -26,7 +26,10 @@ SELECT 'last_event_number', to_jsonb(greatest(coalesce(max(number), 0), coalesce
 
 
 def upgrade() -> None:
-    """Replace `xid` by `number`. On Postgres, number all events; on SQLite, `seq` serves as the number."""
+    """Replace the column `xid` of `event` by `number`.
+
+    On Postgres, all events are numbered. On SQLite, `number` stays null, because `seq` serves as the number.
+    """
     op.add_column("event", sa.Column("number", sa.BigInteger(), nullable=True))
     if op.get_bind().dialect.name == "postgresql":
         op.execute(NUMBER_EVENTS)
@@ -38,7 +41,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Restore `xid` with the same value for all events, so that `seq` orders them."""
+    """Restore the column `xid` of `event`; it is 0 for all events, so that `seq` alone orders them."""
     op.drop_index("uq_event_number", "event")
     op.drop_index("ix_event_feed", "event")
     op.drop_column("event", "number")

@@ -10,7 +10,10 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Create the table and the columns, and mark the tokens that sign-ins created."""
+    """Create the table `sign_in_limit`, and the columns `session` and `created_by` of `token`.
+
+    Tokens with the name `sign-in` are marked as created by sign-ins.
+    """
     op.create_table(
         "sign_in_limit",
         sa.Column("key", sa.String(64), nullable=False),
@@ -25,7 +28,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the columns and the table."""
+    """Drop the columns `session` and `created_by` of `token`, and the table `sign_in_limit`."""
     op.drop_column("token", "created_by")
     op.drop_column("token", "session")
     op.drop_index("ix_sign_in_limit_until_us", "sign_in_limit")

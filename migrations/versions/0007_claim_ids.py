@@ -10,7 +10,10 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Add the columns. Mark earlier attempts as counted, because each was counted when it was claimed."""
+    """Add `unstarted` and `counted_fence` to `job`, and `claim_id` to `attempt`.
+
+    Earlier attempts are marked as counted, because each was counted when it was claimed.
+    """
     op.add_column("job", sa.Column("unstarted", sa.Integer(), nullable=False, server_default=sa.text("0")))
     op.add_column("job", sa.Column("counted_fence", sa.Integer(), nullable=False, server_default=sa.text("0")))
     op.execute("UPDATE job SET counted_fence = fence WHERE fence > 0")
@@ -22,7 +25,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the index and the columns."""
+    """Drop the index of claims and the three columns that `upgrade` has added."""
     op.drop_index("ix_attempt_claim", "attempt")
     op.drop_column("attempt", "claim_id")
     op.drop_column("job", "counted_fence")

@@ -10,7 +10,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Add the upload of each blob; for each upload, add its actual digest and whether it was dropped."""
+    """Add `upload_id` to `blob`, and `actual_digest` and `dropped` to `upload`."""
     op.add_column("blob", sa.Column("upload_id", sa.String(40)))
     of_upload = sa.text("upload_id IS NOT NULL")
     op.create_index("ix_blob_upload", "blob", ["upload_id"], sqlite_where=of_upload, postgresql_where=of_upload)
@@ -19,7 +19,10 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Copy the pieces of each upload into 1 MiB chunks of its blob, and drop the columns."""
+    """Copy the pieces of uploads that are blobs into chunks of 1 MiB of these blobs.
+
+    The columns that `upgrade` has added are dropped, and so are the uploads that were marked as dropped.
+    """
     connection = op.get_bind()
     rows = connection.execute(sa.text("SELECT digest, upload_id FROM blob WHERE upload_id IS NOT NULL")).all()
     for digest, upload_id in rows:

@@ -63,7 +63,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Let each user possess the same blobs in every project again, and drop the table and the columns."""
+    """Let each user possess the same blobs in every project again, and drop the records of attempts."""
     for column in ("project_ids", "fence", "job_id"):
         op.drop_column("upload", column)
     op.execute(FOR_EVERY_PROJECT)

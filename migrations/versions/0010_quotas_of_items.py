@@ -52,7 +52,7 @@ HELD = """
 
 
 def upgrade() -> None:
-    """Add the counters, and count the items and bytes that exist."""
+    """Create the table `holding` of counters, and count the existing items and their bytes."""
     op.create_table(
         "holding",
         sa.Column("owner_id", ID, nullable=False),
@@ -71,7 +71,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the counters and the limits that were set."""
+    """Drop the counters of items and bytes, and the limits that administrators have set."""
     op.drop_column("item", "stored_bytes")
     op.drop_column("item", "creator_id")
     op.drop_column("document", "file_bytes")

@@ -12,10 +12,10 @@ UNFINISHED = sa.text("state IN ('waiting', 'queued', 'running')")
 
 
 def upgrade() -> None:
-    """Add the index."""
+    """Create the index `ix_job_unfinished`."""
     op.create_index("ix_job_unfinished", "job", ["author_id"], sqlite_where=UNFINISHED, postgresql_where=UNFINISHED)
 
 
 def downgrade() -> None:
-    """Remove the index."""
+    """Drop the index `ix_job_unfinished`."""
     op.drop_index("ix_job_unfinished", "job")

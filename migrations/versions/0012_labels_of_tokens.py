@@ -1,4 +1,4 @@
-"""Worker labels to which a token is bound; null: the token allows any labels, as before."""
+"""Worker labels to which a token is bound; if they are null, the token allows any labels, as before."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -11,10 +11,10 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Add the column."""
+    """Add the column `labels` to `token`."""
     op.add_column("token", sa.Column("labels", sa.JSON().with_variant(JSONB(), "postgresql")))
 
 
 def downgrade() -> None:
-    """Remove the column."""
+    """Drop the column `labels` of `token`; the tokens then allow any labels."""
     op.drop_column("token", "labels")

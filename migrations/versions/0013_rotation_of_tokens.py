@@ -10,14 +10,14 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Add the columns."""
+    """Add the columns `rotation_hash` and `successor_of` to `token`."""
     op.add_column("token", sa.Column("rotation_hash", sa.String(64)))
     op.add_column("token", sa.Column("successor_of", sa.String(40)))
     op.create_index("uq_token_successor_of", "token", ["successor_of"], unique=True)
 
 
 def downgrade() -> None:
-    """Remove the columns."""
+    """Drop the columns `rotation_hash` and `successor_of` of `token`."""
     op.drop_index("uq_token_successor_of", "token")
     op.drop_column("token", "successor_of")
     op.drop_column("token", "rotation_hash")

@@ -15,7 +15,7 @@ ALIVE = sa.text("deleted_us IS NULL")
 
 
 def upgrade() -> None:
-    """Create the tables, and the columns for digests, which commits fill."""
+    """Create the tables of datasets, and the columns for content digests, which later commits fill."""
     op.add_column("revision", sa.Column("content", DIGEST, nullable=True))
     op.create_index("ix_revision_content", "revision", ["content"])
     op.add_column("revision_part", sa.Column("content", DIGEST, nullable=True))
@@ -96,7 +96,7 @@ def _create_commits() -> None:
 
 
 def downgrade() -> None:
-    """Drop the tables and the columns."""
+    """Drop the tables of datasets, with all commits, and the columns for content digests."""
     for table in ("dataset_ref", "commit_parent", "dataset_commit", "dataset", "tree_chunk"):
         op.drop_table(table)
     op.drop_column("revision_part", "content")

@@ -17,7 +17,7 @@ COMMIT = ["dataset_commit.dataset_id", "dataset_commit.digest"]
 
 
 def upgrade() -> None:
-    """Create the tables, and the column for rules."""
+    """Create the tables of proposals, and the column `protection` of `dataset_ref` for the rules of branches."""
     op.add_column("dataset_ref", sa.Column("protection", DOCUMENT, nullable=True))
     op.create_table(
         "proposal",
@@ -124,7 +124,7 @@ def _references(table: str, of_user: str) -> list[sa.ForeignKeyConstraint]:
 
 
 def downgrade() -> None:
-    """Drop the tables and the column."""
+    """Drop the tables of proposals, and the protection rules of branches."""
     for table in ("proposal_check", "proposal_review", "proposal_comment", "proposal"):
         op.drop_table(table)
     op.drop_column("dataset_ref", "protection")

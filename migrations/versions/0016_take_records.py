@@ -46,4 +46,4 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Keep the summaries: earlier versions show all members of a summary."""
+    """Change nothing: earlier versions show all members of a summary, also those of take records."""

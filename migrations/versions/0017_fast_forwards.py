@@ -13,7 +13,7 @@ DIGEST = sa.String(71)
 
 
 def upgrade() -> None:
-    """Create the table; earlier fast-forward merges were not recorded."""
+    """Create the table `fast_forward`; merges before this migration are not in it."""
     op.create_table(
         "fast_forward",
         sa.Column("dataset_id", ID, nullable=False),
@@ -29,5 +29,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the table."""
+    """Drop the table `fast_forward`."""
     op.drop_table("fast_forward")

@@ -16,7 +16,7 @@ FOREIGN_KEY = "fk_dataset_commit_job_id_job"
 
 
 def upgrade() -> None:
-    """Add the columns; no earlier commit was made by a job."""
+    """Add `commit_to` and `committed` to `job`, and `job_id` to `dataset_commit`; they are null in existing rows."""
     op.add_column("job", sa.Column("commit_to", DOCUMENT, nullable=True))
     op.add_column("job", sa.Column("committed", DIGEST, nullable=True))
     if op.get_bind().dialect.name == "sqlite":  # which adds a foreign key only together with its column
@@ -30,7 +30,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the columns."""
+    """Drop the columns `commit_to` and `committed` of `job`, and `job_id` of `dataset_commit`."""
     op.drop_index("uq_dataset_commit_job", "dataset_commit")
     op.drop_column("dataset_commit", "job_id")
     op.drop_column("job", "committed")

@@ -15,7 +15,7 @@ DOCUMENT = sa.JSON().with_variant(JSONB(), "postgresql")
 
 
 def upgrade() -> None:
-    """Create the tables."""
+    """Create the tables `webhook` and `webhook_delivery`."""
     op.create_table(
         "webhook",
         sa.Column("id", ID, nullable=False),
@@ -67,6 +67,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the tables."""
+    """Drop the tables `webhook` and `webhook_delivery`."""
     op.drop_table("webhook_delivery")
     op.drop_table("webhook")

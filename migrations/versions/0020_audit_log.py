@@ -36,7 +36,10 @@ event = sa.table("event", *map(sa.column, ("kind", "subject", "actor", "about", 
 
 
 def upgrade() -> None:
-    """Add the columns and indexes, and make earlier events about access and deletion part of the audit log."""
+    """Add `about` and `token_id` to `event`, with indexes, and make earlier events part of the audit log.
+
+    These are the events about access and deletion: their column `about` gets the name of the subject.
+    """
     op.add_column("event", sa.Column("about", sa.String(1024), nullable=True))
     op.add_column("event", sa.Column("token_id", sa.String(40), nullable=True))
     for kinds, name in (
@@ -58,27 +61,27 @@ def upgrade() -> None:
 
 
 def _name_in(table: str) -> sa.ScalarSelect[str]:
-    """Return an expression for the name of an event's subject, which is a row of `table`."""
+    """Return the SQL expression for the name of an event's subject, which is a row of `table`."""
     named = sa.table(table, sa.column("id"), sa.column("name"))
     return sa.select(named.c.name).where(named.c.id == event.c.subject).scalar_subquery()
 
 
 def _creator() -> sa.ScalarSelect[str]:
-    """Return an expression for the actor of the event that created the token; null if that event is not stored."""
+    """Return the SQL expression for the user who created the token of an event; null if the creation is not stored."""
     creation = event.alias("creation")
     same = creation.c.subject == event.c.subject, creation.c.kind == "token.created"
     return sa.select(creation.c.actor).where(*same).limit(1).scalar_subquery()
 
 
 def _in_body(key: str) -> sa.ColumnElement[str]:
-    """Return an expression for the value of a key in the body of an event, as text."""
+    """Return the SQL expression for a member of the body of an event, as text."""
     if op.get_bind().dialect.name == "postgresql":
         return event.c.body.op("->>")(key)
     return sa.func.json_extract(event.c.body, f"$.{key}")
 
 
 def downgrade() -> None:
-    """Drop the indexes and columns; the events stay."""
+    """Drop `about` and `token_id` of `event`, with the indexes; the events themselves stay."""
     for name in INDEXES:
         op.drop_index(f"ix_event_audit_{name}", "event")
     op.drop_column("event", "token_id")

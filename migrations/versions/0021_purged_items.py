@@ -22,7 +22,10 @@ document = sa.table("document", sa.column("digest", DIGEST), sa.column("body", D
 
 
 def upgrade() -> None:
-    """Add the column and the table, and record the references of all documents; this reads each document once."""
+    """Add `purged_us` to `item`, create the table `document_item`, and record to which items documents refer.
+
+    This reads each document once.
+    """
     op.add_column("item", sa.Column("purged_us", sa.BigInteger(), nullable=True))
     op.create_index("ix_item_purged", "item", ["project_id", "purged_us"], sqlite_where=PURGED, postgresql_where=PURGED)
     references = op.create_table(
@@ -47,7 +50,7 @@ def upgrade() -> None:
 
 
 def items_in(body: Any) -> Iterator[str]:
-    """Yield the ids of the items to which a document refers."""
+    """Yield the ids of the items to which `body`, the body of a document, refers."""
     waiting = [body]
     while waiting:
         one = waiting.pop()
@@ -62,7 +65,10 @@ def items_in(body: Any) -> Iterator[str]:
 
 
 def downgrade() -> None:
-    """Drop the table and the column; purged items remain empty, and look like deleted ones."""
+    """Drop the table `document_item` and the column `purged_us`.
+
+    Purged items remain without content, and look like deleted items.
+    """
     op.drop_table("document_item")
     op.drop_index("ix_item_purged", "item")
     op.drop_column("item", "purged_us")

@@ -13,7 +13,7 @@ MICROS = sa.BigInteger
 
 
 def upgrade() -> None:
-    """Create the tables."""
+    """Create the tables `invitation` and `invitation_use`."""
     op.create_table(
         "invitation",
         sa.Column("id", ID, nullable=False),
@@ -48,6 +48,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the tables."""
+    """Drop the tables `invitation` and `invitation_use`."""
     op.drop_table("invitation_use")
     op.drop_table("invitation")

@@ -34,7 +34,10 @@ job = sa.table(
 
 
 def upgrade() -> None:
-    """Add the table and the index, and record the items of all jobs; this reads each job once."""
+    """Create the table `job_item` and an index of deleted items, and record which items all jobs name.
+
+    This reads each job once.
+    """
     links = op.create_table(
         "job_item",
         sa.Column("job_id", ID, nullable=False),
@@ -66,6 +69,6 @@ def items_of(row: Any) -> set[str]:
 
 
 def downgrade() -> None:
-    """Drop the table and the index."""
+    """Drop the table `job_item` and the index of deleted items."""
     op.drop_index("ix_item_deleted", "item")
     op.drop_table("job_item")

@@ -12,7 +12,7 @@ ID = sa.String(40)
 
 
 def upgrade() -> None:
-    """Create the table."""
+    """Create the table `folder_role`."""
     op.create_table(
         "folder_role",
         sa.Column("project_id", ID, nullable=False),
@@ -29,5 +29,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the table."""
+    """Drop the table `folder_role`."""
     op.drop_table("folder_role")

@@ -12,7 +12,7 @@ FACTS = ("subject", "action", "take", "shoot_day", "licence")
 
 
 def upgrade() -> None:
-    """Create the indexes and the table."""
+    """Create the indexes of `item`, and the table `item_facet`."""
     on_sqlite = op.get_bind().dialect.name == "sqlite"
     for name in FACTS:
         fact = f"json_extract(summary, '$.{name}')" if on_sqlite else f"summary ->> '{name}'"
@@ -36,7 +36,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the table, with the facets of all clips, and the indexes."""
+    """Drop the table `item_facet`, with the facets of all clips, and the indexes of `item`."""
     op.drop_table("item_facet")
     for name in FACTS:
         op.drop_index(f"ix_item_by_{name}", "item")

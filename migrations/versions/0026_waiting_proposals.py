@@ -12,11 +12,11 @@ WAITING = sa.text("when_green_id IS NOT NULL")
 
 
 def upgrade() -> None:
-    """Create the index."""
+    """Create the index `ix_proposal_waiting`."""
     columns = ["dataset_id", "number"]
     op.create_index("ix_proposal_waiting", "proposal", columns, sqlite_where=WAITING, postgresql_where=WAITING)
 
 
 def downgrade() -> None:
-    """Drop the index."""
+    """Drop the index `ix_proposal_waiting`."""
     op.drop_index("ix_proposal_waiting", "proposal")

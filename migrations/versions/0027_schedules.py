@@ -16,7 +16,7 @@ DOCUMENT = sa.JSON().with_variant(postgresql.JSONB(), "postgresql")
 
 
 def upgrade() -> None:
-    """Create the table."""
+    """Create the table `schedule`."""
     op.create_table(
         "schedule",
         sa.Column("id", ID, nullable=False),
@@ -45,5 +45,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the table."""
+    """Drop the table `schedule`."""
     op.drop_table("schedule")

@@ -10,10 +10,10 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Add the column; existing blobs are in no object."""
+    """Add the column `object_id` to `blob`; it is null for existing blobs, which are in no object."""
     op.add_column("blob", sa.Column("object_id", sa.String(40)))
 
 
 def downgrade() -> None:
-    """Drop the column."""
+    """Drop the column `object_id` of `blob`."""
     op.drop_column("blob", "object_id")

@@ -69,7 +69,10 @@ WHERE seq = (SELECT max(seq) FROM event) AND seq < (SELECT seq FROM sqlite_seque
 
 
 def upgrade() -> None:
-    """Move first parents to the table of commits; on SQLite, also make the tables of commits and events again."""
+    """Move the first parent of each commit from `commit_parent` to `dataset_commit`.
+
+    On SQLite, the tables of commits and events are also created again, in a form that needs fewer pages.
+    """
     if op.get_bind().dialect.name == "sqlite":
         _make_commits_again(with_rowid=False, first_parent=True)
         op.execute(KEEP_GREATEST)
@@ -93,7 +96,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Restore the former tables and indexes."""
+    """Move the first parents back to `commit_parent`, and restore the former tables and indexes."""
     op.execute(RESTORE_FIRST_PARENTS)
     if op.get_bind().dialect.name == "sqlite":
         _make_commits_again(with_rowid=True, first_parent=False)
@@ -107,7 +110,7 @@ def downgrade() -> None:
 
 
 def _make_commits_again(*, with_rowid: bool, first_parent: bool) -> None:
-    """Make `dataset_commit` again with the same rows, and `commit_parent`, whose rows refer to it.
+    """Create `dataset_commit` again with the same rows, and `commit_parent`, whose rows refer to it.
 
     SQLite checks references to the rows at the end of the transaction, when all rows are back. `commit_parent` has no
     rows meanwhile: SQLite would search it for each row of `dataset_commit`.
@@ -161,7 +164,7 @@ def _create_commits(*, with_rowid: bool, first_parent: bool) -> None:
 
 
 def _make_events_again(*, autoincrement: bool) -> None:
-    """Make the table of events again with the same rows, with or without a row in `sqlite_sequence`."""
+    """Create the table `event` again with the same rows; `autoincrement` adds a row to `sqlite_sequence`."""
     op.rename_table("event", "kept_event")
     op.create_table(
         "event",

@@ -15,7 +15,7 @@ DOCUMENT = sa.JSON().with_variant(postgresql.JSONB(), "postgresql")
 
 
 def upgrade() -> None:
-    """Create the tables."""
+    """Create the tables `script` and `script_run`."""
     op.create_table(
         "script",
         sa.Column("id", ID, nullable=False),
@@ -43,6 +43,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the tables."""
+    """Drop the tables `script` and `script_run`."""
     op.drop_table("script_run")
     op.drop_table("script")

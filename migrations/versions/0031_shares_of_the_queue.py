@@ -16,7 +16,7 @@ COUNTED = ("project_id", "state", "lease_expires_us")
 
 
 def upgrade() -> None:
-    """Create the table, and indexes with which a claim reads the jobs of one project."""
+    """Create the table `queue_share`, and indexes with which a claim reads the jobs of one project."""
     op.create_table(
         "queue_share",
         sa.Column("project_id", sa.String(40), nullable=False),
@@ -31,7 +31,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the table, and restore the indexes."""
+    """Drop the table `queue_share`, with the limits of projects, and restore the former index of queued jobs."""
     op.drop_index("ix_job_leased", "job")
     op.drop_index("ix_job_claim", "job")
     op.create_index("ix_job_claim", "job", list(BEFORE), sqlite_where=QUEUED, postgresql_where=QUEUED)

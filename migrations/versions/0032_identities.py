@@ -13,7 +13,7 @@ ID = sa.String(40)
 
 
 def upgrade() -> None:
-    """Create the tables."""
+    """Create the tables `identity` and `browser_sign_in`."""
     op.create_table(
         "identity",
         sa.Column("id", ID, nullable=False),
@@ -48,6 +48,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the tables."""
+    """Drop the tables `identity` and `browser_sign_in`."""
     op.drop_table("browser_sign_in")
     op.drop_table("identity")

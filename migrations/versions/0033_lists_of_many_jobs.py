@@ -1,6 +1,6 @@
 """Indexes for lists of jobs and for old logs, so that their cost does not grow with the number of ended jobs.
 
-On Postgres, the tables of the queue are vacuumed after changes of 2 % of their rows instead of 20 %.
+On Postgres, the tables of jobs, attempts and events are vacuumed after changes of 2 % of their rows instead of 20 %.
 """
 
 import sqlalchemy as sa
@@ -26,7 +26,7 @@ SETTINGS = {"autovacuum_vacuum_scale_factor": 0.02, "autovacuum_analyze_scale_fa
 
 
 def upgrade() -> None:
-    """Create the indexes, and set the frequency of vacuums."""
+    """Create the indexes; on Postgres, vacuum the tables of the queue and of events more often."""
     for name, columns in LISTS.items():
         op.create_index(f"ix_job_list_{name}", "job", columns, sqlite_where=LISTED, postgresql_where=LISTED)
     columns = ["project_id", "state", "created_us", "id"]
@@ -40,7 +40,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the indexes, and restore the frequency of vacuums."""
+    """Drop the indexes; on Postgres, restore the default frequency of vacuums."""
     if op.get_context().dialect.name == "postgresql":
         for table in VACUUMED:
             op.execute(f"ALTER TABLE {table} RESET ({', '.join(SETTINGS)})")

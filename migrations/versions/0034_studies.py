@@ -16,7 +16,7 @@ DOCUMENT = sa.JSON().with_variant(postgresql.JSONB(), "postgresql")
 
 
 def upgrade() -> None:
-    """Create the tables."""
+    """Create the tables `study_participant` and `study_trial`."""
     op.create_table(
         "study_participant",
         sa.Column("id", ID, nullable=False),
@@ -60,6 +60,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the tables."""
+    """Drop the tables `study_participant` and `study_trial`."""
     op.drop_table("study_trial")
     op.drop_table("study_participant")

@@ -162,14 +162,14 @@ class Scene:
         would wait for `act`.
         """
 
-        def delete_and_hold(*args: Any) -> None:
+        def delete_and_count(*args: Any) -> None:
             self.delete(item)
-            hold(*args)
+            count_added(*args)
 
         def act_beside_deletion(tx: Transaction) -> Any:
             with pytest.MonkeyPatch.context() as patch:
                 if while_publishing:
-                    patch.setattr(holdings, "hold", delete_and_hold)
+                    patch.setattr(holdings, "count_added", delete_and_count)
                 done = act(tx)
             if not while_publishing:
                 self.delete(item)
@@ -179,7 +179,7 @@ class Scene:
             request = PurgeRequest(item=item)
             return recording(tx, "lab", request, preparation(tx, "lab", request))
 
-        hold = holdings.hold
+        count_added = holdings.count_added
         preparation, recording = requiring(WRITE, purging.prepare_purge), requiring(WRITE, purging.record_purge)
         principal, database = who or self.desk.user, self.desk.database
         if not database.is_sqlite:

@@ -61,7 +61,7 @@ def sign_in(tx: Transaction, attempt: SignInTry, verified_hash: str, expires_in_
     Raises `UnauthenticatedProblem` if the user was disabled or has another password now.
     """
     tx.principal = users.authenticated(tx, attempt.name, verified_hash)
-    sign_ins.forgive(tx, attempt)
+    sign_ins.record_success(tx, attempt)
     return tokens.create_session(tx, expires_in_s)
 
 

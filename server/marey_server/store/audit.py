@@ -25,7 +25,7 @@ _ORDER = listing.parse_order("-at,-seq", _KEYS, unique="seq")
 
 
 class AuditFilter(NamedTuple):
-    """Filter of the audit log; None selects all entries.
+    """Filter of the audit log; a field that is None selects all entries.
 
     `subject` is the id or the name of the object that was changed; a text that looks like an id is always taken as an
     id. Entries at the time `since` are selected, entries at the time `until` are not.

@@ -1,8 +1,8 @@
-"""Backings that store the bytes of blobs; the rows of the table `blob` say which blobs exist.
+"""Backings: places that store the bytes of blobs, such as the database or a folder of files.
 
-A backing is called inside the transaction that inserts or deletes the blob's row. This row is the lock: no other
-transaction can write or remove the same bytes before this transaction ends. Bytes that are being received are in a
-`Spool`. The package `object_storage` contains a further backing, for S3.
+The rows of the table `blob` say which blobs exist. A backing is called inside the transaction that inserts or deletes
+the row of a blob. This row is the lock: no other transaction can write or remove the same bytes before this transaction
+ends. Bytes that are being received are in a `Spool`. The package `object_storage` contains a further backing, for S3.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Spool:
 
 
 class BlobBacking(Protocol):
-    """Interface of a place that stores the bytes of blobs."""
+    """Interface of a backing, a place that stores the bytes of blobs."""
 
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
         """Store the bytes of blobs.
@@ -92,11 +92,15 @@ class BlobBacking(Protocol):
         ...
 
     def expect(self, connection: Connection, digests: Iterable[str]) -> None:
-        """Prepare to read all bytes of several blobs, if reading them together is faster than one by one."""
+        """Announce that all bytes of several blobs will be read, so that the backing can read them together."""
         ...
 
     def release(self, connection: Connection, digest: str) -> None:
-        """Free the bytes of a blob whose row this transaction deletes; the transaction may still be rolled back."""
+        """Free the bytes of a blob whose row this transaction deletes.
+
+        If the transaction is rolled back, the bytes must still exist. So files and objects are only deleted later, by
+        garbage collection.
+        """
         ...
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
@@ -104,7 +108,7 @@ class BlobBacking(Protocol):
         ...
 
     def remove_stray(self, digest: str) -> None:
-        """Remove stored bytes that have no row in `blob`."""
+        """Remove the stored bytes of a digest that has no row in `blob`."""
         ...
 
     def new_copy(self) -> Path | None:
@@ -212,7 +216,10 @@ class DatabaseBlobs:
 
 
 class DirectoryBlobs:
-    """Blobs stored in files `<root>/ab/cdef...`; each is written under a temporary name, synced and renamed."""
+    """Blobs stored in files that are named by the digest: the blob `abcdef...` is the file `<root>/ab/cdef...`.
+
+    Each file is written under a temporary name, synced to the disk, and then renamed.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -231,7 +238,7 @@ class DirectoryBlobs:
         return path
 
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:  # noqa: ARG002
-        """Write the file of each blob, replacing a file that a rolled-back transaction may have left under its name."""
+        """Write the file of each blob; replace a file of this name, which a rolled-back transaction may have left."""
         for digest, chunks in contents.items():
             self._write(digest, chunks)
 
@@ -276,7 +283,10 @@ class DirectoryBlobs:
         DatabaseBlobs().release(connection, digest)
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Yield the digests of old files; remove old unfinished files, which dead processes left."""
+        """Yield the digests of the files that are older than `older_than_s` seconds.
+
+        Also remove unfinished files of this age, which processes left that ended while they were writing.
+        """
         newest = time.time() - older_than_s
         for folder in sorted(path for path in self.root.iterdir() if path.is_dir()):
             for path in folder.iterdir():

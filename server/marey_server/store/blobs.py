@@ -190,10 +190,10 @@ def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
         tx.execute(tx.insert_or_ignore(blob_holder), rows)
 
 
-def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Return those of the digests that the caller may refer to, and protect their blobs.
+def lock_usable(tx: Transaction, digests: Iterable[str]) -> set[str]:
+    """Return those of the digests that the caller may refer to, and lock their blobs.
 
-    These blobs cannot be deleted before the end of this transaction.
+    Garbage collection cannot delete the locked blobs before the end of this transaction.
     """
     return _renew(tx, blob, readable(tx, digests))
 
@@ -204,7 +204,7 @@ def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
     Raises `ConflictProblem` (`missing-blobs`) if a blob is not stored or the caller may not refer to it.
     """
     wanted = set(digests)
-    if lacking := wanted - hold(tx, wanted):
+    if lacking := wanted - lock_usable(tx, wanted):
         raise missing_blobs(lacking)
     _name_for_job(tx, job_id, wanted)
 
@@ -319,7 +319,7 @@ def _held(tx: Transaction, digests: Iterable[str], *, since_us: int) -> set[str]
 
 
 def _within_reach(caller: Principal) -> tuple[ColumnElement[bool], ...]:
-    """Return SQL conditions that select, among the uploads of a user, those whose bytes the user's token may use.
+    """Return the SQL conditions for the uploads of a user whose bytes the user's token may use.
 
     The uploads are rows of `blob_holder`; each row is valid in one project or in every project. A token that may read
     in all projects may use all uploads of its user. Any other token may use the uploads that are valid in the projects

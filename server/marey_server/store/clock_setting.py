@@ -21,9 +21,9 @@ PAST = frozenset(
         "withdrawn_us",
     }
 )  # fmt: skip
-"""Columns of times in the past; no value may lie in the future."""
+"""Columns of times of past events. Times in the future are set to now."""
 WAITING = frozenset({"expires_us", "lease_expires_us", "next_us", "old_secret_until_us", "run_at_us", "until_us"})
-"""Columns of times at which something ends or may go on.
+"""Columns of times at which a lease, a validity or a wait ends.
 
 Times in the future are set to now: workers then renew their leases, and jobs, sign-ins and webhooks no longer wait.
 """

@@ -66,12 +66,14 @@ def check_length(path: str) -> None:
     """Raise `InvalidProblem` if a path is too long to be stored."""
     if len(path) > MAX_PATH_LENGTH or len(path.encode()) > MAX_PATH_BYTES:
         raise InvalidProblem(
-            f"A path may have at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes.", code="long-path"
+            f"The path of a folder may have at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes; this path "
+            f"has {len(path)} characters and {len(path.encode())} bytes.",
+            code="long-path",
         )
 
 
 def at_or_below(path: str) -> ColumnElement[bool]:
-    """Return the condition for rows of `collection`: the folder at `path` and all folders below it."""
+    """Return the SQL condition for the rows of the folder at `path` and of all folders below it."""
     if not path:
         return literal(True)
     return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(path) + 1) == f"{path}/")
@@ -99,8 +101,9 @@ def list_collections(
 ) -> Page:
     """List the collections at and below `path`, without the root, in the order of their paths.
 
-    With `directly_in`, only the subfolders of this folder are listed, and with `name`, only those with this name, or
-    whose names begin with the text before a final `*`. With `deleted`, deleted collections are listed instead.
+    With `directly_in`, only the direct subfolders of this folder are listed. `name` selects among these the subfolder
+    of this name or, if `name` ends with `*`, the subfolders whose names begin with the text before the `*`. With
+    `deleted`, only deleted collections are listed.
 
     Raises `BadRequestProblem` if `name` is given without `directly_in`.
     """
@@ -120,7 +123,11 @@ def list_collections(
 
 
 def _children(directly_in: str | None, name: str | None) -> list[ColumnElement[bool]]:
-    """Return the conditions on the folders in a folder; `name` ends with `*` if it is the beginning of their names."""
+    """Return the SQL conditions for the direct subfolders of a folder; none if `directly_in` is None.
+
+    With `name`, only the subfolder of this name is selected, or, if `name` ends with `*`, the subfolders whose names
+    begin with the text before the `*`.
+    """
     if directly_in is None:
         if name is not None:
             raise BadRequestProblem(
@@ -136,16 +143,19 @@ def _children(directly_in: str | None, name: str | None) -> list[ColumnElement[b
 
 
 def find_collection(tx: Transaction, project_row: ProjectRow, collection_id: str, *, lock: bool = False) -> Row[Any]:
-    """Return the row of a folder that is not deleted; with `lock`, lock the row. Raises `NotFoundProblem`."""
+    """Return the row of a folder that is not deleted; with `lock`, lock the row.
+
+    Raises `NotFoundProblem` if there is no such folder.
+    """
     return _find(tx, project_row, collection_id, _ALIVE, lock=lock)
 
 
 def _find(
     tx: Transaction, project_row: ProjectRow, collection_id: str, state: ColumnElement[bool], *, lock: bool = False
 ) -> Row[Any]:
-    """Return the row of a collection that meets the condition `state`, for example that it is not deleted.
+    """Return the row of the collection with an id, if it meets the condition `state`, such as `_ALIVE`.
 
-    With `lock`, the row is locked. Raises `NotFoundProblem`.
+    With `lock`, the row is locked. Raises `NotFoundProblem` if there is no such collection.
     """
     statement = select(collection).where(
         collection.c.id == collection_id, collection.c.project_id == project_row.id, state
@@ -187,9 +197,9 @@ def create_collection(tx: Transaction, project: str, request: CollectionCreate) 
 
 def _path_taken(path: str) -> ConflictProblem:
     return ConflictProblem(
-        f"There is already a collection {path!r}.",
+        f"There is already a collection {path!r}; choose another path.",
         code="path-taken",
-        unnamed="There is already a collection with this path.",
+        unnamed="There is already a collection with this path; choose another path.",
     )
 
 
@@ -198,7 +208,8 @@ def move_collection(
 ) -> Collection:
     """Rename or move a folder with its contents and the roles in it.
 
-    Raises `ConflictProblem` if the new path is taken.
+    Raises `ConflictProblem` if the new path is taken, and `InvalidProblem` for the root collection and for a path
+    inside the folder itself.
     """
     project_row = projects.require(tx, project)
     lock_places(tx, project_row)
@@ -210,9 +221,9 @@ def move_collection(
     rights.require(new.rpartition("/")[0], Role.CONTRIBUTOR)
     if new.startswith(f"{old}/"):
         raise InvalidProblem(
-            f"The collection {old!r} cannot be moved into itself.",
+            f"The collection {old!r} cannot be moved into itself; choose a path outside of it.",
             code="into-itself",
-            unnamed="The collection cannot be moved into itself.",
+            unnamed="The collection cannot be moved into itself; choose a path outside of it.",
         )
     if new != old:
         ensure(tx, project_row, new.rpartition("/")[0])
@@ -256,7 +267,10 @@ def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequenc
 
 
 def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev) -> None:
-    """Hide a folder and its contents; `restore_collection` restores them."""
+    """Hide a folder and its contents; `restore_collection` restores them.
+
+    Raises `InvalidProblem` for the root collection, which cannot be deleted.
+    """
     project_row = projects.require(tx, project)
     lock_places(tx, project_row)
     path = _find(tx, project_row, collection_id, _ALIVE, lock=True).path
@@ -278,7 +292,7 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
         .values(deleted_us=tx.now_us, rev=item.c.rev + 1)
         .returning(item.c.creator_id, item.c.stored_bytes)
     )
-    holdings.release(tx, project_row.id, holdings.by_creator(gone))
+    holdings.count_removed(tx, project_row.id, holdings.by_creator(gone))
     tx.audit("collection.deleted", collection_id, about=path, project_id=project_row.id, path=path)
 
 
@@ -316,7 +330,7 @@ def restore_collection(
         .values(deleted_us=None, rev=item.c.rev + 1)
         .returning(item.c.creator_id, item.c.stored_bytes)
     )
-    holdings.hold(tx, project_row.id, holdings.by_creator(back))
+    holdings.count_added(tx, project_row.id, holdings.by_creator(back))
     tx.audit("collection.restored", collection_id, about=gone.path, project_id=project_row.id, path=gone.path)
     return _shown(tx, project_row, row)
 

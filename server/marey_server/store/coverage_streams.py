@@ -34,9 +34,10 @@ class CoverageOffset(ConflictProblem):
 
 @dataclass(frozen=True, slots=True)
 class NewStream:
-    """Initial state of a stream.
+    """Initial state of a coverage stream.
 
-    `settings` are the fields of `CoverageStream` that never change; `rig` is the skeleton of the stream's poses.
+    `settings` are the fields of `CoverageStream` that never change. `rig` is the encoded skeleton of the stream's
+    poses with its joint mapping, or None without a skeleton. `state` is the encoded state.
     """
 
     settings: Tree
@@ -74,7 +75,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class StreamStep:
-    """Update of a stream: the digest of the request, the answer to it, and the new state of the stream."""
+    """Update of a stream: the digest of the request (`said`), the answer, and the new state of the stream."""
 
     said: str
     answer: Tree
@@ -111,20 +112,21 @@ def list_streams(
 
 
 def read_stream(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """Return a stream to a caller who may read it. Raises `NotFoundProblem`."""
+    """Return a stream to a caller who may read it. Raises `NotFoundProblem` if it does not exist."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
 def read_to_advance(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """Return a stream to a caller who may send frames to it. Raises `NotFoundProblem`."""
+    """Return a stream to a caller who may send frames to it. Raises `NotFoundProblem` if it does not exist."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
 def advance_stream(tx: Transaction, project: str, held: Stream, step: StreamStep) -> Tree:
-    """Store the next state of a stream if the stream is still in the state `held`, and return the answer.
+    """Store the next state of a stream if no other request has changed the stream since `held` was read.
 
-    Raises `CoverageOffset` with the current offset if another request was faster, and `NotFoundProblem` if the stream
-    was deleted.
+    Returns the answer. A repetition of the stream's last request changes nothing and gets the stored answer. Raises
+    `CoverageOffset` with the current offset if another request has changed the stream, and `NotFoundProblem` if the
+    stream was deleted.
     """
     project_row = projects.require(tx, project)
     where = coverage_stream.c.id == held.id, coverage_stream.c.rev == held.rev
@@ -140,7 +142,7 @@ def advance_stream(tx: Transaction, project: str, held: Stream, step: StreamStep
 
 
 def answered_before(stream: Stream, said: str) -> Tree | None:
-    """Return the stored answer if a request with the digest `said` repeats the last request, otherwise None."""
+    """Return the stored answer if the request with the digest `said` repeats the stream's last request, else None."""
     return stream.answer if stream.said == said else None
 
 
@@ -156,7 +158,7 @@ def _elsewhere(stream: Stream) -> CoverageOffset:
 
 
 def delete_stream(tx: Transaction, project: str, stream_id: str) -> None:
-    """Delete a stream. Raises `NotFoundProblem`."""
+    """Delete a stream. Raises `NotFoundProblem` if it does not exist."""
     project_row = projects.require(tx, project)
     found = _find(tx, project_row.id, stream_id)
     tx.execute(delete(coverage_stream).where(coverage_stream.c.id == found.id))

@@ -85,9 +85,9 @@ def _file_bytes(one: PreparedDocument, sizes: Mapping[str, int]) -> int:
 
 
 def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> None:
-    """Store documents that have the arrays and files of existing documents, but other bodies.
+    """Store documents that have the same arrays and files as existing documents, but other bodies.
 
-    `variants` lists the digest of an existing document and the new body.
+    `variants` contains, for each new document, the digest of the existing document and the new body.
     """
     if not variants:
         return
@@ -118,7 +118,7 @@ def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> Non
 def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
     """Check that the caller may use the files to which documents refer; return the sizes of the files in bytes."""
     naming = [one.files for one in contents if one.files]
-    held = blobs.hold(tx, {digest for files in naming for digest in files.values()}) if naming else set()
+    held = blobs.lock_usable(tx, {digest for files in naming for digest in files.values()}) if naming else set()
     for files in naming:
         lacking = {pointer: digest for pointer, digest in files.items() if digest not in held}
         if lacking:
@@ -191,7 +191,10 @@ _BLOBS_OF_DOCUMENTS = Prepared(
 
 
 def load_document(tx: Transaction, digest: str, *, arrays: Literal["encoded", "decoded", "none"] = "encoded") -> Tree:
-    """Load a stored document; its arrays are returned encoded, as numpy arrays, or as references."""
+    """Load a stored document; `arrays` says whether its arrays are encoded, decoded (numpy) or references ("none").
+
+    Raises `NotFoundProblem` if the document is missing.
+    """
     return load_documents(tx, [digest], arrays=arrays)[digest]
 
 
@@ -211,7 +214,7 @@ def load_body(tx: Transaction, digest: str) -> Tree:
 
 
 def load_bodies(tx: Transaction, digests: Collection[str]) -> dict[str, Tree]:
-    """Load documents by digest, with references in place of their arrays."""
+    """Load documents by digest, with references in place of arrays. Raises `NotFoundProblem` if one is missing."""
     wanted = list(digests)
     bodies = {
         row.digest: dict(row.body) for some in in_lists(wanted) for row in tx.run(_BODIES, {"digests": padded(some)})

@@ -6,9 +6,9 @@ events holds a lock until its own commit, sees only committed events, and contin
 gets a lower number than one that was already listed. Writers do not wait for each other, and the order depends on
 nothing but the tables.
 
-Entries of the audit log are events that are kept longer than others. The feed begins after the last event that was old
-enough to be deleted. Audit entries before this beginning are no longer part of the feed. So clients and webhooks, which
-follow the feed, never receive audit entries of a period whose other events were deleted.
+The feed is the list of events that clients and webhooks follow. Old events are deleted, except entries of the audit
+log, which are kept longer. The feed begins after the last deleted event, so it does not contain the audit entries
+before it. Clients thus never receive audit entries of a period whose other events were deleted.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ from marey_server.store.wakeups import events_topic, job_topic, work_topic
 
 MAX_EVENTS = 1000
 PAGE_BYTES = 4 * MIB
-"""Greatest size of the bodies of the events in a page; a longer body is a page of its own."""
+"""Greatest total size in bytes of the event bodies in a page; an event with a larger body has a page of its own."""
 NUMBERED_AT_ONCE = 10_000
 """Greatest number of events that get their numbers in one transaction."""
 
 CHANNEL = "marey_events"
-"""Channel of Postgres on which servers announce to each other that events got numbers."""
+"""Channel of Postgres (LISTEN and NOTIFY) on which servers announce to each other that events got numbers."""
 
 LAST_NUMBER = "last_event_number"
 """Key of the number of the last numbered event, in the table `server_state`."""
@@ -67,7 +67,7 @@ _UNNUMBERED = event.c.number.is_(None)
 
 
 class EventPage(NamedTuple):
-    """Page of the feed, and whether no events followed it when it was read."""
+    """Page of events; `complete` says that no further events existed when the page was read."""
 
     items: list[Event]
     complete: bool
@@ -106,8 +106,8 @@ def list_events(
 def _placed(tx: Transaction, conditions: Sequence[ColumnElement[bool]], most: int) -> Select[*tuple[Any, ...]]:
     """Return a query for the first `most` events that meet the conditions, without the bodies of the events.
 
-    The column `until_bytes` is the total size of the bodies up to and including that of the row, so that callers can
-    select the bodies that fit into a page. The column `found` is the number of rows.
+    The column `until_bytes` is the running total of the sizes of the bodies in bytes, including the row's own. With it,
+    callers select the bodies that fit into a page. The column `found` is the number of rows.
     """
     text_size = func.octet_length(cast(event.c.body, Text))
     size_bytes = text_size if tx.is_postgres else func.length(cast(event.c.body, LargeBinary))
@@ -136,10 +136,9 @@ def _last_deleted(tx: Transaction) -> int:
 
 
 def start_of_feed(tx: Transaction, after: int) -> int:
-    """Return the number of the event after which a client continues to read.
+    """Return the number after which a client that has the events up to `after` continues to read.
 
-    The client has received the events up to `after`. If later events were deleted from the feed, the client continues
-    after the last deleted event.
+    This is `after`, or the number of the last deleted event if that is greater.
     """
     return max(after, _last_deleted(tx))
 
@@ -148,10 +147,10 @@ def start_of_feed(tx: Transaction, after: int) -> int:
 
 
 def find_last_old(tx: Transaction, age_us: int) -> int | None:
-    """Return the number of the last event that may be deleted, or None if there is no such event.
+    """Return the number up to which `delete_until` may delete the events of the feed; None if no event is old enough.
 
-    This event and all earlier ones are older than `age_us`. At most `DELETED_AT_ONCE` events of the feed have numbers
-    up to the returned number. The newest event always has a greater number.
+    All events up to this number are older than `age_us`. They are at most `DELETED_AT_ONCE`, and the newest event is
+    never among them.
     """
     number = number_of(tx)
     oldest = select(number.label("number"), event.c.at_us).where(follows(tx, _last_deleted(tx)))
@@ -189,12 +188,12 @@ _COLUMNS = (event.c.at_us, event.c.kind, event.c.subject, event.c.actor, event.c
 
 
 def number_of(tx: Transaction) -> ColumnElement[int]:
-    """Return the column of the table `event` that contains the numbers of events."""
+    """Return the column of the table `event` with the numbers of events: `number` on Postgres, `seq` on SQLite."""
     return event.c.number if tx.is_postgres else event.c.seq
 
 
 def follows(tx: Transaction, after: int) -> ColumnElement[bool]:
-    """Return the condition for events after the one numbered `after`."""
+    """Return the SQL condition for events with a number greater than `after`."""
     if tx.is_postgres:
         return event.c.number > after
     return and_(_UNNUMBERED, event.c.seq > after)  # the first condition makes the index of the feed usable
@@ -238,12 +237,12 @@ def number_events(tx: Transaction) -> int:
 
 
 class News(NamedTuple):
-    """Topics that new events announce to waiting requests, and the number of the last event that was read."""
+    """Topics of the waiting requests that new events wake, and the number of the last event that was read."""
 
     topics: frozenset[str]
     last: int
     complete: bool
-    """Whether no events remain to be read."""
+    """Whether all events were read; if false, at least `MAX_EVENTS` were found, and more may follow."""
 
 
 def newest_number(tx: Transaction) -> int:
@@ -286,11 +285,14 @@ def _waiting_for_key(tx: Transaction, keys: Iterable[tuple[str, str]]) -> set[st
 
 
 _MOST_READ = 100
-"""Greatest number of queued jobs of a project whose kinds are read when another job of the project may start."""
+"""Greatest number of a project's queued jobs that are examined to find which workers to wake."""
 
 
 def _waiting_for_place(tx: Transaction, projects: Collection[str]) -> set[str]:
-    """Return the kinds of the first queued jobs of those projects that have a limit of running jobs."""
+    """Return the kinds of the first queued jobs of those projects that have a limit on running jobs.
+
+    After another job of such a project has stopped running, one of these jobs may start.
+    """
     limited = select(queue_share.c.project_id).where(queue_share.c.most_running.is_not(None))
     found: set[str] = set()
     for some in in_lists(projects):

@@ -71,9 +71,10 @@ MISCOUNTED = "counter-wrong"
 def check_store(
     database: Database, *, progress: Callable[[str, int], None] | None = None, repair: bool = False
 ) -> Iterator[StoreDefect]:
-    """Yield all defects as they are found; call `progress(check, count)` after each page.
+    """Yield all defects as they are found.
 
-    With `repair`, wrong counters of items and bytes are yielded as defects, too, and then corrected.
+    From time to time, `progress` is called with the name of a check and the number of rows that it has examined. With
+    `repair`, wrong counters of items and bytes are corrected at the end; they are yielded as defects, too.
     """
     yield from database.read(SYSTEM, _check_file)
     passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[StoreDefect]]], ...] = (
@@ -117,7 +118,7 @@ def _check_page(
 
 
 def _check_file(tx: Transaction) -> list[StoreDefect]:
-    """Return the faults that SQLite finds in its file and in foreign keys; on Postgres, return none."""
+    """Return the faults of an SQLite file: damaged pages, and references to missing rows. On Postgres, return none."""
     if tx.is_postgres:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
@@ -133,11 +134,12 @@ def _check_file(tx: Transaction) -> list[StoreDefect]:
 def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     findings = []
     if digest_of(canonical_json(row.body)) != row.digest:
-        findings.append(StoreDefect("document-corrupt", row.digest, "the text has another digest"))
+        findings.append(StoreDefect("document-corrupt", row.digest, "the text does not have this digest"))
     arrays, files = references_of(row.schema, row.body)
     file_bytes = select(func.coalesce(func.sum(blob.c.size_bytes), 0)).where(blob.c.digest.in_(set(files.values())))
     if tx.execute(file_bytes).scalar_one() != row.file_bytes:
-        findings.append(StoreDefect("document-reference", row.digest, "the files to which it refers have another size"))
+        detail = "the files to which it refers have another total size than recorded"
+        findings.append(StoreDefect("document-reference", row.digest, detail))
     statement = select(document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes)
     statement = statement.outerjoin(blob, blob.c.digest == document_blob.c.blob_digest)
     held = {
@@ -148,11 +150,12 @@ def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         findings.append(StoreDefect("document-reference", row.digest, f"{pointer} {what}"))
     named_items = select(document_item.c.item_id).where(document_item.c.document_digest == row.digest)
     if set(tx.execute(named_items).scalars()) != items_named_in(row.body):
-        detail = "the items to which it refers are not those that are recorded"
+        detail = "it refers to other items than the table document_item records"
         findings.append(StoreDefect("document-reference", row.digest, detail))
     for pointer, named in files.items():
         if pointer in held and held[pointer].blob_digest != named:
-            findings.append(StoreDefect("document-reference", row.digest, f"{pointer} has another blob"))
+            detail = f"{pointer} names another blob than recorded"
+            findings.append(StoreDefect("document-reference", row.digest, detail))
     for pointer, leaf in arrays.items():
         if pointer in held and held[pointer].size_bytes is not None:
             findings += _check_array(tx, row.digest, pointer, leaf, held[pointer])
@@ -166,7 +169,7 @@ def _check_array(tx: Transaction, digest: str, pointer: str, leaf: dict[str, Any
     except ArrayError as error:
         return [StoreDefect("array-corrupt", digest, f"{pointer}: {error}")]
     if content != leaf["content"]:
-        return [StoreDefect("array-corrupt", digest, f"{pointer}: the array has another digest")]
+        return [StoreDefect("array-corrupt", digest, f"{pointer}: the array has another digest than the document says")]
     return []
 
 
@@ -175,9 +178,8 @@ def _check_item(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     counts = select(func.count(), func.max(revision.c.number)).where(revision.c.item_id == row.id)
     count, newest = tuple(tx.execute(counts).one())
     if (count, newest) != (row.head, row.head):
-        return [
-            StoreDefect("revisions-lost", row.id, f"{count} revisions up to {newest}; the newest should be {row.head}")
-        ]
+        detail = f"it has {count} revisions up to number {newest}, but the newest should have the number {row.head}"
+        return [StoreDefect("revisions-lost", row.id, detail)]
     if row.purged_us is not None:
         return _check_purged(tx, row)
     findings = []
@@ -186,14 +188,14 @@ def _check_item(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         complete = complete and found.body is not None
         bodies[found.part] = found.body
         if found.body is None:
-            detail = f"{found.part} of revision {row.head}: {found.document_digest}"
+            detail = f"the document {found.document_digest} of the part {found.part} of revision {row.head} is missing"
             findings.append(StoreDefect("document-lost", row.id, detail))
     lacking = [part for part, spec in PARTS[kind].items() if spec.required and part not in bodies]
-    findings += [StoreDefect("part-lost", row.id, f"revision {row.head} has no {part}") for part in lacking]
+    findings += [StoreDefect("part-lost", row.id, f"revision {row.head} has no part {part}") for part in lacking]
     if complete and not lacking:
         summary = summarise(kind, bodies)
         if (summary.shown, summary.frames, summary.skeleton_id) != (row.summary, row.frames, row.skeleton_id):
-            findings.append(StoreDefect("summary-wrong", row.id, "the summary is not that of the newest revision"))
+            findings.append(StoreDefect("summary-wrong", row.id, "the summary does not match the newest revision"))
         findings += _check_named_items(tx, row, bodies)
     if (size := tx.execute(select(holdings.BYTES_OF_ITEM).where(item.c.id == row.id)).scalar_one()) != row.stored_bytes:
         detail = f"its revisions take {size} bytes, but {row.stored_bytes} are recorded"
@@ -302,7 +304,8 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         first_parents.update(first)
         record = CommitRecord(one.tree, (*first, *parents.get(one.digest, ())), one.author, one.message, one.at)
         if record.digest != one.digest:
-            findings.append(StoreDefect("commit-corrupt", row.id, f"the commit {one.digest} has another digest"))
+            detail = f"the content of the commit {one.digest} has another digest"
+            findings.append(StoreDefect("commit-corrupt", row.id, detail))
     lost = sorted(first_parents - there)
     findings += [StoreDefect("commit-lost", row.id, f"the parent {one} of a commit is missing") for one in lost]
     return findings + _check_folder(tx, row) + _check_entries(tx, row) + _check_proposals(tx, row)
@@ -320,7 +323,7 @@ def _check_folder(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault for each entry that is damaged, or whose content is not that of any revision of the project."""
+    """Return a fault for each entry that is damaged, or whose content no revision of the project has."""
     trees = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     waiting = set(tx.execute(trees).scalars())
     seen: set[str] = set()
@@ -346,7 +349,10 @@ def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _contents_in(row: Row[Any], digest: str, leaf: Leaf, findings: list[StoreDefect]) -> dict[str, str]:
-    """Return the paths of the entries in a chunk by their content; add a fault to `findings` for each damaged entry."""
+    """Return the paths of the entries in a chunk, by the content digests of the entries.
+
+    For each damaged entry, a fault is added to `findings`.
+    """
     found: dict[str, str] = {}
     for key, value in leaf.entries:
         try:
@@ -384,7 +390,7 @@ def _check_job(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     naming = NamingJob(row.id, row.inputs, {} if row.parent_id is not None else row.params, row.outputs or ())
     recorded = set(tx.execute(select(job_item.c.item_id).where(job_item.c.job_id == row.id)).scalars())
     return [
-        StoreDefect("job-reference", row.id, f"it names the item {one}, which is not recorded")
+        StoreDefect("job-reference", row.id, f"it names the item {one}, but the table job_item has no row for it")
         for one in sorted(naming.items() - recorded)
     ]
 

@@ -98,9 +98,9 @@ def _collect(
 
 
 def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> list[str]:
-    """Return at most `BATCH` digests, the next after `behind`, that have had no references for `grace_us`.
+    """Return the next digests of documents or blobs, after the digest `behind`, without references for `grace_us`.
 
-    Together, these documents or blobs have at most `BATCH_BYTES`. A document or blob with more bytes is returned alone.
+    There are at most `BATCH` of them, with at most `BATCH_BYTES` together. A larger document or blob is returned alone.
     """
     rows = select(table.c.digest, table.c.size_bytes).where(table.c.digest > behind, *_garbage(tx, table, grace_us))
     chosen: list[str] = []
@@ -114,7 +114,10 @@ def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> li
 
 
 def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElement[bool], ...]:
-    """Return SQL conditions for rows that may be deleted; the caller must exclude staged documents separately."""
+    """Return the SQL conditions for documents or blobs that are old enough and not referenced.
+
+    Staged documents meet the conditions, too; the caller must exclude them.
+    """
     old = table.c.created_us < tx.now_us - grace_us
     if table is document:
         return old, ~exists().where(revision_part.c.document_digest == document.c.digest)
@@ -123,7 +126,7 @@ def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElemen
 
 
 def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_us: int) -> list[str]:
-    """Lock the rows with the given digests, and return the digests of those that may still be deleted."""
+    """Lock the rows with the given digests, and return the digests of those that still have no references."""
     chosen = table.c.digest.in_(digests)
     tx.execute(select(table.c.digest).where(chosen).order_by(table.c.digest).with_for_update()).all()
     return list(tx.execute(select(table.c.digest).where(chosen, *_garbage(tx, table, grace_us))).scalars())

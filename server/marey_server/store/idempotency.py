@@ -66,7 +66,9 @@ def find(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
 
 def _answer(stored: Row[Any], fingerprint: str) -> StoredAnswer:
     if stored.fingerprint != fingerprint:
-        detail = "This Idempotency-Key was used for another request, or with a token that has other scopes."
+        detail = (
+            "This Idempotency-Key was used for another request, or with a token that has other scopes; use another key."
+        )
         raise InvalidProblem(detail, code="idempotency-key-reused")
     return StoredAnswer(stored.status, dict(stored.headers), bytes(stored.body))
 
@@ -78,9 +80,9 @@ def finish(tx: Transaction, key: str, status: int, headers: Mapping[str, str], b
 
 
 def principal_key(principal: Principal) -> str:
-    """Return a text that identifies the owner of the caller's idempotency keys.
+    """Return a text that identifies whose idempotency keys the caller uses.
 
-    The owner is an attempt, a user, or all callers of another kind together.
+    An attempt and a user each have their own keys. All other callers of one kind share their keys.
     """
     if principal.kind == "attempt":
         return f"{principal.job_id}/{principal.fence}"

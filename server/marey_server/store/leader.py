@@ -15,7 +15,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True)
 class Lead:
-    """Leadership of a process for one task."""
+    """Leadership of the process `holder` for the task `name`; `fence` is the number of this leadership."""
 
     name: str
     holder: str
@@ -23,7 +23,7 @@ class Lead:
 
 
 def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | None:
-    """Become or stay the leader for the task `name` during `ttl_us`.
+    """Become or stay the leader for the task `name`, for `ttl_us` microseconds.
 
     Returns the fence (a number that each new leader increases), or None if another process is the leader.
     """
@@ -46,7 +46,7 @@ def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | Non
 
 
 def holds_lead(tx: Transaction, lead: Lead) -> bool:
-    """Return whether this process is still the leader, and if so, keep it the leader until the transaction ends."""
+    """Return whether this process still leads; if so, nobody else can take the lead until the transaction ends."""
     which = (leader.c.name == lead.name, leader.c.holder == lead.holder, leader.c.fence == lead.fence)
     return tx.execute(select(leader.c.fence).where(*which).with_for_update(read=True)).first() is not None
 

@@ -24,18 +24,18 @@ MAX_LIMIT = 1000
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Order of a list: columns with their directions; the last column is unique."""
+    """Order of a list by several columns; the last column is unique, so that the order is complete."""
 
     text: str
     columns: tuple[tuple[ColumnElement[Any], bool], ...]
-    """Columns of the order, each with True if its order is descending."""
+    """Columns with their directions; True means descending."""
 
     def clauses(self) -> list[UnaryExpression[Any]]:
         """Return the terms of the clause ORDER BY."""
         return [column.desc() if falls else column.asc() for column, falls in self.columns]
 
     def after(self, values: Sequence[Any]) -> ColumnElement[bool]:
-        """Return the condition for the rows after the row with these values.
+        """Return the SQL condition for the rows that follow the row with these values in the order.
 
         The first term of the condition restricts the first column to a range, so that an index can be used.
         """
@@ -48,7 +48,11 @@ class Order:
 
 
 def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str = "id") -> Order:
-    """Return the order for `sort=-created_at,name`. Raises `BadRequestProblem` for an unknown or repeated key."""
+    """Parse the parameter `sort` of a list, such as `-created_at,name`; a minus means descending order.
+
+    `keys` maps the allowed keys to columns. The column of the key `unique` is added at the end, so that the order is
+    complete. Raises `BadRequestProblem` for an unknown or repeated key.
+    """
     names = [part.strip() for part in text.split(",") if part.strip()]
     bare = [name.removeprefix("-") for name in names]
     if unknown := [name for name in bare if name not in keys]:
@@ -66,15 +70,18 @@ def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str =
 
 
 def make_cursor(tx: Transaction, order: Order, identity: Any, values: Sequence[Any]) -> str:
-    """Return the cursor, an opaque text, of the page after the row with these values."""
+    """Return the cursor (an opaque, signed text) for the page after the row with these values.
+
+    `identity` is JSON that distinguishes the list from all other lists.
+    """
     payload = json.dumps([order.text, _fingerprint(identity), list(values)], separators=(",", ":")).encode()
     return base64.urlsafe_b64encode(_mac(tx, payload) + payload).decode().rstrip("=")
 
 
 def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> list[Any]:
-    """Return the values of the last row of the page before the cursor.
+    """Return the values that a cursor contains: those of the last row of the previous page.
 
-    Raises `BadRequestProblem` if this server did not sign the cursor, or if the cursor is from another list.
+    Raises `BadRequestProblem` if no server of this database signed the cursor, or if the cursor is from another list.
     """
     try:
         data = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
@@ -93,7 +100,9 @@ def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> li
 
 
 def _bad_cursor() -> BadRequestProblem:
-    return BadRequestProblem("This is no cursor of this server; start again without one.", code="bad-cursor")
+    return BadRequestProblem(
+        "The cursor does not come from this server; start again without a cursor.", code="bad-cursor"
+    )
 
 
 def _fingerprint(identity: Any) -> str:
@@ -116,9 +125,11 @@ def read_page(
     """Return at most `limit` rows of `statement` after the cursor, and the cursor of the next page.
 
     `identity` is JSON that distinguishes this list from all other lists: its subject and filters. `parts` are queries
-    that each select the last column of the order. If they are given, the list contains the rows of `statement` that at
-    least one of them selects. Each part is read only up to the limit, so it should have an index that ends with the
-    order.
+    for values of the last column of the order. If there are `parts`, the list contains only the rows of `statement`
+    that at least one of them selects. Only the first rows of each part are read, so an index should contain the rows of
+    the part in the order of the list. The second result is None on the last page.
+
+    Raises `BadRequestProblem` if `limit` is out of range, or the cursor is not valid for this list.
     """
     if not 1 <= limit <= MAX_LIMIT:
         raise BadRequestProblem(f"The parameter `limit` must be between 1 and {MAX_LIMIT}.", code="bad-limit")

@@ -50,9 +50,10 @@ def put_member(
     expected_rev: ExpectedRev = None,
     absent: bool = False,
 ) -> Member:
-    """Add a member, or change the member's role. With `absent`, a user who is a member already is refused.
+    """Add a member, or change the member's role.
 
     Raises `NotFoundProblem` if there is no such user, and `ConflictProblem` if the project would lose its last owner.
+    With `absent`, raises `PreconditionFailedProblem` if the user is a member already.
     """
     project_row = lock_project(tx, project_name)
     lock_places(tx, project_row)
@@ -79,7 +80,8 @@ def write_role(
 ) -> Row[Any]:
     """Add a member, or change the member's role, without a check of rights; return the row.
 
-    A member who becomes an owner loses all roles in folders. The caller must have locked the project.
+    A member who becomes an owner loses all roles in folders. With `absent`, raises `PreconditionFailedProblem` if the
+    user is a member already. The caller must have locked the project.
     """
     which = (member.c.project_id == project_id, member.c.user_id == user_id)
     row = {"project_id": project_id, "user_id": user_id, "role": role.value, "since_us": tx.now_us}
@@ -138,7 +140,7 @@ def _forget_folder_roles(tx: Transaction, project_id: str, user_name: str) -> No
 
 
 def _withdraw_invitations(tx: Transaction, project_row: ProjectRow, user_name: str) -> None:
-    """Withdraw the invitations to a project that a user created and may no longer create."""
+    """Withdraw the invitations of a user to a project if the user may no longer invite others to it."""
     invited = invitation.c.inviter_id.in_(select(user.c.id).where(user.c.name == user_name))
     withdraw_unauthorised(tx, invitation.c.project_id == project_row.id, invited)
 

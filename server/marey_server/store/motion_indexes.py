@@ -34,9 +34,9 @@ _DIGEST_DIGITS = 64
 
 
 class FoundIndex(NamedTuple):
-    """Index of a project, and the clips that were changed, created or deleted since its inputs were read.
+    """Index of motions, and the clips that were changed, created or deleted since the request to build the index.
 
-    `heads` maps the ids of these clips to their newest revisions; 0 for a deleted clip.
+    `heads` maps the ids of these clips to the numbers of their newest revisions, or to 0 for a deleted clip.
     """
 
     item: str
@@ -47,16 +47,17 @@ class FoundIndex(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FoundClip:
-    """Clip in an answer: its path, and its newest revision."""
+    """Clip that a search has found: its path, and the number of its newest revision."""
 
     path: str
     head: int
 
 
 def find_index(tx: Transaction, project: str, index: str | None) -> FoundIndex:
-    """Return the index with an id, or else the one that was updated last.
+    """Return the index of motions with the id `index`; if it is None, the index that was updated last.
 
-    Raises `NotFoundProblem` if there is none, and `ConflictProblem` if it is too old to be searched.
+    Raises `NotFoundProblem` if there is no such index. Raises `ConflictProblem` if the index must be updated: an
+    earlier version of Marey made it, or more than `MOST_CHANGES` clips have changed since.
     """
     project_row = projects.require(tx, project)
     wanted = (item.c.project_id == project_row.id, item.c.kind == Kind.INDEX.value, item.c.deleted_us.is_(None))
@@ -87,7 +88,10 @@ def find_index(tx: Transaction, project: str, index: str | None) -> FoundIndex:
 
 
 def _changed_since(tx: Transaction, project_id: str, since_us: int) -> dict[str, int]:
-    """Return the newest revisions of the clips that changed at or after a time; 0 for deleted clips."""
+    """Return, by id, the newest revision number of each clip that changed at or after a time; 0 for deleted clips.
+
+    Raises `ConflictProblem` if there are more than `MOST_CHANGES` such clips.
+    """
     own = (item.c.project_id == project_id, item.c.kind == Kind.CLIP.value)
     changed = or_(item.c.updated_us >= since_us, item.c.deleted_us >= since_us)
     statement = select(item.c.id, item.c.head, item.c.deleted_us).where(*own, changed).limit(MOST_CHANGES + 1)
@@ -101,7 +105,10 @@ def _changed_since(tx: Transaction, project_id: str, since_us: int) -> dict[str,
 
 
 def require_all_clips(tx: Transaction, project: str, found: FoundIndex) -> None:
-    """Raise `ConflictProblem` if an index of some folders lacks clips of the project that have not changed since."""
+    """Raise `ConflictProblem` if the project has more clips than the index contains.
+
+    This is so if the index was built for some folders only, or if clips were created since it was built.
+    """
     project_row = projects.require(tx, project)
     existing = (item.c.project_id == project_row.id, item.c.kind == Kind.CLIP.value, item.c.deleted_us.is_(None))
     clips = tx.execute(select(func.count()).select_from(item).where(*existing)).scalar_one()
@@ -116,7 +123,10 @@ def require_all_clips(tx: Transaction, project: str, found: FoundIndex) -> None:
 
 
 def name_clips(tx: Transaction, project: str, ids: Collection[str]) -> dict[str, FoundClip]:
-    """Return those of the clips that exist in the project, by id."""
+    """Return the paths and newest revisions of clips, by id.
+
+    Clips that do not exist, or that the caller may not read, are left out.
+    """
     project_row = projects.require(tx, project)
     refused = reach.unreachable_items(tx, ids)
     found: dict[str, FoundClip] = {}
@@ -133,7 +143,7 @@ def name_clips(tx: Transaction, project: str, ids: Collection[str]) -> dict[str,
 
 
 class IndexFiles:
-    """Copies of the files of indexes in a folder of this server."""
+    """Folder of this server with copies of the files of indexes, from which searches read."""
 
     def __init__(self, folder: Path, *, most_bytes: int = MOST_COPIED_BYTES) -> None:
         self._folder = folder
@@ -144,7 +154,7 @@ class IndexFiles:
         return self._folder / digest.removeprefix("sha256:")
 
     def missing(self, document: MotionIndexDocument) -> list[StoredFile]:
-        """List the files of an index that have no copy; remove old copies if they do not fit.
+        """Return the files of an index that have no copy yet, and free space for them by removing old copies.
 
         Raises `TooLargeProblem` if the index is too large to be searched.
         """
@@ -170,8 +180,8 @@ class IndexFiles:
     def copy(self, tx: Transaction, stored: StoredFile) -> None:
         """Copy a file of an index that the caller may read; a copy appears only when it is complete.
 
-        Raises `NotFoundProblem` if bytes are missing, or if the file has another size than the index states: anybody
-        may write an index, and `missing` has made room for the stated size.
+        Raises `NotFoundProblem` if bytes are missing, or if the file does not have the size that the index states. An
+        index may state a wrong size, because anybody may write one, but there is only room for the stated size.
         """
         digest = stored.blob
         size = tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one()
@@ -206,7 +216,7 @@ class IndexFiles:
         return removed
 
     def _copies(self) -> list[Path]:
-        """List the complete copies; the names of copies that are being made are no digests."""
+        """Return the paths of the complete copies, whose names are digests; a copy in progress has another name."""
         if not self._folder.exists():
             return []
         return [path for path in self._folder.iterdir() if len(path.name) == _DIGEST_DIGITS]

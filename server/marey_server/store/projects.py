@@ -109,9 +109,9 @@ def require(
 ) -> ProjectRow:
     """Return the project `name` if the caller has the role and the scope that the transaction's operation declares.
 
-    If `at_least` is higher than the declared role, it is required instead. `deleted=True` looks for the project of this
-    name that was deleted last. If the operation declares `in_folders`, a role in some folder suffices, but the result
-    contains the role in the project.
+    The declaration is `tx.required_role`. If `at_least` is higher than the declared role, it is required instead. With
+    `deleted`, the function looks for the project of this name that was deleted last. If the operation declares
+    `in_folders`, the role in a single folder suffices; the result nevertheless contains the role in the project.
 
     Raises `NotFoundProblem` if the caller may not know that the project exists. Raises `ForbiddenProblem` if the caller
     lacks the role or the scope. An anonymous caller gets `UnauthenticatedProblem` instead of `ForbiddenProblem`,
@@ -203,7 +203,7 @@ def _row(row: Row[Any], role: Role, most_running: int | None, *, guest: bool) ->
 
 
 def is_visible(principal: Principal) -> ColumnElement[bool]:
-    """Return the condition for rows of `project` that are not deleted and that the caller may read.
+    """Return the SQL condition for the projects that are not deleted and that the caller may read.
 
     If the caller is an attempt of a job, the condition is always false.
     """
@@ -254,7 +254,7 @@ def list_projects(
 
 
 def read_quotas(tx: Transaction, name: str) -> ProjectQuotasInUse:
-    """Return the number of items, bytes and running jobs of a project, and the limits."""
+    """Return how many items, bytes and running jobs a project has, and how many it may have."""
     return limits.show_project_quotas(tx, require(tx, name).id)
 
 
@@ -264,7 +264,7 @@ def read_quotas(tx: Transaction, name: str) -> ProjectQuotasInUse:
 def meets_hidden(tx: Transaction, name: str, guesses_per_hour: int) -> bool:
     """Return whether a project of this name exists that the caller may not see.
 
-    Raises `TooManyRequestsProblem`, whatever the name, if the caller has tried too many names of such projects.
+    Raises `TooManyRequestsProblem`, whatever the name, if the caller has tried too many names of hidden projects.
     """
     if wait_s := rate_limits.wait_s(tx, _guess_limit(tx, guesses_per_hour)):
         raise _too_many_guesses(wait_s)
@@ -273,7 +273,7 @@ def meets_hidden(tx: Transaction, name: str, guesses_per_hour: int) -> bool:
 
 
 def count_guess(tx: Transaction, guesses_per_hour: int) -> None:
-    """Count one attempt of the caller to use the name of a hidden project.
+    """Count that the caller has tried to use the name of a hidden project, perhaps to find out whether it exists.
 
     Raises `TooManyRequestsProblem` if the caller has tried too many of these names.
     """
@@ -326,7 +326,7 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
 
 
 def _name_taken(name: str) -> ConflictProblem:
-    return ConflictProblem(f"The name {name!r} is taken by another project.", code="name-taken")
+    return ConflictProblem(f"The name {name!r} is taken by another project; choose another name.", code="name-taken")
 
 
 def change_project(tx: Transaction, name: str, request: ProjectChange, *, expected_rev: ExpectedRev) -> Project:

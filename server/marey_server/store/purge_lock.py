@@ -4,8 +4,8 @@ Such a write reads items and then stores something that refers to them: a revisi
 reading and storing, another request could delete and purge the items. So each of these writes first acquires a lock
 that excludes purges of its project. The write does so before it reads items and before it locks any row. Many such
 writes run side by side. A purge waits until the writes that hold the lock have ended, and later writes wait until the
-purge has ended. While a purge or such a write waits for this lock, it holds no row that the other side needs. So there
-are no deadlocks.
+purge has ended. While a purge or such a write waits for this lock, it has locked no row that the other side needs. So
+there are no deadlocks.
 
 A commit is prepared in one transaction and recorded in a later one. The preparation reads the time of the project's
 last purge. Recording fails if another purge has followed.
@@ -43,9 +43,9 @@ def hold_off_purges(tx: Transaction, *project_ids: str) -> None:
 
 
 def hold_off_purges_of_jobs(tx: Transaction, job_ids: Iterable[str]) -> None:
-    """Call `hold_off_purges` for the projects of jobs that this write is going to end.
+    """Prevent purges, as `hold_off_purges` does, of the projects of jobs that this write is going to end.
 
-    The end of a job can publish results, and use them as inputs of jobs that have waited for this job.
+    This is necessary because the end of a job can publish items, and use them as inputs of waiting jobs.
     """
     if not tx.is_postgres:
         return
@@ -60,7 +60,10 @@ def hold_off_purges_of_jobs(tx: Transaction, job_ids: Iterable[str]) -> None:
 
 
 def require_no_purge_since(tx: Transaction, project_id: str, last: int) -> None:
-    """Hold off purges, and raise `ConflictProblem` if the last purge of the project was not at the time `last`."""
+    """Prevent purges until this write ends, and raise `ConflictProblem` if the project was purged after `last`.
+
+    `last` is the time that `last_purge` returned when the request was prepared.
+    """
     hold_off_purges(tx, project_id)
     if last_purge(tx, project_id) != last:
         raise ConflictProblem(

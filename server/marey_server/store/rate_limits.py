@@ -25,34 +25,31 @@ FORGOTTEN_AT_ONCE = 10_000
 
 @dataclass(frozen=True, slots=True)
 class RateLimit:
-    """Limit on events with the same key: at most `burst` at once, then one per `interval_us` (microseconds)."""
+    """Limit on events with the same key: at most `burst` at once, and then one in each `interval_us` microseconds."""
 
     key: str
     burst: int
     interval_us: int
 
     def latest_us(self, now_us: int) -> int:
-        """Return the greatest `until_us` in this limit's row with which another event is still allowed at `now_us`."""
+        """Return the greatest stored time (`until_us`) with which another event is still allowed at `now_us`."""
         return now_us + (self.burst - 1) * self.interval_us
 
 
 @dataclass(frozen=True, slots=True)
 class DailyAmount(RateLimit):
-    """Limit on an amount per day, such as bytes.
+    """Limit on an amount per day, such as bytes, for one event that uses up a part of it.
 
-    An event uses up an amount, which becomes free again after `interval_us`.
+    `interval_us` is the time in microseconds after which this part is free again.
     """
 
     @classmethod
     def part(cls, key: str, amount: int, most: int) -> DailyAmount:
-        """Return the limit for an event that uses up `amount`.
-
-        `most` is the amount that is free at first, and that becomes free again in each day.
-        """
+        """Return the limit for an event that uses up `amount`; `most` is the amount per day."""
         return cls(key, burst=1, interval_us=max(1, amount * DAY_US // most))
 
     def latest_us(self, now_us: int) -> int:
-        """Return the greatest `until_us` in this limit's row with which the event is still allowed at `now_us`."""
+        """Return the greatest stored time (`until_us`) with which the event is still allowed at `now_us`."""
         return now_us + DAY_US - self.interval_us
 
 
@@ -79,7 +76,7 @@ def count(tx: Transaction, limit: RateLimit) -> int:
     return 0 if tx.execute(counted.returning(until)).first() is not None else wait_s(tx, limit)
 
 
-def take_back(tx: Transaction, limit: RateLimit) -> None:
+def uncount(tx: Transaction, limit: RateLimit) -> None:
     """Undo the count of one event, so that it does not use up the limit."""
     values = {"until_us": sign_in_limit.c.until_us - limit.interval_us}
     tx.execute(update(sign_in_limit).where(sign_in_limit.c.key == limit.key).values(**values))

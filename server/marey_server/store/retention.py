@@ -104,8 +104,8 @@ def _retire_audit_entries(database: Database, days: int) -> int:
 def _first_young_job(tx: Transaction, age_us: int) -> str:
     """Return an id that is greater than the ids of all jobs that ended more than `age_us` ago.
 
-    Ids sort by the time of creation, so a search for old jobs reads no younger ones. Ids are made with the clock of the
-    server, which may differ from that of the database; the greatest difference that is allowed for is a day.
+    Ids sort by the time of creation, so a search for old jobs need not read the ids after this one. Ids are made with
+    the clock of the server, which may differ by up to a day from the clock of the database.
     """
     return first_id_at("job", tx.now_us - age_us + DAY_US)
 

@@ -14,18 +14,18 @@ from marey_server.errors import ApiProblem, PreconditionFailedProblem
 from marey_server.store.transaction import Transaction
 
 ExpectedRev = int | frozenset[int] | None
-"""The `rev` that a writer expects, or several, of which one must match; None matches any."""
+"""The `rev` that a writer expects in the row, or several acceptable values; None accepts any `rev`."""
 
 
 def at_rev(column: Column[int], expected: ExpectedRev) -> ColumnElement[bool]:
-    """Return the SQL condition that a row has an expected `rev`, for use in the statement that changes the row."""
+    """Return the SQL condition that a row has an expected `rev`, for the UPDATE that changes the row."""
     if expected is None:
         return true()
     return column == expected if isinstance(expected, int) else column.in_(sorted(expected))
 
 
 def is_expected(rev: int, expected: ExpectedRev) -> bool:
-    """Return whether a `rev` that was read is an expected one."""
+    """Return whether `rev` is the expected value or one of several; always true if None is expected."""
     return expected is None or (rev == expected if isinstance(expected, int) else rev in expected)
 
 

@@ -49,7 +49,7 @@ def in_lists(values: Iterable[T]) -> Iterator[list[T]]:
 
 @dataclass(frozen=True)
 class Quotas:
-    """Greatest numbers of things that one user, or one project, may have; functions of `store.quotas` check them."""
+    """Quotas of the server: how many things, or bytes, one user or one project may have (see `store.quotas`)."""
 
     user_uploads: int = 1000
     user_upload_bytes: int = 128 * 2**30
@@ -84,11 +84,11 @@ class Observer:
         """Count an attempt whose lease has expired."""
 
     def observe_claims(self, delays_s: Sequence[float]) -> None:
-        """Record for how many seconds each job of a claim could have run before."""
+        """Record, for each job of a claim, how many seconds the job was ready before the claim."""
 
 
 def _untraced(_principal: Principal) -> None:
-    """Return None, because jobs belong to no trace."""
+    """Return None as the trace header of new jobs: they belong to no trace."""
 
 
 IGNORED = Observer()
@@ -96,7 +96,7 @@ IGNORED = Observer()
 
 
 class Transaction:
-    """Transaction with the principal on whose behalf it runs."""
+    """Database transaction that runs on behalf of a principal, such as a user, a worker or an attempt of a job."""
 
     def __init__(
         self,
@@ -182,9 +182,9 @@ class Transaction:
         statement.run_each(self.connection, many)
 
     def insert_or_ignore(self, table: Table, row: Mapping[str, Any] | None = None) -> postgresql.Insert | sqlite.Insert:
-        """Return an INSERT that does nothing if a unique index refuses the row; `returning` then gives no row.
+        """Return an INSERT that skips rows that violate a unique index; `returning` gives no row for them.
 
-        Without `row`, the rows are given at execution.
+        Without `row`, the rows are passed to `execute`.
         """
         return self.insert_into(table, row).on_conflict_do_nothing()
 
@@ -194,9 +194,10 @@ class Transaction:
         return added if row is None else added.values(**row)
 
     def lock(self, name: str, *, shared: bool = False) -> None:
-        """Acquire the lock `name` and hold it until the end of the write; `shared` locks exclude only exclusive locks.
+        """Acquire the lock `name`, and hold it until the transaction ends.
 
-        On SQLite, nothing is locked, because there is only one writer at a time.
+        Several transactions can hold a lock at the same time if all of them acquire it with `shared`. On SQLite,
+        nothing is locked, because there is only one writer at a time.
         """
         if not self.is_postgres or (name, shared) in self._locks:
             return
@@ -238,7 +239,7 @@ class Transaction:
         self._after_commit.append(action)
 
     def run_after_commit(self) -> None:
-        """Run the actions registered with `after_commit`, and announce that there are events."""
+        """Run the actions that were passed to `after_commit`; if events were recorded, announce them."""
         for action in self._after_commit:
             action()
         if self._has_emitted:

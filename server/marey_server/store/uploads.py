@@ -27,7 +27,7 @@ from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.database.clock import DAY_US
 from marey_server.store.ids import new_id
 from marey_server.store.quotas.counting import require_room
-from marey_server.store.quotas.daily import count_sent, take_back_sent
+from marey_server.store.quotas.daily import count_sent, uncount_sent
 from marey_server.store.tables import blob, job, upload, upload_chunk
 from marey_server.store.transaction import Transaction
 
@@ -56,12 +56,15 @@ class StoredUpload:
 
     @property
     def is_received(self) -> bool:
-        """Return whether all bytes were received, and the upload was not stored as a blob or refused yet."""
+        """Whether all bytes were received, and `finish` was not called yet."""
         return self.offset == self.length and self.digest is None and self.actual_digest is None
 
 
 def create_upload(tx: Transaction, length: int, *, digest: str | None = None) -> StoredUpload:
-    """Create an upload of `length` bytes; if `digest` is given, the bytes must have it."""
+    """Create an upload of `length` bytes; if `digest` is given, the bytes must have this digest.
+
+    Raises `TooLargeProblem` if `length` is not between 1 and `MAX_UPLOAD_BYTES`.
+    """
     sender = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
         raise TooLargeProblem(f"The size of an upload must be 1 to {MAX_UPLOAD_BYTES} bytes.")
@@ -78,7 +81,7 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
 
 
 def read_upload(tx: Transaction, upload_id: str) -> StoredUpload:
-    """Return the state of an upload of the caller. Raises `NotFoundProblem`."""
+    """Return the state of an upload of the caller. Raises `NotFoundProblem` if it does not exist."""
     return _shown(_find(tx, upload_id))
 
 
@@ -92,7 +95,8 @@ def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredU
         raise _elsewhere(found.offset)
     if offset + len(data) > found.length:
         raise TooLargeProblem(
-            f"The upload was created for {found.length} bytes, but would have {offset + len(data)} after this piece."
+            f"The upload was created for {found.length} bytes, but would have {offset + len(data)} after this piece; "
+            f"send at most {found.length - offset} bytes."
         )
     if not data:
         return _shown(found)
@@ -142,14 +146,14 @@ def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> S
             tx.blobs.adopt(copy, digest)
         blobs.add_holder(tx, digest, _places(found))
         if not is_new:
-            take_back_sent(tx, found.length)
+            uncount_sent(tx, found.length)
     faults.point("upload.finish.before_commit")
     tx.after_commit(lambda: faults.point("upload.finish.after_commit"))
     return _shown(_find(tx, upload_id))
 
 
 def require_intact(found: StoredUpload) -> None:
-    """Raise `InvalidProblem` if the bytes do not have the announced digest."""
+    """Raise `InvalidProblem` if the bytes of a finished upload do not have the announced digest."""
     if found.actual_digest is not None:
         detail = (
             f"The bytes have the digest {found.actual_digest}, not {found.announced}. Delete this upload and "
@@ -163,7 +167,7 @@ def abandon(tx: Transaction, upload_id: str) -> None:
     found = _find(tx, upload_id)
     dropped = update(upload).where(upload.c.id == found.id, upload.c.dropped.is_(False)).values(dropped=True)
     for row in tx.execute(dropped.returning(upload.c.length, upload.c.offset)).all():
-        take_back_sent(tx, row.length - row.offset)
+        uncount_sent(tx, row.length - row.offset)
 
 
 # -- garbage ----------------------------------------------------------------------------------------------------------
@@ -197,7 +201,10 @@ def delete_dropped(tx: Transaction, limit: int) -> int:
 
 
 def _sender(tx: Transaction) -> dict[str, Any]:
-    """Return the columns of a new upload that record the sender, and the projects in which the bytes can be used."""
+    """Return the columns of a new upload that name the sender, and the projects in which the bytes can be used.
+
+    Raises `ForbiddenProblem` if the caller may not upload data.
+    """
     caller = tx.principal
     blobs.require_sender(caller)
     if caller.kind == "attempt":

@@ -66,14 +66,17 @@ def _insert(
         "id": user_id or new_id("user"), "name": name, "display_name": display_name, "password_hash": password_hash,
         "administrator": administrator, "disabled": False, "created_us": tx.now_us, "rev": 1,
     }  # fmt: skip
-    with taken(ConflictProblem(f"The name {name!r} is taken by another user.", code="name-taken")):
+    with taken(ConflictProblem(f"The name {name!r} is taken by another user; choose another name.", code="name-taken")):
         made = tx.execute(insert(user).values(**row).returning(*user.c)).one()
     tx.audit("user.created", made.id, about=name, administrator=administrator)
     return _shown(made)
 
 
 def find_user(tx: Transaction, name: str) -> User:
-    """Return a user. Only administrators may read other users. Raises `NotFoundProblem`."""
+    """Return a user. Raises `NotFoundProblem` if the caller may not read the user, or if there is no such user.
+
+    Users may read themselves, and administrators all users.
+    """
     if tx.principal.kind != "user" or tx.principal.user_name != name:
         require_administrator(tx.principal, hidden=_no_user(name))
     row = tx.execute(select(user).where(user.c.name == name)).first()
@@ -127,8 +130,9 @@ def change_user(
     """Change a user: administrators may change all fields, users their own display name and password.
 
     A new password ends the user's sessions, unless the request says which tokens end. `password_hash` is the hash of
-    `request.password`. `verified_hash` is the hash against which `request.current_password` was checked. The change is
-    refused if the user has another hash by then.
+    `request.password`. `verified_hash` is the stored hash that `request.current_password` matched, or None. Raises
+    `ForbiddenProblem` if users change their own password without the current one, and `PreconditionFailedProblem` if
+    the stored hash is another one now.
     """
     itself = _require_changes(tx.principal, name, request)
     which: tuple[ColumnElement[bool], ...] = (user.c.name == name,)
@@ -160,7 +164,7 @@ def change_user(
 
 
 def _pause_schedules(tx: Transaction, user_id: str) -> None:
-    """Pause the schedules of a user, because somebody else may have created them with a token of the user."""
+    """Pause all schedules of a user, because somebody who had stolen a token of the user may have created them."""
     reason = "Paused, because all tokens of the author were revoked, or the author was disabled."
     which = (schedule.c.author_id == user_id, schedule.c.due_us.is_not(None))
     tx.execute(update(schedule).where(*which).values(due_us=None, problem=reason, rev=schedule.c.rev + 1))
@@ -227,9 +231,9 @@ def stored_hash(tx: Transaction, name: str) -> str | None:
 
 
 def authenticated(tx: Transaction, name: str, verified_hash: str) -> Principal:
-    """Return the principal of a user whose password matched `verified_hash`, which must still be the stored hash.
+    """Return the principal of a user whose password matched `verified_hash`.
 
-    Raises `UnauthenticatedProblem`.
+    Raises `UnauthenticatedProblem` if this is not the stored hash any more, or if the user is disabled.
     """
     statement = select(user).where(user.c.name == name, user.c.password_hash == verified_hash)
     row = tx.execute(statement.where(user.c.disabled.is_(False))).first()
@@ -239,7 +243,10 @@ def authenticated(tx: Transaction, name: str, verified_hash: str) -> Principal:
 
 
 def active_principal(tx: Transaction, user_id: str) -> Principal:
-    """Return the principal of a user whom an identity provider has signed in. Raises `ForbiddenProblem` if disabled."""
+    """Return the principal of a user whom an identity provider has signed in.
+
+    Raises `ForbiddenProblem` if the user is disabled.
+    """
     row = tx.execute(select(user).where(user.c.id == user_id, user.c.disabled.is_(False))).first()
     if row is None:
         raise ForbiddenProblem("Your user is disabled; ask an administrator.", code="user-disabled")
@@ -256,7 +263,7 @@ def _principal(row: Row[Any]) -> Principal:
 
 
 def _reach(*, administrator: bool) -> tuple[str, ...]:
-    """Return the scopes of a user who has signed in."""
+    """Return the scopes of a user who has signed in: all, but `admin` only for an administrator."""
     return tuple(scope.value for scope in Scope if scope is not Scope.ADMIN or administrator)
 
 

@@ -17,7 +17,7 @@ OUTPUTS_TO_COMMIT = "outputs to commit"
 """Topic that is announced when the tasks of a job have ended and the server must commit their many outputs."""
 
 NUMBERED_EVENTS = "numbered events"
-"""Topic that is announced when events can be read that have not been announced before."""
+"""Topic that is announced when new events can be read. On Postgres, this is when their numbers are assigned."""
 
 
 def events_topic(project_id: str) -> str:
@@ -36,7 +36,7 @@ def work_topic(kind: str) -> str:
 
 
 class Wakeups:
-    """Wake-ups by topic: threads announce a topic, and coroutines wait for it."""
+    """Wake-ups by topic: any thread can announce a topic, and coroutines wait until it is announced."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -75,7 +75,7 @@ class Wakeups:
 
 
 class Listener:
-    """Coroutine that waits, and the topics that wake it."""
+    """Wait of one coroutine: `wait` suspends the coroutine, and `wake` resumes it."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop

@@ -118,7 +118,7 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
 @pytest.mark.parametrize(
     ("arguments", "status", "told"),
     [
-        (["mv", "lab/raw/a", "lab/raw/b"], 1, "lab/raw/a: There is already a clip with this name in the collection."),
+        (["mv", "lab/raw/a", "lab/raw/b"], 1, "lab/raw/a: There is already a clip with this name in the collection;"),
         (["mv", "lab/raw/a", "studio/a"], 2, "lab/raw/a cannot be moved to another project"),
         (["mv", "lab/raw/nobody", "lab/raw/b"], 2, "there is no item or folder at lab/raw/nobody"),
         (["mv", "lab/raw/a"], 2, "give the items to move and the destination"),

@@ -77,7 +77,7 @@ def test_strangers_at_many_addresses_do_not_keep_the_owner_out_of_a_known_addres
 ) -> None:
     home = SignInTry("ann", "198.51.100.1", PER_MINUTE)
     database.write(ANONYMOUS, sign_ins.count, home)
-    database.write(ANONYMOUS, sign_ins.forgive, home)
+    database.write(ANONYMOUS, sign_ins.record_success, home)
     refusals = [guess(database, address=f"203.0.113.{number}") for number in range(MORE_FOR_MANY * PER_MINUTE + 1)]
     assert refusals == [None] * MORE_FOR_MANY * PER_MINUTE + ["account"]
     assert guess(database, address="192.0.2.1") == "account"
@@ -103,7 +103,7 @@ def test_right_passwords_use_nothing_up(database: Database) -> None:
     attempt = SignInTry("ann", "10.0.0.1", PER_MINUTE)
     for _ in range(3 * PER_MINUTE):
         database.write(ANONYMOUS, sign_ins.count, attempt)
-        database.write(ANONYMOUS, sign_ins.forgive, attempt)
+        database.write(ANONYMOUS, sign_ins.record_success, attempt)
     assert guess(database) is None
 
 

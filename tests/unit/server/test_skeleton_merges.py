@@ -143,7 +143,7 @@ def test_only_documents_of_what_moves_are_read_and_not_before_the_limits_are_che
 
         return loading
 
-    monkeypatch.setattr(skeleton_merges, "_users", note(skeleton_merges._users))
+    monkeypatch.setattr(skeleton_merges, "_items_using", note(skeleton_merges._items_using))
     monkeypatch.setattr(skeleton_merges, "MOST_MOVED", 1)
     with pytest.raises(TooLargeProblem, match="changes at most 1 clips"):
         merge(lab)

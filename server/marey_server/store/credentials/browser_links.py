@@ -43,7 +43,11 @@ class IssuedSession(NamedTuple):
 
 
 def create_link(tx: Transaction, project: str) -> BrowserLink:
-    """Create a link to a project that the caller may read. Raises `NotFoundProblem` and `QuotaExceededProblem`."""
+    """Create a link to a project that the caller may read.
+
+    Raises `NotFoundProblem` if the caller may not see the project, and `QuotaExceededProblem` if the caller has
+    `MOST_OF_USER` links and sessions already.
+    """
     projects.require(tx, project)
     own = tokens.lock_own(tx)
     mine = and_(token.c.user_id == own.user_id, token.c.name == _NAME, token.c.session.is_(True))
@@ -68,15 +72,16 @@ def create_link(tx: Transaction, project: str) -> BrowserLink:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try to redeem the code of a link, which must be counted before the code is checked."""
+    """Return the sign-in try for the code of a link; the caller must count the try before checking the code."""
     prefix, _ = split_view_code(code) or ("", "")
     return SignInTry(f"view {prefix}", address, per_minute)
 
 
 def redeem_link(tx: Transaction, code: str, attempt: SignInTry) -> IssuedSession:
-    """Begin the session of a link, which cannot be used again. `attempt` is the counted try.
+    """Begin the session of a link; the link cannot be used again.
 
-    Raises `NotFoundProblem`, and `ForbiddenProblem` if the user is disabled.
+    `attempt` is the counted try, which no longer counts afterwards. Raises `NotFoundProblem` if the code is wrong,
+    expired or used, and `ForbiddenProblem` if the user is disabled.
     """
     prefix, secret = split_view_code(code) or ("", "")
     which = token.c.prefix == prefix, token.c.secret_hash == _hash(secret), token.c.expires_us > tx.now_us
@@ -93,7 +98,7 @@ def redeem_link(tx: Transaction, code: str, attempt: SignInTry) -> IssuedSession
     if tx.execute(begun).rowcount != 1:
         raise _invalid_link()
     tx.principal = users.active_principal(tx, row.user_id)
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     (project,) = projects_of(row.scopes, "read")
     return IssuedSession(BrowserSession(project=project, expires_at=datetime_of(expires_us)), issued.text)
 
@@ -112,7 +117,7 @@ def end_session(tx: Transaction, secret: str) -> None:
 
 
 def _session_of(tx: Transaction, secret: str) -> Principal | None:
-    """Return the principal of a session, or None if the text is no token of a user, or not valid any more."""
+    """Return the principal of a session; None if `secret` is not a valid token, or not the token of a user."""
     try:
         found = tokens.resolve_token(tx, secret)
     except UnauthenticatedProblem:
@@ -121,7 +126,10 @@ def _session_of(tx: Transaction, secret: str) -> Principal | None:
 
 
 def _hash(secret: str) -> str:
-    """Return the stored hash of the secret of a code; it differs from that of a token with the same secret."""
+    """Return the hash that is stored for the secret of a link's code.
+
+    A token with the same secret would have another hash, so a code is never accepted as a token.
+    """
     return hash_secret(f"{VIEW_PREFIX}{secret}")
 
 

@@ -38,9 +38,10 @@ _USER_NAME = re.compile(UserName.__metadata__[0].pattern)
 
 
 def begin(tx: Transaction, request: BrowserSignInCreate, address: str, per_minute: int, longest_s: int) -> str:
-    """Begin a sign-in, and return its id. One address may begin at most `per_minute` sign-ins a minute.
+    """Begin a sign-in, and return its id. Its token will be valid for `longest_s` seconds at most.
 
-    Raises `TooManyRequestsProblem`, and `UnavailableProblem` if too many sign-ins of all addresses are not complete.
+    Raises `TooManyRequestsProblem` if the address begins more than `per_minute` sign-ins a minute, and
+    `UnavailableProblem` if `MOST_WAITING` sign-ins of all addresses are not complete.
     """
     if wait_s := rate_limits.count(tx, RateLimit(key_of("browser", address), per_minute, MINUTE_US // per_minute)):
         raise TooManyRequestsProblem(
@@ -70,7 +71,10 @@ def invalid_sign_in() -> NotFoundProblem:
 
 
 def open_in_browser(tx: Transaction, sign_in_id: str, cookie: str, state: str) -> None:
-    """Bind a sign-in to the browser that has a cookie. Raises `NotFoundProblem` if a browser has opened it already."""
+    """Bind a sign-in to the browser that has `cookie`; the provider will send `state` back with this browser.
+
+    Raises `NotFoundProblem` if the sign-in does not exist, has expired, or was opened in a browser already.
+    """
     unopened = browser_sign_in.c.browser_hash.is_(None), browser_sign_in.c.expires_us > tx.now_us
     bound = update(browser_sign_in).where(browser_sign_in.c.id == sign_in_id, *unopened)
     if tx.execute(bound.values(browser_hash=hash_secret(cookie), state_hash=hash_secret(state))).rowcount != 1:
@@ -78,8 +82,9 @@ def open_in_browser(tx: Transaction, sign_in_id: str, cookie: str, state: str) -
 
 
 def use_state(tx: Transaction, state: str, cookie: str) -> tuple[str, int | None]:
-    """Use up the state that the provider sent back with the browser; return the sign-in's id and port.
+    """Use up the state that the provider sent back with the browser; return the id and the port of the sign-in.
 
+    The port is the one at which the program on the person's machine waits for the code, or None if it does not wait.
     Raises `NotFoundProblem` if the state is not valid in the browser with this cookie.
     """
     which = (
@@ -95,10 +100,12 @@ def use_state(tx: Transaction, state: str, cookie: str) -> tuple[str, int | None
 
 
 def confirm(tx: Transaction, sign_in_id: str, code: str, person: Person, *, creates_users: bool) -> str:
-    """Record that the provider has identified a person, who gets `code`; return the name of the person's user.
+    """Record that the identity provider has identified a person; return the name of the person's user.
 
-    An unknown person becomes a new user if `creates_users` is true. Raises `ForbiddenProblem` if the person has no
-    user or a disabled one, `ConflictProblem` if the name of the new user is taken, and `NotFoundProblem`.
+    The browser then gets `code`, with which the program completes the sign-in. If `creates_users` is true, a new user
+    is created for a person who is not linked with a user. Raises `ForbiddenProblem` if the person has no user, or a
+    disabled user. Raises `ConflictProblem` if the name of the new user is taken, and `NotFoundProblem` if the sign-in
+    cannot continue.
     """
     found = identities.find_identity(tx, person.issuer, person.subject)
     if found is None and not creates_users:
@@ -125,7 +132,10 @@ def confirm(tx: Transaction, sign_in_id: str, code: str, person: Person, *, crea
 
 
 def _name_of(claim: str | None) -> str:
-    """Return the name of a new user: the part before @ of a claim, in lower case. Raises `ForbiddenProblem`."""
+    """Return the name of a new user, from a claim of the identity provider: the part before @, in lower case.
+
+    Raises `ForbiddenProblem` if the result is no valid user name.
+    """
     name = (claim or "").partition("@")[0].lower()
     if not _USER_NAME.fullmatch(name):
         raise ForbiddenProblem(
@@ -137,9 +147,10 @@ def _name_of(claim: str | None) -> str:
 
 
 def redeem(tx: Transaction, sign_in_id: str, request: BrowserSignInCode, attempt: SignInTry) -> NewToken:
-    """Return the token of a sign-in for its code and verifier; this ends the sign-in.
+    """End a sign-in whose code and verifier are given, and return the token.
 
-    `attempt` is the counted try. Raises `NotFoundProblem`, and `ForbiddenProblem` if the user is disabled.
+    `attempt` is the counted try, which no longer counts afterwards. Raises `NotFoundProblem` if the code or the
+    verifier is wrong or the sign-in has expired, and `ForbiddenProblem` if the user is disabled.
     """
     which = (
         browser_sign_in.c.id == sign_in_id,
@@ -153,7 +164,7 @@ def redeem(tx: Transaction, sign_in_id: str, request: BrowserSignInCode, attempt
         raise invalid_sign_in()
     owner = select(identity.c.user_id).where(identity.c.id == row.identity_id)
     tx.principal = users.active_principal(tx, tx.execute(owner).scalar_one())
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     return tokens.create_session(tx, row.lifetime_s)
 
 

@@ -33,7 +33,10 @@ MOST_OF_USER = 20
 def list_identities(
     tx: Transaction, name: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """List the identities of a user. Only administrators may read other users' identities. Raises `NotFoundProblem`."""
+    """List the identities of a user. Only administrators may read other users' identities.
+
+    Raises `NotFoundProblem` if the caller may not read the user, or if there is no such user.
+    """
     if not scopes.allows(tx.principal.scopes, "read"):  # a token for one project shows nothing about its user
         raise ForbiddenProblem(
             "This request needs a token with the scope 'read' for all projects.", code="insufficient-scope"
@@ -48,8 +51,9 @@ def list_identities(
 def link_identity(tx: Transaction, name: str, issuer: str | None, subject: str) -> Identity:
     """Let a person at an identity provider sign in as a user. Only administrators may do this.
 
-    If the person is linked with this user already, nothing changes. Raises `NotFoundProblem`, and `ConflictProblem` if
-    the person is linked with another user.
+    If the person is linked with this user already, nothing changes. Raises `InvalidProblem` if `issuer`, the address of
+    the provider, is None. Raises `NotFoundProblem` if there is no such user, and `ConflictProblem` if the person is
+    linked with another user.
     """
     require_administrator(tx.principal)
     user_id = users.find_user(tx, name).id
@@ -79,7 +83,8 @@ def insert_identity(tx: Transaction, user_id: str, name: str, person: Person) ->
     """
     present = tx.execute(select(func.count()).where(identity.c.user_id == user_id)).scalar_one()
     if present >= MOST_OF_USER:
-        raise QuotaExceededProblem(f"A user can have at most {MOST_OF_USER} identities.", code="quota-exceeded")
+        detail = f"A user can have at most {MOST_OF_USER} identities; remove one first (`marey user unlink`)."
+        raise QuotaExceededProblem(detail, code="quota-exceeded")
     row = {
         "id": new_id("identity"), "user_id": user_id, "issuer": person.issuer, "subject": person.subject,
         "created_us": tx.now_us,
@@ -97,7 +102,7 @@ def _linked_already() -> ConflictProblem:
 def unlink_identity(tx: Transaction, name: str, identity_id: str) -> None:
     """End the link of an identity with a user, and all sign-ins of the user. Only administrators may do this.
 
-    Raises `NotFoundProblem`.
+    Raises `NotFoundProblem` if the user has no such identity.
     """
     require_administrator(tx.principal)
     user_id = users.find_user(tx, name).id

@@ -1,4 +1,4 @@
-"""Secret key of all servers that share a database: it shows that a server has issued a cursor or a token."""
+"""Secret key that all servers of a database share; with it, a server recognizes cursors and tokens that it issued."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def read_server_key(tx: Transaction) -> bytes:
 
 
 def read_seal_key(tx: Transaction) -> bytes:
-    """Return the key with which the tokens of attempts are sealed."""
+    """Return the key with which servers sign the tokens of attempts, and recognize the tokens that they signed."""
     return hmac.digest(read_server_key(tx), b"tokens of attempts", "sha256")
 
 

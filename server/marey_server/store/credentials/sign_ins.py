@@ -24,10 +24,10 @@ from marey_server.store.tables import sign_in_limit
 from marey_server.store.transaction import Transaction
 
 MORE_FOR_MANY = 10
-"""Limit of one address for all accounts, as a multiple of `per_minute`.
+"""Number by which `per_minute` is multiplied for the limit of one address with all accounts.
 
-The limit of one account for all unknown addresses allows the same number of tries at once, but then only `per_minute`
-tries a minute.
+The limit of one account from all unknown addresses together allows the same number of tries at once, and then
+`per_minute` tries a minute.
 """
 KNOWN_FOR_US = 90 * DAY_US
 """Time for which an address is known after a sign-in."""
@@ -52,7 +52,7 @@ class SignInTry:
 
 
 def is_known(tx: Transaction, attempt: SignInTry) -> bool:
-    """Return whether somebody has signed in to the account from this address in the last `KNOWN_FOR_US`."""
+    """Return whether somebody signed in to the account from this address in the last `KNOWN_FOR_US` microseconds."""
     statement = select(sign_in_limit.c.until_us).where(sign_in_limit.c.key == _known_key(attempt))
     return int(tx.execute(statement).scalar() or 0) > tx.now_us
 
@@ -67,18 +67,18 @@ def count(tx: Transaction, attempt: SignInTry) -> None:
             raise too_many_sign_ins(scope, wait_s)
 
 
-def forgive(tx: Transaction, attempt: SignInTry) -> None:
+def record_success(tx: Transaction, attempt: SignInTry) -> None:
     """Remove a try with the right password from the counts, and remember the client's address as known."""
-    take_back(tx, attempt)
+    uncount(tx, attempt)
     row = {"key": _known_key(attempt), "until_us": tx.now_us + KNOWN_FOR_US}
     remembered = tx.insert_into(sign_in_limit, row)
     tx.execute(remembered.on_conflict_do_update(index_elements=["key"], set_={"until_us": row["until_us"]}))
 
 
-def take_back(tx: Transaction, attempt: SignInTry) -> None:
+def uncount(tx: Transaction, attempt: SignInTry) -> None:
     """Remove a try from the counts, because its password or code was right."""
     for limit, _scope in _limits(attempt, known=is_known(tx, attempt)):
-        rate_limits.take_back(tx, limit)
+        rate_limits.uncount(tx, limit)
 
 
 def _limits(attempt: SignInTry, *, known: bool) -> Iterator[tuple[RateLimit, LimitScope]]:

@@ -192,7 +192,12 @@ def _insert(
 
 
 def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | None:
-    """Return the labels to which a new token is bound: the requested ones, or else the labels of the caller's token."""
+    """Return the labels to which a new token is bound; None if it is not bound to labels.
+
+    They are the requested labels. By default, a token that can claim jobs gets the labels of the caller's token. Raises
+    `InvalidProblem` if a token that cannot claim jobs is to have labels, and `ForbiddenProblem` for a label that the
+    caller's token does not allow.
+    """
     claims_jobs = scopes.reaches_somewhere(request.scopes, "work")
     if request.labels is None:
         return tx.principal.labels if claims_jobs else None
@@ -281,7 +286,9 @@ def _id_of(tx: Transaction, name: str) -> str:
 
 
 def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) -> None:
-    """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
+    """Revoke a token of the caller; administrators may revoke any token.
+
+    Raises `NotFoundProblem` if there is no such token that the caller may revoke.
 
     With `with_created`, also revoke the successors and predecessors of this token, all tokens that were created with
     any of these, and so on.
@@ -298,7 +305,9 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
         which = and_(which, token.c.user_id == principal.user_id)
     found = tx.execute(select(token.c.user_id, token.c.created_by, token.c.successor_of).where(which)).first()
     if found is None:
-        raise NotFoundProblem(f"There is no token {token_id!r} that you may revoke.", code="no-token")
+        raise NotFoundProblem(
+            f"There is no token {token_id!r} that you may revoke; `marey token ls` lists your tokens.", code="no-token"
+        )
     _lock_tokens(tx, found.user_id)
     if with_created:
         _revoke(tx, token.c.id.in_(_connected_with(which)))
@@ -347,7 +356,10 @@ def revoke_named(tx: Transaction, name: str) -> None:
 
 
 def end_tokens(tx: Transaction, user_id: str, which: EndTokens) -> None:
-    """Revoke tokens of a user, except the token of this request. Does not check whether the principal may do this."""
+    """Revoke the tokens of a user that `which` selects (none, sessions or all), except the token of this request.
+
+    Does not check whether the principal may do this.
+    """
     if which is EndTokens.NONE:
         return
     others = and_(token.c.user_id == user_id, token.c.id != (tx.principal.token_id or ""))

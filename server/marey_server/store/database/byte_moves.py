@@ -26,7 +26,7 @@ def run_and_move(
     run: Callable[[Callable[[Transaction], T]], T],
     function: Callable[[Transaction], T],
 ) -> T:
-    """Call `run(function)`, and call it again after each move of bytes that the function needs; return the last result.
+    """Return the result of `run(function)`; if the function needs bytes moved, move them and repeat the call.
 
     The bytes are moved to or from object storage in the calling thread.
     """

@@ -54,7 +54,10 @@ MOVING_THREADS = 16
 RESERVED_THREADS = 3
 """Number of threads, and of connections, for short transactions that must not wait for other transactions."""
 SHARED_BY_ALL = 2
-"""Greatest number of ordinary threads that one client may use all at once; with more threads, one is left to others."""
+"""Greatest number of ordinary threads of which one client may use all at the same time.
+
+If there are more threads, one client may use all but one of them.
+"""
 
 
 class Database:
@@ -108,7 +111,7 @@ class Database:
 
     @property
     def lanes(self) -> dict[str, Lane | WriteLane]:
-        """The lanes by name."""
+        """Lanes of this process by name: groups of threads that run the calls for this database."""
         lanes: dict[str, Lane | WriteLane] = {"database": self._ordinary, "database-reserved": self._reserved}
         if isinstance(self.blobs, ObjectBlobs):
             lanes["object-storage"] = self._moving
@@ -284,7 +287,10 @@ class Database:
         function: Callable[[Transaction], T],
         submit: Callable[[Callable[[Transaction], T]], Future[T]],
     ) -> Future[T]:
-        """Submit a function to a lane; it uses no thread of the lane and no connection while bytes are moved for it."""
+        """Submit a function to a lane, and return the future of the result.
+
+        While bytes are moved for the function, it occupies no connection and no thread of the lane.
+        """
         if not isinstance(self.blobs, ObjectBlobs):
             return submit(function)
         return MovingCall(self.blobs, self._moving, client, function, submit).begin()
@@ -296,13 +302,13 @@ class Database:
     def submit_signed_url(self, object_name: str, valid_s: int) -> Future[str]:
         """Sign a URL with which anybody can read an object for `valid_s` seconds; return the future of the URL.
 
-        The blobs of the database must be in object storage.
+        May be called only if the settings name a bucket of an object storage.
         """
         assert isinstance(self.blobs, ObjectBlobs)
         return self.submit_move(partial(self.blobs.storage.signed_url, object_name, valid_s))
 
     async def notifications(self, channel: str) -> AsyncGenerator[None]:
-        """Listen to a channel of Postgres: yield once when the server listens, and then after each notification.
+        """Listen to a channel of Postgres: yield once when the connection listens, and then after each notification.
 
         The connection is not taken from the pool. Raises `UnavailableProblem` if it breaks.
         """

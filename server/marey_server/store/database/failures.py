@@ -15,7 +15,7 @@ WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
 """Greatest number of runs of a read; only a broken connection makes it run again, at once, on a new connection."""
 FAILURES = (exc.DBAPIError, exc.TimeoutError, OSError, OverflowError, UnicodeEncodeError)
-"""Errors with which a transaction can fail."""
+"""Types of the errors that the database, its driver or the connection raises during a transaction."""
 
 
 def worth_retrying(error: Exception) -> bool:
@@ -41,16 +41,22 @@ def translated(error: Exception) -> Exception:
     """
     if isinstance(error, OSError):
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        return StorageFullProblem("The disk has no space left; nothing was written.") if full else error
+        detail = "The disk of the server has no space left; nothing was written. Ask the operator to free space."
+        return StorageFullProblem(detail) if full else error
     if isinstance(error, exc.TimeoutError):
-        return no_answer("All connections to the database are in use; nothing was written.")
+        return no_answer("All connections to the database are in use; nothing was written. Try again.")
     if isinstance(error, OverflowError | UnicodeEncodeError | exc.DataError):
-        return InvalidProblem("The request contains a number or text that the database cannot store.", code="bad-value")
+        return InvalidProblem(
+            "The request contains a number or text that the database cannot store, such as an integer of more than 64 "
+            "bits or a text with the character NUL.",
+            code="bad-value",
+        )
     if not isinstance(error, exc.DBAPIError):
         return error
     message = str(error.orig)
     if "disk is full" in message or getattr(error.orig, "sqlstate", None) == "53100":
-        return StorageFullProblem("The disk of the database has no space left; nothing was written.")
+        detail = "The disk of the database has no space left; nothing was written. Ask the operator to free space."
+        return StorageFullProblem(detail)
     if isinstance(error, exc.OperationalError) and not message.startswith(("no such", "near ")):  # faults of the server
         return no_answer("The database does not answer; nothing was written. Try again.")
     return error

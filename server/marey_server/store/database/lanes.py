@@ -34,9 +34,12 @@ class Client:
 
     key: str
     known: bool = True
-    """Whether the client has a token that was accepted before or issued to an attempt, and is not often refused."""
+    """Whether the client's token was accepted before or issued to an attempt; false for clients often refused."""
     is_gone: Callable[[], bool] = bool
-    """Returns whether the client has closed the connection; its queued calls then do not begin, and its reads stop."""
+    """Function that returns whether the client has closed the connection.
+
+    If so, queued calls of the client do not begin, and running reads stop before their next statement.
+    """
 
     def require_present(self) -> None:
         """Raise `ClientGoneProblem` if the client has closed the connection."""

@@ -95,7 +95,7 @@ def run_together(connection: Connection, runs: Sequence[tuple[Prepared, Paramete
 def padded(values: Iterable[T]) -> list[T]:
     """Extend a list for `IN` to a length that is a power of two, by repeating its last value.
 
-    So a statement is compiled only for a few lengths.
+    Statements are compiled once for each length of a list, so padded lists need only a few compilations.
     """
     known = list(values)
     return known + known[-1:] * ((1 << max(len(known) - 1, 0).bit_length()) - len(known))
@@ -133,7 +133,7 @@ class _Form:
     to_row: Convert | None
 
     def values(self, parameters: Parameters) -> Any:
-        """Return the parameters in the form that the driver takes."""
+        """Return the parameters as the driver takes them: a tuple in the order of the text, or a mapping by name."""
         named = {**self.constants, **parameters}
         for name, members in self.expansion.items():
             named.update(_members(members, named.pop(name)))

@@ -30,7 +30,7 @@ MOST_RESERVED = 12
 
 @dataclass(frozen=True, slots=True)
 class _Write:
-    """A queued write and the future of its result."""
+    """Queued write, and the future of its result."""
 
     principal: Principal
     function: Callable[[Transaction], Any]

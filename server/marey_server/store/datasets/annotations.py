@@ -83,9 +83,9 @@ class AnnotationMerger:
         ]
 
     def _find_documents(self, wanted: Iterable[str]) -> dict[str, str]:
-        """Return the digests of the documents of annotation revisions, by the content digests of the revisions.
+        """Find the annotation revisions with the content digests `wanted`, and return the digests of their documents.
 
-        `wanted` are the content digests; revisions that the project does not have are left out.
+        The keys of the result are the content digests. Revisions that the project does not have are left out.
         """
         held = revisions_with(self._tx, self._project_id, wanted)
         parts = read_part_digests(self._tx, set(held.values()))
@@ -121,9 +121,9 @@ class AnnotationMerger:
 
 
 def _contents_of(one: ChangedPart) -> tuple[str, ...]:
-    """Return the content digests of the entry to which a part belongs: in the base, on our side, on their side.
+    """Return the three content digests of the entry to which a part belongs: in the base, on our side, on their side.
 
-    If the part does not exist in the base, the result is empty.
+    If the entry does not exist in the base, the result is empty.
     """
     return () if one.base is None else (one.base.content, one.ours.content, one.theirs.content)
 

@@ -97,7 +97,10 @@ def _make_manifest(
     request: CheckoutRequest,
     selected: SelectedEntries | None,
 ) -> FolderManifest:
-    """Return the new manifest of the folder; if only a part of the version is checked out, store its tree."""
+    """Return the record (`FolderManifest`) of the version that the folder gets.
+
+    If only a part of the version is checked out, also store the tree of this part.
+    """
     if not request.partial:
         digest = resolve(tx, found.id, request.version)
         return FolderManifest(digest, tree_of(tx, found.id, digest))
@@ -172,9 +175,8 @@ class _Checkout:
     def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
         """Find, for the content of each entry, an item with a revision that has this content.
 
-        Returns a mapping from the content digest to the id of the item and the parts of the revision. The parts map the
-        name of each part to the digest of its document. Raises `InvalidProblem` if the project does not have the
-        content of an entry.
+        Returns, by content digest, the id of the item, and the digests of the revision's documents by name of the part.
+        Raises `InvalidProblem` if the project does not have the content of an entry.
         """
         wanted = {entry.content: entry for entry in entries}
         held = revisions_with(self.tx, self.project.id, wanted)
@@ -241,7 +243,7 @@ class _Checkout:
         self.given[made.item] = one.after.content
 
     def _keep_facets(self) -> None:
-        """Copy facets to the new revisions from earlier revisions with the same content."""
+        """Copy the facets of earlier revisions with the same content to the new revisions."""
         known = facets_of_contents(self.tx, self.project.id, self.given.values())
         measured = sorted(item_id for item_id, content in self.given.items() if content in known)
         for some in in_lists(measured):

@@ -48,7 +48,7 @@ class StoredChunks:
 
 
 def store_chunks(tx: Transaction, chunks: Mapping[str, bytes]) -> None:
-    """Store chunks by digest. Storing a chunk again has no effect."""
+    """Store chunks by digest. If a chunk is stored already, only its time is renewed, so that no purge deletes it."""
     compressor = zstandard.ZstdCompressor(level=1)
     rows = [
         {
@@ -65,7 +65,7 @@ def chunk_in(stored: bytes, decompressor: zstandard.ZstdDecompressor | None = No
     """Return the bytes of a chunk from the value of `tree_chunk.data`.
 
     Callers that read many chunks pass one `decompressor`, because making a decompressor takes longer than using it. A
-    damaged value is returned unchanged. `decode` then refuses it, because its digest is not that of the chunk.
+    damaged value is returned unchanged; `decode` then refuses it, because it does not have the digest of the chunk.
     """
     data = bytes(stored)
     if not data.startswith(_START_OF_FRAME):

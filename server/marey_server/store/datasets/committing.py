@@ -50,14 +50,17 @@ from marey_versions.tree.reading import Tree
 
 @dataclass(frozen=True)
 class FolderCommit:
-    """Folder from which a commit is made."""
+    """State of the dataset's folder from which a commit is made."""
 
     rev: int
     """`rev` of the dataset when the folder was read."""
     was: str | None
-    """Value of `dataset.folder_commit` when the folder was read."""
+    """Version that was checked out in the folder when it was read, as stored in `dataset.folder_commit`."""
     partial: FolderManifest | None
-    """New manifest of the folder, but with the old commit; None if a whole version is checked out in the folder."""
+    """Record of the folder's entries after the commit, still with the commit before it.
+
+    None if a whole version is checked out in the folder.
+    """
 
 
 @dataclass(frozen=True)
@@ -277,10 +280,11 @@ def _require_checked_out(found: Row[Any], manifest: FolderManifest | None, paren
 def _from_folder(
     tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, head: str | None
 ) -> tuple[str, Contents, FolderCommit]:
-    """Store a tree of entries that is made from the items in the dataset's folder.
+    """Store the tree of a new version, made from the items in the dataset's folder.
 
-    If the branch has a commit `head`, only the entries that differ from what was checked out are changed in its tree.
-    Returns the digest of the root of the tree, the content digests of the items, and the state of the folder.
+    If the branch has a newest commit `head`, the new tree is the tree of `head` with the changes of the folder since
+    the checkout. Returns the digest of the root of the new tree, the content digests of the items, and the state of the
+    folder. Raises `ConflictProblem` if another version is checked out in the folder.
     """
     manifest = read_manifest(tx, found)
     _require_checked_out(found, manifest, head)
@@ -384,5 +388,8 @@ def _take_away(state: dict[str, Value | None], one: RemoveEntry | MoveEntry) -> 
     if isinstance(one, MoveEntry):
         target = key_of(one.to, one.kind)
         if state.get(target) is not None:
-            raise ConflictProblem(f"The version has a {one.kind.value} at {one.to!r} already.", code="path-taken")
+            raise ConflictProblem(
+                f"The version already has a {one.kind.value} at {one.to!r}; move it away or remove it first.",
+                code="path-taken",
+            )
         state[target] = entry_of(key, value).value  # a damaged entry is not copied

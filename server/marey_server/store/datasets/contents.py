@@ -19,7 +19,7 @@ from marey_versions.records import RevisionKey, document_content, references_in,
 
 @dataclass
 class Contents:
-    """Content digests of revisions and of their parts."""
+    """Content digests of revisions (`revisions`) and of their parts by name (`parts`)."""
 
     revisions: dict[RevisionKey, str] = field(default_factory=dict)
     parts: dict[RevisionKey, dict[str, str]] = field(default_factory=dict)
@@ -127,7 +127,7 @@ _PARTS = (
 
 
 def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
-    """Return SQL conditions that the parts of all wanted revisions meet.
+    """Return SQL conditions that the parts of all wanted revisions meet, and perhaps parts of some others.
 
     Ids and numbers are compared separately, because SQLite would scan the whole table to compare pairs. So parts of
     other revisions can meet the conditions, too, if their id and their number each occur in `wanted`. Callers skip such
@@ -139,7 +139,7 @@ def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
 
 
 def bodies_of(tx: Transaction, digests: Collection[str]) -> dict[str, Any]:
-    """Return the bodies of documents, in which arrays are references, by digest."""
+    """Return the bodies of documents by digest; a body contains references in place of arrays."""
     rows = tx.execute(select(document.c.digest, document.c.body).where(document.c.digest.in_(sorted(digests))))
     return {row.digest: row.body for row in rows}
 

@@ -30,7 +30,7 @@ class FolderState:
     contents: Contents
 
     def changes_since(self, before: Tree) -> dict[str, Value | None]:
-        """Return the changes that turn the entries of a tree into those of the folder; None removes an entry."""
+        """Return, by entry key, the changes that turn a tree into the entries of the folder; None removes an entry."""
         changes: dict[str, Value | None] = dict(self.entries)
         for key, value in before.entries():
             if key not in self.entries:

@@ -30,7 +30,7 @@ from marey_versions.tree.chunks import Value
 from marey_versions.tree.reading import ChunkReader, Tree
 
 MOST_EXAMINED = 1000
-"""Greatest number of commits that one request reads to find the commits that changed a path."""
+"""Greatest number of commits that one request searches for changes of a path."""
 MOST_DIFFERENCES = 100_000
 """Greatest number of differing entries that are counted in one answer."""
 MOST_QUOTED = 200
@@ -123,10 +123,10 @@ def _listed(row: Row[Any], parents: Sequence[str], change: ChangeAtPath | None) 
 def _changing(
     tx: Transaction, commits: Sequence[Row[Any]], path: str, limit: int
 ) -> tuple[list[tuple[Row[Any], ChangeAtPath | None]], Sequence[Row[Any]]]:
-    """Return at most `limit` commits that changed a path, and the commit with which the next page begins.
+    """Return at most `limit` commits that changed a path, each with the change, and where the next page begins.
 
-    The second result is empty if there is no next page. In the list `commits`, the first parent of each commit follows
-    the commit.
+    In `commits`, each commit is followed by its first parent. The second result contains the commit with which the next
+    page begins, or nothing if there is no next page.
     """
     comparer = PathComparer(ChunkReader(StoredChunks(tx)), path, MOST_DIFFERENCES)
     found: list[tuple[Row[Any], ChangeAtPath | None]] = []
@@ -207,7 +207,7 @@ class _ReadCommit:
 
 
 class CommitReader:
-    """Reads commits of a dataset, and reads no commit twice."""
+    """Reader of commits of a dataset, which reads each commit at most once."""
 
     def __init__(self, tx: Transaction, dataset_id: str) -> None:
         self._tx = tx
@@ -261,7 +261,7 @@ class EntryRevision(NamedTuple):
 
 
 class VersionEntries(NamedTuple):
-    """Entries of one kind in a version of a dataset."""
+    """Entries of one kind in a version of a dataset: those that the project has as revisions, and all others."""
 
     commit: str
     folder: str
@@ -294,7 +294,7 @@ def _shown_entries(tx: Transaction, project_id: str, entries: Sequence[DatasetEn
 
 
 def shown_entry(entry: DatasetEntry, held: Mapping[str, tuple[str, int]]) -> Entry:
-    """Return an entry as a document; `held` maps content digests to revisions of the project."""
+    """Return an entry as a document; `held` maps content digests to revisions of the project (item id and number)."""
     item_id, number = held.get(entry.content, (None, None))
     return Entry(
         path=entry.path, kind=Kind(entry.kind), parts=dict(entry.parts), tags=entry.tags, item=item_id, revision=number
@@ -328,7 +328,8 @@ def compare_versions(
     """Return the entries that differ in two versions; at most `limit` of them are listed.
 
     With `path`, compare only the entries at this path or below it. An entry that was moved to this path from elsewhere
-    then counts as added, and an entry that was moved away counts as removed.
+    then counts as added, and an entry that was moved away counts as removed. Raises `BadRequestProblem` if the versions
+    differ in more than `MOST_DIFFERENCES` entries.
     """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)

@@ -1,8 +1,9 @@
 """Manifests of folders: which version a folder has, and which part of the version was checked out there.
 
-If a whole version is checked out, `dataset.folder_commit` is the digest of its commit. If a part was checked out, it is
-the digest of a chunk that contains a manifest. The entries that the folder has then have a tree of their own, so that
-entries that are not in the folder are never taken for removed ones.
+If a whole version is checked out, `dataset.folder_commit` is the digest of its commit. If only a part was checked out,
+`dataset.folder_commit` is the digest of a chunk that contains a manifest. The manifest names a tree of the entries that
+were checked out. A commit compares the folder with this tree, so the other entries of the version do not count as
+removed.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _IS_COMMIT = and_(dataset_commit.c.dataset_id == dataset.c.id, dataset_commit.c.
 
 @dataclass(frozen=True)
 class FolderManifest:
-    """Version that a folder has, and the selection by which a part of it was checked out."""
+    """Version that is checked out in a folder, and the selection if only a part of the version is checked out."""
 
     commit: str
     tree: str
@@ -40,7 +41,7 @@ class FolderManifest:
 
     @property
     def shown(self) -> dict[str, Any]:
-        """The commit and the selection, as errors show them."""
+        """The commit and the selection as a JSON object, for the context of errors."""
         return {"commit": self.commit, "query": self.query, "paths": list(self.paths)}
 
 
@@ -65,7 +66,7 @@ def read_manifests(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, Folde
 
 
 def _manifest_in(chunk: Chunk) -> FolderManifest:
-    """Return the manifest in a chunk. Raises `DamagedChunk` if the chunk does not contain one."""
+    """Return the manifest that a chunk contains. Raises `DamagedChunk` if the chunk contains no valid manifest."""
     value = dict(chunk.entries).get(_KEY) if isinstance(chunk, Leaf) else None
     if value is None or value.keys() != {"commit", "query", "paths", "tree"}:
         raise DamagedChunk("the chunk does not contain the manifest of a folder")
@@ -85,7 +86,10 @@ def store_manifest(tx: Transaction, manifest: FolderManifest) -> str:
 
 
 def roots_of_folders(tx: Transaction, *conditions: ColumnElement[bool]) -> set[str]:
-    """Return the roots of the trees that manifests need, for the datasets that meet the conditions."""
+    """Return the digests of the root chunks that the folders' manifests need, for datasets that meet the conditions.
+
+    These are the chunks that contain a manifest, and the roots of the trees of the entries that were checked out.
+    """
     partial = (
         select(dataset.c.id, dataset.c.folder_commit)
         .outerjoin(dataset_commit, _IS_COMMIT)

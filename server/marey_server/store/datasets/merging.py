@@ -124,7 +124,7 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
 def _repeated(tx: Transaction, project: str, found: Row[Any], request: CombineRequest) -> PreparedMerge | None:
     """Return the merge that an earlier request with the same `write_id` has recorded; None if there is none.
 
-    The branch and the version of the request may be gone meanwhile, so neither is looked up.
+    The branch and the version of the request may have been deleted since, so neither is looked up.
     """
     recorded = recorded_as(tx, found.id, request.write_id)
     if recorded is None:
@@ -142,9 +142,10 @@ def _repeated(tx: Transaction, project: str, found: Row[Any], request: CombineRe
 def _start(
     tx: Transaction, found: Row[Any], request: CombineRequest, theirs: str | None, message: str
 ) -> PreparedMerge:
-    """Return a merge of the commit `theirs` into the branch that `request` names; the result is not computed yet.
+    """Return a merge of the commit `theirs` into the branch that `request` names; `_combine` then computes its result.
 
-    `message` is the message of the commit if the request contains none.
+    `message` is the message of the commit if the request contains none. Raises `InvalidProblem` if the branch has no
+    commits.
     """
     ours = head_of(tx, found.id, request.into, request.expected)
     if ours is None:
@@ -160,10 +161,11 @@ def _start(
 def _combine(
     tx: Transaction, project_id: str, request: CombineRequest, started: PreparedMerge, most: int | None = None
 ) -> PreparedMerge:
-    """Compute a merge that `_start` has returned: the resulting tree and the conflicts.
+    """Compute the resulting tree and the conflicts of a merge that `_start` has returned.
 
-    The changes from the commit `base` to the commit `theirs`, both named in `started.answer`, are applied to the tree
-    of the commit `ours`.
+    `started.answer` names three commits. The changes from `base` to `theirs` are applied to the tree of `ours`. Raises
+    `InvalidProblem` if a side has more than `most` changes, if more than `MOST_COMBINED` entries must be combined, or
+    if a resolution of the request resolves no conflict.
     """
     store = StoredChunks(tx)
     answer, commit = started.answer, started.commit
@@ -200,10 +202,10 @@ def _combine(
 
 
 def _require_all_used(merged: MergedEntries) -> None:
-    """Raise `InvalidProblem` if a resolution of the request has resolved no conflict.
+    """Raise `InvalidProblem` if a resolution in the request resolves no conflict.
 
-    While other conflicts remain, an unused resolution of an entry with a resolved conflict is allowed, because it may
-    be for a further conflict of this entry.
+    One case is allowed: while there are unresolved conflicts, the request may contain a further resolution for an entry
+    of which another conflict was resolved.
     """
     unknown = [one for one in merged.unused if one.key not in merged.decided or not merged.conflicts]
     if not unknown:
@@ -300,8 +302,8 @@ def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | N
     nearest = nearest_common(CommitReader(tx, dataset_id).read, ours, theirs)
     if len(nearest) > 1:
         raise ConflictProblem(
-            "The two versions have several nearest common commits, because earlier merges crossed. Cherry-pick the "
-            "commits that the branch lacks instead.",
+            "The two versions have several nearest common commits, because each was merged into the other before. "
+            "Instead of merging, cherry-pick the commits that the branch lacks.",
             code="several-bases",
             context={"commits": nearest},
             unnamed=True,

@@ -46,7 +46,10 @@ _ALIVE = dataset.c.deleted_us.is_(None)
 
 
 def find_dataset(tx: Transaction, project_row: ProjectRow, name: str) -> Row[Any]:
-    """Return the row of a dataset, with the path of its folder as `path`. Raises `NotFoundProblem`."""
+    """Return the row of a dataset, with the path of its folder as `path`.
+
+    Raises `NotFoundProblem` if there is no such dataset.
+    """
     row = tx.execute(_shown_rows(project_row).where(dataset.c.name == name)).first()
     if row is None:
         raise NotFoundProblem(f"There is no dataset {name!r} in this project.", code="no-dataset")
@@ -97,7 +100,8 @@ def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dat
         "description": request.description, "collection_id": folder,
         "created_us": tx.now_us, "updated_us": tx.now_us, "rev": 1,
     }  # fmt: skip
-    with taken(ConflictProblem(f"There is a dataset {request.name!r} already.", code="name-taken")):
+    name_taken = f"There is already a dataset {request.name!r}; choose another name."
+    with taken(ConflictProblem(name_taken, code="name-taken")):
         tx.execute(insert(dataset).values(**row))
     tx.execute(insert(dataset_ref).values(**new_ref(tx, dataset_id, MAIN, RefKind.BRANCH, None)))
     tx.emit("dataset.created", dataset_id, project_id=project_row.id, name=request.name)
@@ -182,7 +186,7 @@ def lock_refs(tx: Transaction, dataset_id: str) -> None:
 
 
 def read_ref(tx: Transaction, project: str, name: str, ref: str) -> Ref:
-    """Return a branch or a tag."""
+    """Return a branch or a tag. Raises `NotFoundProblem` if the dataset does not have it."""
     row = find_dataset(tx, projects.require(tx, project), name)
     found = find_ref(tx, row.id, ref)
     if found is None:
@@ -202,7 +206,8 @@ def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> 
     _require_no_commit(tx, row.id, request.name)
     held = tx.execute(select(func.count()).where(dataset_ref.c.dataset_id == row.id)).scalar_one()
     _require_room(held, MOST_REFS, "branches and tags in a dataset", "too-many-refs")
-    with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
+    name_taken = f"There is already a branch or tag {request.name!r}; choose another name."
+    with taken(ConflictProblem(name_taken, code="name-taken")):
         row_of_ref = new_ref(tx, row.id, request.name, request.kind, digest)
         made = tx.execute(insert(dataset_ref).values(**row_of_ref).returning(*dataset_ref.c)).one()
     created: OrdinaryEventKind = "branch.created" if request.kind is RefKind.BRANCH else "tag.created"
@@ -262,9 +267,10 @@ def dataset_replaced(name: str) -> ConflictProblem:
 
 
 def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_rev: ExpectedRev) -> None:
-    """Delete a branch or a tag; the commits stay. The branch `main` cannot be deleted.
+    """Delete a branch or a tag; the commits stay.
 
-    Raises `ConflictProblem` if the branch is protected, or is the source or target of an open proposal.
+    Raises `InvalidProblem` for the branch `main`. Raises `ConflictProblem` if the branch is protected, or is the source
+    or target of an open proposal.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -355,7 +361,10 @@ def first_parents(dataset_id: str, start: str, steps: int) -> CTE:
 
 
 def _commits_by_digits(tx: Transaction, dataset_id: str, name: str) -> Sequence[str]:
-    """Return at most two commits whose digest begins with the digits in `name`; none if `name` is not digits."""
+    """Return the digests of at most two commits that begin with the hexadecimal digits `name`.
+
+    Two digests show that `name` is ambiguous. The result is empty if `name` does not consist of digits.
+    """
     match = _DIGITS.fullmatch(name)
     if match is None:
         return ()

@@ -44,7 +44,7 @@ class OutputEntries:
     project_id: str
     branch: str
     base: str | None
-    """Newest commit of the branch when the inputs of the job were pinned to exact revisions."""
+    """Commit from which the job started: the newest commit of the branch when the job's input revisions were fixed."""
     entries: Mapping[str, DatasetEntry]
     """The entries by key."""
     revisions: Mapping[str, RevisionKey]
@@ -52,9 +52,9 @@ class OutputEntries:
     message: str
     job_id: str
     author_id: str | None
-    """Author of the job."""
+    """Id of the user who is the author of the job; None for a job of the server itself."""
     replaced: str | None = None
-    """Folder from which all entries of `kinds` are removed, except outputs of the job; if None, nothing is removed."""
+    """Folder whose other entries of `kinds` the commit removes, except outputs of the job; None removes nothing."""
     kinds: Collection[str] = ()
     """Kinds of the entries that are removed from the folder `replaced`."""
 
@@ -70,7 +70,11 @@ class PlannedCommit:
     head_tree: str = ""
     """Tree of the commit `head`."""
     tree: str = ""
-    """Tree of `head` with the outputs; if there are conflicts, the tree of `OutputEntries.base` with the outputs."""
+    """Tree of the new commit: that of `head` with the outputs.
+
+    If there are conflicts, the outputs go to a new branch, and this is the tree of `OutputEntries.base` with the
+    outputs.
+    """
     count: int = 0
     """Number of entries of `tree`."""
     chunks: Mapping[str, bytes] = field(default_factory=dict)
@@ -156,7 +160,10 @@ def _values(entries: Mapping[str, DatasetEntry | None]) -> dict[str, Value | Non
 
 
 def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConflict | None:
-    """Return the reason why a commit cannot contain these entries, or None."""
+    """Return the reason why a commit cannot contain these entries, or None if it can.
+
+    It cannot if there are more than `most` entries, or if a path is too long.
+    """
     if len(entries) > most:
         return too_many_changes(most)
     long = [path_and_kind(key)[0] for key in entries if len(key.partition("\t")[0]) > LONGEST_PATH]
@@ -167,7 +174,10 @@ def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConfl
 
 
 def too_many_changes(most: int, condition: str = "") -> CommitConflict:
-    """Return the conflict of a job that would commit more than `most` changes; `condition` restricts this limit."""
+    """Return the conflict for a job that would commit more than `most` changes.
+
+    The text `condition`, such as " if others have committed", follows the limit in the message.
+    """
     return CommitConflict(
         code="too-many-changes",
         detail=f"The commit of a job can change at most {most:,} entries{condition}. The outputs are in the project; "
@@ -182,10 +192,10 @@ def _merged(
     entries: Mapping[str, DatasetEntry | None],
     annotations: AnnotationMerger,
 ) -> MergedEntries:
-    """Merge the entries of a job, part by part, with the changes of other commits.
+    """Merge the outputs of a job, part by part, with the changes that other commits made to the same entries.
 
-    Other commits have changed the tree `base` to the tree `head`. Changes of entries that are not in `entries` are
-    ignored.
+    The job started from the tree `base`; other commits have changed `base` to the tree `head`. `entries` are the
+    outputs of the job by key, and None for removed entries.
     """
     before = {key: entry_of(key, value) for key, value in Tree(reader, base).get_several(entries).items()}
     if base == head:
@@ -207,10 +217,10 @@ def _compared(before: DatasetEntry | None, after: DatasetEntry | None) -> Compar
 def _is_in_folder(
     tx: Transaction, wanted: OutputEntries, head: str | None, changes: Mapping[str, Value | None]
 ) -> bool:
-    """Return whether the dataset's folder has all changes of a commit, so that the commit counts as checked out.
+    """Return whether the dataset's folder already has all changes of a new commit, which then counts as checked out.
 
-    For this, the commit `head`, the parent of the new commit, must be checked out in the folder. Also, each entry in
-    `changes` must be the newest revision of an item at the entry's path in the folder.
+    For this, two conditions must be met. The parent `head` of the new commit is checked out in the folder. Each entry
+    in `changes` is the newest revision of an item at its path in the folder. A removed entry makes the result false.
     """
     followed = (dataset.c.id == wanted.dataset_id, dataset.c.folder_commit.is_not_distinct_from(head))
     folder = tx.execute(FOLDER.where(*followed)).scalar()

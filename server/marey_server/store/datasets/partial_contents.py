@@ -51,10 +51,10 @@ Bases = Mapping[BasePlace, Base]
 
 
 def bases_named_in(received: Sequence[ReceivedRevision], take_bytes: Callable[[int], None]) -> set[BasePlace]:
-    """Return the places of the bases of all partial arrays and array differences in received documents.
+    """Return where the bases are that the partial arrays and array differences in received documents need.
 
-    `take_bytes` is called with the size of the whole arrays, before they take memory. Raises `InvalidProblem` if one of
-    these objects is malformed, or if the arrays together are too large.
+    `take_bytes` is called with the total size of the restored arrays, before they take memory. Raises `InvalidProblem`
+    if a partial array or a difference is malformed, or if the restored arrays together are too large.
     """
     found: set[BasePlace] = set()
     size_bytes = 0
@@ -75,10 +75,10 @@ def load_bases(
     stored: Mapping[str, Mapping[str, str]],
     take_bytes: Callable[[int], None],
 ) -> dict[BasePlace, Base]:
-    """Load the bases of partial arrays and array differences.
+    """Load the bases of partial arrays and array differences from their places.
 
-    `stored` maps content digests and parts to the digests of documents. `take_bytes` is called with the size of these
-    documents before they are loaded.
+    `stored` maps content digests of revisions, then names of parts, to digests of documents. `take_bytes` is called
+    with the total size of the needed documents before they are loaded.
 
     Raises `InvalidProblem` if a document has no array at a place, or if the bases together are too large.
     """
@@ -106,7 +106,7 @@ def load_bases(
 
 
 def restored(value: Any, part: str, bases: Bases) -> Any:
-    """Return the document of a part with a whole array in place of each partial array and each array difference."""
+    """Return `value`, the document of a part, with whole arrays in place of partial arrays and array differences."""
     if not bases:
         return value
     if (described := _described(value, part)) is not None:
@@ -133,7 +133,10 @@ class _Described(NamedTuple):
 
 
 def _described(value: Any, part: str) -> _Described | None:
-    """Return the array that a partial array or an array difference describes; None for other values of a document."""
+    """Return the base and the size of the array that `value`, a partial array or an array difference, describes.
+
+    Returns None for other values of a document. Raises `InvalidProblem` if `value` is malformed.
+    """
     try:
         difference = ArrayDifference.of(value)
         if difference is None and not is_partial(value):
@@ -155,10 +158,10 @@ class DocumentComparison:
     """Bytes of the arrays that may still be compared. Further arrays are sent whole, to limit the time."""
 
     def compared(self, value: Any, before: Any, references: Mapping[str, Mapping[str, Any]], content: str) -> Any:
-        """Return a document with array differences in place of the arrays that are similar in the document `before`.
+        """Return the document `value` with array differences in place of arrays that are similar to those in `before`.
 
-        `references` are the references to the arrays of the document, by JSON Pointer, and `content` is the content
-        digest of the revision with the document `before`.
+        `before` is a document that the reader has, and `content` the content digest of its revision. `references` are
+        the references to the arrays of `value`, by JSON Pointer.
         """
         bases = {at: one for at, one in members_of(before) if isinstance(one, EncodedArray)}
 

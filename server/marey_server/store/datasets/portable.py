@@ -34,7 +34,10 @@ from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import RevisionKey, portable_document, references_in
 
 MOST_BYTES_COMPARED = MAX_ARRAY_BYTES
-"""Total size of the arrays of one answer that are compared with arrays of bases; the other arrays are sent whole."""
+"""Greatest total size in bytes of the arrays of one answer that are compared with arrays that the reader has.
+
+The other arrays are sent whole.
+"""
 
 
 def check_export(tx: Transaction, project: str, name: str, request: ExportCheck) -> ExportPermission:
@@ -60,7 +63,7 @@ def check_export(tx: Transaction, project: str, name: str, request: ExportCheck)
 
 @dataclass(frozen=True)
 class _LoadedDocument:
-    """Document that was loaded for an answer, and the document of which the reader has the arrays."""
+    """Document that was loaded for an answer, and the document `base`, whose arrays the reader has already."""
 
     tree: Tree | None
     """Loaded document; None if the project does not have the document."""
@@ -73,18 +76,18 @@ class _LoadedDocument:
 
 @dataclass(frozen=True)
 class LoadedContents:
-    """Members of the answer to a request for contents, and the documents whose arrays must still be compared."""
+    """Answer to a request for contents, before its arrays are compared with those that the reader has."""
 
     members: Mapping[str, Any]
     documents: Sequence[_LoadedDocument]
     tiled: Sequence[_LoadedDocument]
-    """Documents for whose arrays the answer lists the tiles."""
+    """Documents for whose arrays the answer lists the digests of the tiles."""
 
 
 def contents_document(loaded: LoadedContents) -> dict[str, Any]:
-    """Return the answer to a request for contents.
+    """Return the answer to a request for contents; arrays similar to those that the reader has become differences.
 
-    Call this function outside of transactions, because it takes long for large arrays.
+    Call this function outside of transactions, because the comparison of large arrays takes long.
     """
     comparison = DocumentComparison(MOST_BYTES_COMPARED)
     found = [
@@ -95,10 +98,11 @@ def contents_document(loaded: LoadedContents) -> dict[str, Any]:
 
 
 def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> LoadedContents:
-    """Load the requested revisions of a project by content digest, their facets, and documents with encoded arrays.
+    """Load the revisions of a project that have the requested content digests, their facets, and their documents.
 
-    A revision or document that the project does not have is None. If the documents together are too large, the list of
-    documents ends early; it always contains the first one. The same applies to the list of the tiles of documents.
+    The arrays of the documents stay encoded. A revision or document that the project does not have is None. If the
+    documents together are too large, the list of documents ends early, but always contains the first document. The list
+    of documents whose tiles are requested ends early under the same condition.
     """
     project_row = projects.require(tx, project)
     wanted = {*request.revisions, *(one.content for one in (*request.documents, *request.tiles))}
@@ -115,7 +119,7 @@ def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> Lo
 
 
 def _facets(tx: Transaction, project_id: str, request: ContentsRequest) -> list[dict[str, float]]:
-    """Return the facets of each requested revision."""
+    """Return the facets of each requested revision, by name, in the order of the request."""
     found = facets_of_contents(tx, project_id, request.revisions)
     return [found.get(one, {}) for one in request.revisions]
 
@@ -177,7 +181,7 @@ def _portable(tx: Transaction, project_id: str, loaded: Sequence[_LoadedDocument
 
 
 def _tiles_of(tree: Tree | None) -> dict[str, list[str]] | None:
-    """Return the digests of the tiles of each array in a document, by JSON Pointer."""
+    """Return, by JSON Pointer, the digests of the tiles of each array in a document; None for a missing document."""
     if tree is None:
         return None
     return {pointer: tile_digests(one) for pointer, one in members_of(tree) if isinstance(one, EncodedArray)}

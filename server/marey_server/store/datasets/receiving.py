@@ -60,11 +60,11 @@ IMPORTED = "imported"
 
 @dataclass(frozen=True)
 class LocalRevisions:
-    """Revisions of the project that a request refers to, by content digest."""
+    """Revisions of the project that a request contains or refers to (`held`), by content digest, with their data."""
 
     held: Mapping[str, RevisionKey]
     documents: Mapping[str, Mapping[str, str]]
-    """For each revision, by its content digest: the digest of the document of each part, by the name of the part."""
+    """Digests of the revisions' documents: by the content digest of the revision, then by the name of the part."""
     last_purge: int
     """Time of the last purge of the project before the revisions were found."""
     facets: Mapping[str, Mapping[str, float]]
@@ -76,9 +76,10 @@ class LocalRevisions:
 def find_local(
     tx: Transaction, project: str, received: Sequence[ReceivedRevision], take_bytes: Callable[[int], None]
 ) -> LocalRevisions:
-    """Find the revisions that a request contains or refers to.
+    """Find those revisions of a request that the project has already, and the revisions to which the request refers.
 
-    `take_bytes` is called with the sizes of partial arrays and of their bases, before these take memory.
+    `take_bytes` is called with the total sizes of arrays that are restored and of their bases, before these take
+    memory.
 
     Raises `ConflictProblem` if the project lacks a revision that a received revision refers to. Raises `InvalidProblem`
     if a received revision refers to an item of this project by its id, and for a partial array without its base.
@@ -100,9 +101,9 @@ def find_local(
 def _require_no_own_ids(tx: Transaction, project_id: str, received: Sequence[ReceivedRevision]) -> None:
     """Raise `InvalidProblem` if a received document refers to an item of this project by its id.
 
-    Senders replace ids of their own project by content digests. An id of any other project, which anybody can write
-    into free members of a document, stays in the document as text. If the project of the id receives the document, the
-    text becomes a reference, and the content digest of the document would change.
+    In this project, the id would count as a reference, so the document would get another content digest than the sender
+    has computed. Senders replace the ids of their own project by content digests, but anybody can write ids of other
+    projects into members of a document that have no schema.
     """
     named = {key: one for one in received for key in references_in(one.parts)}
     ids = sorted({key.item for key in named})
@@ -121,7 +122,10 @@ def _require_no_own_ids(tx: Transaction, project_id: str, received: Sequence[Rec
 
 
 def prepare_revisions(received: Sequence[ReceivedRevision], local: LocalRevisions) -> dict[str, Draft]:
-    """Check and encode the revisions that the project does not have; return their drafts by content digest."""
+    """Check and encode the revisions that the project does not have; return their drafts by content digest.
+
+    Raises `InvalidProblem` for a document that is not valid.
+    """
     return {one.content: _draft(one, local) for one in received if one.content not in local.held}
 
 
@@ -176,7 +180,7 @@ def store_revisions(
 
 @dataclass(frozen=True)
 class PreparedReceipt:
-    """Commit from an archive or another server, with its computed tree, which has the digest that the commit names."""
+    """Commit from an archive or another server, with the chunks of its tree; the digest of the tree was checked."""
 
     dataset_id: str
     record: CommitRecord

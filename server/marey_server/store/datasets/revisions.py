@@ -33,7 +33,7 @@ LONGEST_NAME = 200
 
 
 def require_contents(missing: Iterable[str]) -> None:
-    """Raise `ConflictProblem` if `missing`, the content digests that the project lacks, is not empty."""
+    """Raise `ConflictProblem` if there are content digests in `missing`, which the project lacks."""
     if lacking := sorted(missing):
         raise ConflictProblem(
             f"The project lacks {counted(len(lacking), 'revision')} that the request refers to; send them first.",
@@ -43,7 +43,7 @@ def require_contents(missing: Iterable[str]) -> None:
 
 
 def item_name(shown: str, content: str) -> str:
-    """Return a name for a new item: the last component of the path or text `shown`, and part of the content digest."""
+    """Return a name for a new item: the last component of the path `shown`, and 12 digits of the content digest."""
     return f"{shown.rpartition('/')[2][:LONGEST_NAME]} {content.removeprefix('sha256:')[:12]}"
 
 
@@ -90,9 +90,10 @@ def store_combined(
     author_id: str | None,
     job_id: str | None = None,
 ) -> None:
-    """Store the revisions of entries that have changes of both sides of a merge, unless the project has them already.
+    """Store a revision for each entry of a merge that combines changes of both sides, unless the project has it.
 
-    `merged` maps the content digests of parts that were merged to their documents.
+    `merged` maps the content digests of merged parts to the documents of these parts. Raises `ConflictProblem` if the
+    project lacks a revision from which an entry takes a part.
     """
     sides = {side.content for one in combined for part in one.entry.parts if (side := one.source_of(part)) is not None}
     held = {content: RevisionKey(*key) for content, key in revisions_with(tx, project_row.id, sides).items()}

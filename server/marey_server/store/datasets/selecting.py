@@ -37,7 +37,7 @@ from marey_versions.tree.chunks import Value
 from marey_versions.tree.reading import ChunkReader, Tree
 
 MOST_SEARCHED = 200_000
-"""Greatest number of entries whose content one query is compared with."""
+"""Greatest number of entries that one query is compared with, one by one."""
 SEARCHED_AT_ONCE = 1000
 MOST_IN_MEMORY = 200_000
 """Greatest number of content digests that are in memory at the same time; they take about 30 MB."""
@@ -47,7 +47,7 @@ OF_ENTRIES = frozenset({"name", "path", "folder", "tag"})
 
 @dataclass(frozen=True)
 class SelectedEntries:
-    """Part of a version; nothing of it is stored yet."""
+    """Selected entries of a version, as a tree that is not stored yet."""
 
     dataset_id: str
     commit: str
@@ -89,7 +89,10 @@ def select_entries(tx: Transaction, project: str, name: str, request: CheckoutRe
 
 
 def _at_paths(tree: Tree, paths: Sequence[str]) -> Iterator[tuple[str, Value]]:
-    """Return the entries of a tree at the given paths and below them, in the order of their keys."""
+    """Return the entries of a tree at the given paths and below them, in the order of their keys; without paths, all.
+
+    Raises `NotFoundProblem` if there is no entry at or below one of the paths.
+    """
     if not paths:
         return tree.entries()
     wanted = set(paths)
@@ -133,7 +136,10 @@ def _matching(
 
 
 def _is_of_content(query: Query) -> bool:
-    """Return whether all conditions of a query are on columns of items, and none on facts that entries have."""
+    """Return whether a query has conditions only on values that follow from the content of an entry.
+
+    Its conditions are then on columns of items: none is on the path or the tags of an entry, and none on facets.
+    """
     fields = {part.field for part in conditions_of(query)}
     return fields.isdisjoint(OF_ENTRIES) and not any(field.startswith(FACET_PREFIX) for field in fields)
 
@@ -141,11 +147,11 @@ def _is_of_content(query: Query) -> bool:
 def _with_possible_content(
     tx: Transaction, project_id: str, queries: Sequence[Query], entries: Iterable[DatasetEntry]
 ) -> Iterator[DatasetEntry]:
-    """Yield the entries whose content is that of a revision of the project which may meet all `queries`.
+    """Yield the entries whose content may meet all `queries`.
 
-    The database has facts only of the newest revisions of items, so it evaluates the queries for these. All older
-    revisions are assumed to meet the queries. If there are more than `MOST_IN_MEMORY` contents of such revisions, the
-    database is queried for each group of entries.
+    The database evaluates the queries for the newest revisions of items. It has no summaries of older revisions, so
+    these are assumed to meet the queries. The content digests of all these revisions are read once; if there are more
+    than `MOST_IN_MEMORY`, the database is queried for `SEARCHED_AT_ONCE` entries at a time instead.
     """
     newest, older = _possible_contents(project_id, queries)
     possible = set(tx.execute(newest.limit(MOST_IN_MEMORY + 1)).scalars())
@@ -163,7 +169,7 @@ def _with_possible_content(
 def _possible_contents(
     project_id: str, queries: Sequence[Query]
 ) -> tuple[Select[*tuple[Any, ...]], Select[*tuple[Any, ...]]]:
-    """Return two queries: for the contents of newest revisions that meet all `queries`, and of all older revisions."""
+    """Return two SQL queries for content digests: of newest revisions that meet `queries`, and of older revisions."""
     of_project = (
         select(revision.c.content)
         .join(item, item.c.id == revision.c.item_id)
@@ -204,10 +210,10 @@ def _facts_of(entry: DatasetEntry, folder: str, **more: Any) -> QueriedFacts:
 def _facts(
     tx: Transaction, project_id: str, folder: str, entries: Sequence[DatasetEntry]
 ) -> Iterator[tuple[DatasetEntry, QueriedFacts]]:
-    """Yield entries with their facts.
+    """Yield entries, each with the values that a query can compare.
 
-    The name, the folder and the tags come from the entry, the other facts from a revision that has the content of the
-    entry. An entry whose content was purged is left out.
+    The name, the folder and the tags come from the entry. All other values come from a revision that has the content
+    of the entry. An entry whose content was purged is left out.
     """
     contents = [entry.content for entry in entries]
     rows = _revisions(tx, project_id, contents)
@@ -229,7 +235,7 @@ def _facts(
 
 
 def _revisions(tx: Transaction, project_id: str, contents: Collection[str]) -> dict[str, Row[Any]]:
-    """Return a revision of the project for each content digest, if possible the newest revision of an item."""
+    """Return, by content digest, a revision of the project with this content, preferably the newest of its item."""
     found: dict[str, Row[Any]] = {}
     wanted = sorted(set(contents))
     for some in in_lists(wanted):
@@ -248,7 +254,10 @@ def _revisions(tx: Transaction, project_id: str, contents: Collection[str]) -> d
 
 
 def _summaries(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, Summary]:
-    """Return the summaries of revisions; the summaries of older revisions are computed from their documents."""
+    """Return the summaries of the revisions in `rows`, by content digest.
+
+    Only the summary of an item's newest revision is stored; the others are computed from the documents.
+    """
     older = {content: (row.item_id, row.number) for content, row in rows.items() if row.head != row.number}
     parts = read_part_digests(tx, set(older.values()))
     bodies = bodies_of(tx, {digest for digests in parts.values() for digest in digests.values()}) if older else {}
@@ -265,7 +274,7 @@ def _summaries(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, Summa
 
 
 def _names(tx: Transaction, project_id: str, skeletons: Collection[str]) -> dict[str, str]:
-    """Return the names of those skeletons that are not deleted, by id."""
+    """Return the names of skeletons by id; deleted skeletons are left out."""
     named = select(item.c.id, item.c.name).where(
         item.c.id.in_(sorted(skeletons)), item.c.project_id == project_id, item.c.deleted_us.is_(None)
     )

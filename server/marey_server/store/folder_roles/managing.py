@@ -56,7 +56,7 @@ def list_folder_roles(
 
 
 def read_folder_role(tx: Transaction, project: str, collection_id: str, user_name: str) -> FolderRole:
-    """Return the role of a member, or of all members, in a folder."""
+    """Return the role of a member, or of all members, in a folder. Raises `NotFoundProblem` if there is none."""
     project_row = projects.require(tx, project)
     row = tx.execute(_rows(project_row).where(collection.c.id == collection_id, _is_user(user_name))).first()
     if row is None:
@@ -102,10 +102,11 @@ def put_folder_role(
     expected_rev: ExpectedRev = None,
     absent: bool = False,
 ) -> FolderRole:
-    """Set the role of a member, or of all members, in a folder. With `absent`, an existing role is not changed.
+    """Set the role of a member, or of all members, in a folder.
 
     Raises `NotFoundProblem` if the user is no member of the project. Raises `ConflictProblem` if the user is an owner,
-    or if the project has too many roles in folders.
+    or if the project has too many roles in folders. With `absent`, raises `PreconditionFailedProblem` if the role
+    exists already. Raises `InvalidProblem` for the root folder.
     """
     project_row, path = _lock(tx, project, collection_id)
     key = _key(project_row, collection_id, _find_member(tx, project_row, user_name))
@@ -151,7 +152,10 @@ def remove_folder_role(
 
 
 def _lock(tx: Transaction, project: str, collection_id: str) -> tuple[ProjectRow, str]:
-    """Lock the roles in folders of a project, then the folder; return the project and the path of the folder."""
+    """Lock the roles in folders of a project, then the folder; return the project and the path of the folder.
+
+    Raises `InvalidProblem` for the root folder, which has no roles of its own.
+    """
     project_row = lock_project(tx, project)
     lock_places(tx, project_row)
     path = collections.find_collection(tx, project_row, collection_id, lock=True).path
@@ -173,7 +177,10 @@ def _has(key: Mapping[str, str]) -> tuple[ColumnElement[bool], ...]:
 
 
 def _find_member(tx: Transaction, project_row: ProjectRow, user_name: str) -> str:
-    """Return the id of a member who is not an owner, or `EVERY_MEMBER`."""
+    """Return the id of the member `user_name`; `EVERY_MEMBER` is returned unchanged.
+
+    Raises `NotFoundProblem` if the user is no member, and `ConflictProblem` if the user is an owner.
+    """
     if user_name == EVERY_MEMBER:
         return EVERY_MEMBER
     mine = and_(member.c.user_id == user.c.id, member.c.project_id == project_row.id)

@@ -44,17 +44,20 @@ _AUTHOR = Prepared(
 
 
 def lock_name(project_id: str) -> str:
-    """Return the name of the lock on a project's roles in folders: shared to read them, exclusive to change them."""
+    """Return the name of the lock on a project's roles in folders.
+
+    Transactions that read the roles hold the lock shared; transactions that change them hold it exclusively.
+    """
     return f"folder-roles:{project_id}"
 
 
 def lock_places(tx: Transaction, project: ProjectRow) -> None:
     """Lock the roles in folders, and the paths of the folders with roles, until the transaction ends.
 
-    Members who write compare the path of a folder with the paths at which they have roles. While another request moves,
-    deletes or restores a folder, one of these paths could be out of date. So such requests call this function before
-    they lock an item, a folder or a job. Requests that change a role in a folder or in the project do so, too. The
-    function waits for writes that have read roles. Later writes that read roles wait until the lock is released.
+    Requests call this function if they move, delete or restore a folder, or change a role in a folder or in the
+    project. They call it before they lock an item, a folder or a job. The function waits until all writes that have
+    read the roles have ended. Later writes that read the roles wait until this transaction has ended. So a write never
+    compares the path of a folder with roles at outdated paths.
     """
     tx.lock(lock_name(project.id))
     forget_rights(tx)
@@ -121,7 +124,10 @@ def _kept(tx: Transaction, project: ProjectRow, user_id: str | None, role: Role)
 
 
 def _read(tx: Transaction, project: ProjectRow, user_id: str | None) -> FolderRights:
-    """Read a member's rights, including the role in the project, which may have changed before the lock was held."""
+    """Read a member's rights in folders, together with the role in the project, while the lock on roles is held.
+
+    The role in the project is read again, because it may have changed before the lock was acquired.
+    """
     rows = tx.run(_OVERRIDES, {"project_id": project.id, "user_id": user_id, "every_member": EVERY_MEMBER})
     role = Role(rows[0].project_role) if rows else Role.READER  # of a user who is no member any more
     if role is Role.OWNER:

@@ -37,15 +37,16 @@ def invitation_invalid() -> NotFoundProblem:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try to use an invitation code, which must be counted for rate limits before the code is checked."""
+    """Return the sign-in try for an invitation code; the caller must count the try before checking the code."""
     prefix, _ = split_invitation(code) or ("", "")
     return SignInTry(f"invitation {prefix}", address, per_minute)
 
 
 def _find(tx: Transaction, code: str) -> Row[Any]:
-    """Return the invitation with a code, even one that nobody can use any more.
+    """Return the invitation with a code, even if nobody can use the invitation any more.
 
-    Unknown codes cost the same query and comparison as known ones. Raises `NotFoundProblem`.
+    An unknown code takes as long as a known one, so that the time does not show which codes exist. Raises
+    `NotFoundProblem` if the code is wrong.
     """
     prefix, secret = split_invitation(code) or ("", "")
     statement = select(invitation, project.c.name.label("project"), project.c.deleted_us, is_open(tx).label("open"))
@@ -87,11 +88,11 @@ def accept_invitation(tx: Transaction, code: str, attempt: SignInTry) -> Accepte
     elif used_before or not row.open:
         raise invitation_invalid()
     elif present is not None and includes(present, role):
-        sign_ins.take_back(tx, attempt)
+        sign_ins.uncount(tx, attempt)
         return AcceptedInvitation(project=row.project, role=present, joined=False)
     else:
         _use(tx, row, user_id, user_name)
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     return AcceptedInvitation(project=row.project, role=role, joined=True)
 
 
@@ -122,11 +123,11 @@ def _use(tx: Transaction, row: Row[Any], user_id: str, user_name: str) -> None:
 
 
 def needs_password_check(tx: Transaction, code: str, name: str) -> bool:
-    """Return whether the request of the user `name` needs a password check and `sign_up_again` in place of `sign_up`.
+    """Return whether a request to sign up as `name` must check the password and call `sign_up_again`, not `sign_up`.
 
-    The result is true if the user has used the code. If the code cannot create an account, the result is true for every
-    name. So the answer to a used code does not show who has used it. Raises `NotFoundProblem` if the secret of the code
-    is wrong.
+    The result is true if the user `name` has used the code. It is also true, for every name, if the code cannot create
+    an account, for example because it is used up. So the answer to a used code does not show who has used it. Raises
+    `NotFoundProblem` if the code is wrong.
     """
     row = _find(tx, code)
     user_id = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()
@@ -155,10 +156,11 @@ def sign_up(tx: Transaction, request: SignUp, password_hash: str, attempt: SignI
 def sign_up_again(
     tx: Transaction, request: SignUp, verified_hash: str | None, login: SignInTry, attempt: SignInTry
 ) -> SignedUp:
-    """Return a new token for a user who repeats `sign_up` with the same password, which matched `verified_hash`.
+    """Return a new token for a user who repeats `sign_up` with the same code and password.
 
-    `login` is the try to use the password, and `attempt` the try to use the code, both counted against the rate limits.
-    Raises `NotFoundProblem` if the password did not match. So the answer does not show who has used the code.
+    `verified_hash` is the hash that the password matched, or None if it did not match. `login` is the counted try of
+    the password, and `attempt` the counted try of the code. Raises `NotFoundProblem` if the password did not match, or
+    if the user has not used the code. So the answer does not show who has used the code.
     """
     row = _find(tx, request.code.get_secret_value())
     if verified_hash is None:
@@ -166,12 +168,12 @@ def sign_up_again(
     tx.principal = users.authenticated(tx, request.name, verified_hash)
     if not _has_used(tx, row, tx.principal.user_id):
         raise invitation_invalid()
-    sign_ins.forgive(tx, login)
+    sign_ins.record_success(tx, login)
     return _signed_up(tx, row, request, attempt)
 
 
 def _signed_up(tx: Transaction, row: Row[Any], request: SignUp, attempt: SignInTry) -> SignedUp:
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     role = None if row.project_id is None else members.find_role(tx, row.project_id, str(tx.principal.user_id))
     made = tokens.create_session(tx, request.expires_in_s)
     return SignedUp(**made.model_dump(), project=None if role is None else row.project, role=role)

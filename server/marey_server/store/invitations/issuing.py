@@ -124,7 +124,10 @@ def _shown(row: Row[Any]) -> Invitation:
 
 
 def withdraw_invitation(tx: Transaction, project_name: str, named: str) -> None:
-    """Withdraw an invitation to a project, named by its `id` or its `prefix`. Raises `NotFoundProblem`."""
+    """Withdraw an invitation to a project, named by its `id` or its `prefix`.
+
+    Raises `NotFoundProblem` if the project has no such open invitation.
+    """
     project_row = projects.require(tx, project_name)
     _withdraw(tx, named, invitation.c.project_id == project_row.id)
 
@@ -132,7 +135,7 @@ def withdraw_invitation(tx: Transaction, project_name: str, named: str) -> None:
 def withdraw_account_invitation(tx: Transaction, named: str) -> None:
     """Withdraw an invitation that can create accounts, named by its `id` or its `prefix`.
 
-    Only administrators may do this. Raises `NotFoundProblem`.
+    Only administrators may do this. Raises `NotFoundProblem` if there is no such invitation.
     """
     require_administrator(tx.principal)
     _withdraw(tx, named, invitation.c.creates_account.is_(True))

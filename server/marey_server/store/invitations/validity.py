@@ -21,9 +21,9 @@ DELETED_AT_ONCE = 500
 
 
 def _exists(*which: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return the SQL condition that there is a row that meets all conditions in `which`.
+    """Return the SQL condition EXISTS for rows that meet all conditions in `which`.
 
-    The conditions may compare columns of this row with columns of the invitation in the surrounding query.
+    The conditions may also use columns of the invitation in the surrounding query.
     """
     return exists().where(*which).correlate(invitation)
 
@@ -47,17 +47,17 @@ IN_FORCE = and_(
 
 
 def is_unspent(tx: Transaction) -> ColumnElement[bool]:
-    """Return the condition for invitations that are neither used up nor expired."""
+    """Return the SQL condition for invitations that are neither used up nor expired."""
     return and_(invitation.c.used < invitation.c.uses, invitation.c.expires_us > tx.now_us)
 
 
 def is_open(tx: Transaction) -> ColumnElement[bool]:
-    """Return the condition for invitations that somebody can still use."""
+    """Return the SQL condition for invitations that somebody can still use."""
     return and_(is_unspent(tx), IN_FORCE)
 
 
 def withdraw_unauthorised(tx: Transaction, *which: ColumnElement[bool]) -> None:
-    """Withdraw invitations that meet `which` and are no longer in force, after a change of rights.
+    """Withdraw the invitations that meet `which` and whose inviter may no longer invite, after a change of rights.
 
     Invitations that are used up or expired are left as they are.
     """

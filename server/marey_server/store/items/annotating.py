@@ -18,7 +18,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True, slots=True)
 class FoundAnnotation:
-    """Annotation that the caller may change: its document, its item's `rev`, and the number of frames of its clip."""
+    """Annotation that the caller may change: its document, the `rev` of its item, and the frame count of its clip."""
 
     tree: dict[str, Any]
     rev: int
@@ -61,7 +61,7 @@ def put_changed(tx: Transaction, project: str, item_id: str, changed: ChangedAnn
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedClip:
-    """Newest revision of a clip that is annotated, with its number of frames."""
+    """Clip that is to be annotated, at its newest revision, with its number of frames."""
 
     item: Item
     frame_count: int

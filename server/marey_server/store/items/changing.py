@@ -32,7 +32,7 @@ from marey_server.store.items.revisions import (
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import daily, holdings
-from marey_server.store.quotas.holdings import Held
+from marey_server.store.quotas.holdings import ItemTotals
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
 from marey_server.store.tables import item, item_tag
 from marey_server.store.transaction import Transaction
@@ -48,7 +48,11 @@ def prepare_parts(kind: Kind, parts: dict[str, Any]) -> dict[str, PreparedDocume
 
 
 def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
-    """Check and encode the document of one part of an item."""
+    """Check and encode the document of one part of an item.
+
+    Raises `InvalidProblem`, whose JSON Pointers begin with the name of the part, if the kind has no such part or the
+    document is not valid.
+    """
     spec = PARTS[kind].get(part)
     if spec is None:
         detail = f"A {kind} has no part {part!r}; it has {', '.join(PARTS[kind])}."
@@ -111,7 +115,7 @@ def put_part(
         if write_head(tx, kind, item_id, parts, bodies, unchanged, added_bytes=added):
             made = NewRevision(item_id, found.head + 1, parts, message)
             write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
-            holdings.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
+            holdings.count_added(tx, project_row.id, {found.creator_id: ItemTotals(stored_bytes=added)})
             daily.count_sent(tx, tx.new_document_bytes)
             shown = _shown(tx, project_row, kind, item_id)
             tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
@@ -138,7 +142,7 @@ def set_parts(
         raise moved_on(found.rev)
     made = NewRevision(item_id, found.head + 1, parts, message)
     write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
-    holdings.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
+    holdings.count_added(tx, project_row.id, {found.creator_id: ItemTotals(stored_bytes=added)})
     shown = _shown(tx, project_row, kind, item_id)
     tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
 
@@ -167,7 +171,11 @@ def revert_item(
 def change_item(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: ExpectedRev
 ) -> Item:
-    """Rename, move or tag an item. Raises `ConflictProblem` if another item at the new place has the name."""
+    """Rename, move or tag an item.
+
+    Raises `ConflictProblem` if another item of the kind has the name in the collection, `ForbiddenProblem` if the
+    caller may not write to one of the two folders, and `PreconditionFailedProblem` if the item has changed.
+    """
     project_row = projects.require(tx, project)
     rights = rights_of_caller(tx, project_row)
     found = _find_to_change(tx, project_row, kind, item_id)
@@ -178,7 +186,8 @@ def change_item(
         rights.require(request.collection, Role.CONTRIBUTOR)
         values["collection_id"] = collections.ensure(tx, project_row, request.collection)
     which = (*_in_folder(project_row, kind, found), item.c.deleted_us.is_(None))
-    with taken(ConflictProblem(f"There is already a {kind} with this name in the collection.", code="name-taken")):
+    name_taken = f"There is already a {kind} with this name in the collection; choose another name."
+    with taken(ConflictProblem(name_taken, code="name-taken")):
         change_row(tx, item, which, values, expected_rev=expected_rev, absent=_moved_away(kind, item_id))
     if request.tags is not None:
         tx.execute(delete(item_tag).where(item_tag.c.item_id == item_id))
@@ -190,14 +199,17 @@ def change_item(
 
 
 def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev) -> None:
-    """Hide an item; it can be restored. References to its revisions stay valid."""
+    """Hide an item, which can be restored; references to revisions of the item stay valid.
+
+    Raises `ForbiddenProblem` unless the caller is a maintainer in the folder of the item.
+    """
     project_row = projects.require(tx, project)
     found = _find_to_change(tx, project_row, kind, item_id, Role.MAINTAINER)
     which = (*_in_folder(project_row, kind, found), item.c.deleted_us.is_(None))
     gone = shown_items(tx, [found])[0]
     absent = _moved_away(kind, item_id)
     row = change_row(tx, item, which, {"deleted_us": tx.now_us}, expected_rev=expected_rev, absent=absent)
-    holdings.release(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
+    holdings.count_removed(tx, project_row.id, {row.creator_id: ItemTotals(1, row.stored_bytes)})
     tx.audit("item.deleted", about=gone.name, **event_of_item(project_row, gone))
 
 
@@ -216,13 +228,13 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None), item.c.purged_us.is_(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
     name_taken = ConflictProblem(
-        f"The collection now contains another {kind} named {gone.name!r}.",
+        f"The collection now contains another {kind} named {gone.name!r}. Rename it, then restore this one.",
         code="name-taken",
-        unnamed=f"The collection now contains another {kind} with the same name.",
+        unnamed=f"The collection now contains another {kind} with the same name. Rename it, then restore this one.",
     )
     with taken(name_taken):
         row = change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
-    holdings.hold(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
+    holdings.count_added(tx, project_row.id, {row.creator_id: ItemTotals(1, row.stored_bytes)})
     shown = _shown(tx, project_row, kind, item_id)
     tx.audit("item.restored", about=shown.name, **event_of_item(project_row, shown))
     return shown
@@ -243,7 +255,7 @@ def _find_to_change(
 
 
 def _in_folder(project_row: ProjectRow, kind: Kind, found: Any) -> tuple[Any, ...]:
-    """Return the condition that an item is still in the folder in which the caller's role was checked."""
+    """Return the SQL conditions that an item is still in the folder in which the caller's role was checked."""
     return *_this(project_row, kind, found.id), item.c.collection_id == found.collection_id
 
 

@@ -29,7 +29,7 @@ MOST_NAMED = 10
 
 
 class EndedConsent(NamedTuple):
-    """Item whose consent has ended."""
+    """Item for which the consent of the performer has ended."""
 
     item: str
     path: str

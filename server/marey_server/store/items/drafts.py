@@ -27,11 +27,13 @@ PartContent = PreparedDocument | StoredDocument | dict[str, Any]
 class Draft:
     """Content of an item or revision that is to be published.
 
-    `reuse`: `new` creates an item and refuses a name that is taken; `by_name` adds a revision to the item that has the
-    name, or else creates an item; `by_content` uses any item of the project whose required parts are equal, or else
-    creates an item.
+    `reuse` says what happens if the draft matches an existing item:
 
-    With `same_skeleton`, nothing is published if the item that has the name has another skeleton.
+    * `new` creates an item, and fails if another item has the name.
+    * `by_name` adds a revision to the item that has the name; without such an item, it creates one.
+    * `by_content` uses an item of the project whose required parts are equal; without such an item, it creates one.
+
+    With `same_skeleton`, nothing is published if the existing item of this name has another skeleton.
     """
 
     name_in_batch: str
@@ -45,14 +47,14 @@ class Draft:
     message: str = ""
     same_skeleton: bool = False
     hidden: bool = False
-    """Whether a new item is deleted from the beginning, so that no folder shows it before a checkout restores it."""
+    """Whether a new item is created as a deleted item, so that no folder shows it before a checkout restores it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Revision published from a draft. `created` is false if the revision existed before.
+    """Revision published from a draft; `created` is false if an existing revision is used.
 
-    `skeleton_changed` says whether the revision before the new one has another skeleton.
+    `skeleton_changed` says whether the previous revision of the item has another skeleton.
     """
 
     name: str

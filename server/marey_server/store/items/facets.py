@@ -21,7 +21,7 @@ from marey_server.store.tables import document, item, item_facet, revision, revi
 from marey_server.store.transaction import Transaction, in_lists
 
 StoredFacets = list[list[Any]]
-"""Staged facets: for each item its id, the number of its revision, and the values by name."""
+"""Facets as they are staged: for each revision, a list of the id of the item, the number, and the values by name."""
 
 
 def stored_facets(tx: Transaction, job_row: Any, facets: Sequence[ItemFacets]) -> StoredFacets:
@@ -36,7 +36,8 @@ def stored_facets(tx: Transaction, job_row: Any, facets: Sequence[ItemFacets]) -
     for one in facets:
         if (one.item, one.revision) in stated:
             raise InvalidProblem(
-                f"The job states facets of {one.item} at revision {one.revision} twice.", code="no-facet-input"
+                f"The job states facets of {one.item} at revision {one.revision} twice; state them once.",
+                code="no-facet-input",
             )
         if (one.item, one.revision) not in given:
             raise InvalidProblem(
@@ -98,8 +99,9 @@ def _existing(tx: Transaction, project_id: str, named: Collection[tuple[str, int
 def with_revisions(facets: StoredFacets, revisions: Mapping[tuple[str, int], int]) -> StoredFacets:
     """Return facets that an identical job has staged, rewritten as facets of this job.
 
-    `revisions` maps each input of the other job (item id and revision number) to the revision that this job read. Other
-    items, the clips of evaluations, have the same revisions for both jobs.
+    The two jobs may have read different revisions of an item. `revisions` maps each input of the other job (item id and
+    revision number) to the revision number that this job read. All other facets, of clips of evaluations, are
+    unchanged.
     """
     return [[item_id, revisions.get((item_id, number), number), values] for item_id, number, values in facets]
 
@@ -107,8 +109,8 @@ def with_revisions(facets: StoredFacets, revisions: Mapping[tuple[str, int], int
 def publish_facets(tx: Transaction, project_id: str, facets: StoredFacets) -> None:
     """Record the facets that a job states.
 
-    If another job has published the same facet of the same revision, its value is replaced. Items that were purged
-    meanwhile are left out.
+    If another job has published a facet of this name for the same revision, its value is replaced. Items that were
+    purged since the job stated their facets are left out.
     """
     hold_off_purges(tx, project_id)
     stated: dict[str, list[tuple[int, dict[str, float]]]] = {}
@@ -167,7 +169,7 @@ def fill_facets(tx: Transaction, project_id: str, values: Mapping[str, Mapping[s
 
 
 def repeat_facets(tx: Transaction, item_id: str, number: int, again: int) -> None:
-    """Copy the facets of the revision `number` of an item to its later revision `again`, which has the same content."""
+    """Copy the facets of revision `number` of an item to the later revision `again`, which has the same content."""
     of_revision = (item_facet.c.item_id == item_id, item_facet.c.number == number)
     rows = tx.execute(select(item_facet.c.name, item_facet.c.value).where(*of_revision))
     add_facets(tx, [(item_id, again, {row.name: row.value for row in rows})])
@@ -187,9 +189,8 @@ def add_facets(tx: Transaction, stated: Iterable[tuple[str, int, Mapping[str, fl
 def _not_purged(tx: Transaction, project_id: str, items: Sequence[str]) -> Sequence[str]:
     """Return those items of a project that are not purged, sorted by id.
 
-    So the facets of one job are written in the order of item ids. A transaction that publishes the facets of several
-    jobs follows this order separately for each job. So two such transactions can deadlock; `Database.write` then
-    repeats one of them.
+    The facets of one job are written in this order, but a transaction can publish the facets of several jobs, one job
+    after the other. So two transactions can deadlock; `Database.write` then repeats one of them.
     """
     statement = select(item.c.id).where(
         item.c.id.in_(items), item.c.project_id == project_id, item.c.purged_us.is_(None)

@@ -79,7 +79,7 @@ def read_lineage(
 ) -> Lineage:
     """Return the inputs of a revision, the job that created it, and the revisions that were made from it.
 
-    Without `revision_number`, the newest revision is meant. Items that the caller may not see are left out.
+    If `revision_number` is None, this is the newest revision. Items that the caller may not see are left out.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     number = revision_number or found.head
@@ -102,9 +102,10 @@ def _versions(environment: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[LineageEdge, ...]:
-    """Return the revisions at one end of the rows of `lineage` that meet `condition`.
+    """Return at most `MAX_EDGES` revisions that are named in the rows of `lineage` that meet `condition`.
 
-    `other` and `number` are the columns of `lineage` that contain the item and the number of these revisions.
+    A row names two revisions: an input and a result. `other` and `number` are the two columns, item id and revision
+    number, of the revision that is returned. Revisions in projects that the caller may not see are left out.
     """
     statement = (
         select(other.label("item"), number.label("revision"), item.c.kind, item.c.name)
@@ -120,7 +121,7 @@ def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[Li
 
 
 def _has_newer_content(item_id: Any, number: Any) -> ColumnElement[bool]:
-    """Return the condition that an item has a later revision which was not made by a merge of skeletons."""
+    """Return the SQL condition that an item has a revision after `number` that no merge of skeletons made."""
     later, merge = revision.alias("later"), lineage.alias("merge")
     is_merge = and_(
         merge.c.item_id == later.c.item_id, merge.c.number == later.c.number, merge.c.role == SKELETON_MERGE

@@ -59,9 +59,9 @@ class ItemFilters:
 
     @property
     def looks_up_name(self) -> bool:
-        """Whether `name` is a whole name without a wildcard, or ends in `**`.
+        """Whether `name` is given without a wildcard, or ends in `**`.
 
-        In `**`, the first asterisk is an ordinary character: `walk**` selects names that begin with the text `walk*`.
+        In `walk**`, only the last asterisk is a wildcard, so it selects the names that begin with `walk*`.
         """
         return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
 
@@ -80,8 +80,8 @@ def list_items(
 ) -> Page:
     """Return one page of a project's items of a kind; with `fields`, each item has only the members named there.
 
-    Raises `ForbiddenProblem` if the caller is an attempt of a job and the filters do not select by name
-    (`looks_up_name`).
+    With `count`, the page also contains the number of all items that match. Raises `ForbiddenProblem` if the caller is
+    an attempt of a job, unless the filters name the items (`ItemFilters.looks_up_name`).
     """
     if tx.principal.kind == "attempt" and not filters.looks_up_name:
         raise ForbiddenProblem(
@@ -100,7 +100,7 @@ def list_items(
 
 @dataclass(frozen=True, slots=True)
 class Namesakes:
-    """Items that have one name: how many there are, and the first of them as path, id and newest revision."""
+    """Items that have the same name: their number, and the first of them, each as path, id and newest revision."""
 
     count: int
     first: tuple[tuple[str, str, int], ...]
@@ -206,9 +206,10 @@ def _filter_conditions(project_id: str, filters: ItemFilters) -> list[ColumnElem
 
 
 def read_query(text: str, alike: Mapping[str, frozenset[str]] = MappingProxyType({})) -> Query:
-    """Parse the text of a query; `alike` is as in `ItemFilters`.
+    """Parse the text of a query.
 
-    Raises `BadRequestProblem`, which gives the column of the first fault.
+    `alike` maps the text of each condition `like(...)` to the ids of the clips that meet it (`ItemFilters.alike`).
+    Raises `BadRequestProblem`, with the column of the first fault, if the query is malformed.
     """
     try:
         return with_clips(parse(text), alike)
@@ -217,9 +218,11 @@ def read_query(text: str, alike: Mapping[str, frozenset[str]] = MappingProxyType
 
 
 def explain_query(tx: Transaction, project: str, kind: Kind, filters: ItemFilters, query: str) -> QueryExplanation:
-    """Count the items that match `filters`, and those of them that the query selects, or that each condition excludes.
+    """Explain which conditions of a query exclude how many of the items that match `filters`.
 
-    The conditions are the operands of the outermost `and` of the query, or else the whole query.
+    The answer contains the number of all these items, and of those that the query selects. For each condition, it
+    contains the number of items that the condition excludes, and of those that no other condition excludes. The
+    conditions are the operands of the outermost `and`; a query without an outermost `and` is one condition.
     """
     project_row = projects.require(tx, project)
     parts = parts_of(read_query(query, filters.alike))

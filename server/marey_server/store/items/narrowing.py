@@ -29,13 +29,13 @@ from marey_server.store.tables import INDEXED_CHARACTERS, INDEXED_FACTS, MemberS
 from marey_server.store.transaction import Transaction
 
 MOST_ITEMS = 1000
-"""Greatest number of items that may meet a condition that is used as `Narrowing.few`."""
+"""Greatest number of items that `Narrowing.few` may select."""
 
 Candidates = Callable[[Condition, str, Kind], Select[*tuple[Any, ...]]]
-"""Function that returns a query for the items of a project and kind that may meet a condition; the query uses an index.
+"""Function that returns an SQL query, supported by an index, for the items that may meet a condition.
 
-The columns of the query are the id of the item and the time of its creation, and the newest items come first. If the
-order is arbitrary instead, the second column is null for all items. The result may contain items that do not meet the
+The query has two columns: the id of an item and the time of its creation. Its rows are either in the order of creation,
+the newest first, or in no order; in the second case, all times are null. It may also find items that do not meet the
 condition, and items of other projects.
 """
 
@@ -49,7 +49,7 @@ class Narrowing(NamedTuple):
     few: ColumnElement[bool] | None = None
     """Condition that at most `MOST_ITEMS` items meet."""
     ordered: ColumnElement[bool] | None = None
-    """Condition that a fact has a certain value. More than `MOST_ITEMS` items have this value.
+    """Condition that a member of the summary has a certain value, which more than `MOST_ITEMS` items have.
 
     An index finds these items in the order of their creation, so a list in this order reads no other items.
     """
@@ -58,10 +58,10 @@ class Narrowing(NamedTuple):
 def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrowing:
     """Return the condition by which the fewest items have to be read for a query.
 
-    The condition is one of the operands of the outermost `and`: the operand for which an index finds the fewest items.
-    If an index finds more than `MOST_ITEMS` items for each operand, only comparisons of a fact with a single value are
-    considered. Of these, the rarest is chosen: the comparison whose newest `MOST_ITEMS` items reach furthest back in
-    time.
+    Each operand of the outermost `and` is a candidate if an index finds its items, or if it is a condition `like(...)`,
+    whose clips are known. If one of them has at most `MOST_ITEMS` items, the one with the fewest items is returned as
+    `few`. Otherwise, only operands that compare a member of the summary with a single value are considered. Of these,
+    the rarest is returned as `ordered`: the one whose newest `MOST_ITEMS` items reach furthest back in time.
     """
     fewest, few = MOST_ITEMS + 1, None
     oldest_us, ordered = None, None
@@ -84,10 +84,7 @@ def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrow
 
 
 def _indexed(query: Query) -> Iterator[tuple[Condition, Candidates]]:
-    """Yield the conditions that must be true for the query to be true, and whose items an index finds.
-
-    With each condition comes the function that uses the index.
-    """
+    """Yield the operands of the outermost `and` whose items an index finds, each with the function for this index."""
     for part in operands_of(query):
         if not isinstance(part, Condition):
             continue
@@ -100,9 +97,9 @@ def _indexed(query: Query) -> Iterator[tuple[Condition, Candidates]]:
 
 
 def _start(condition: Condition) -> ColumnElement[bool]:
-    """Return the SQL condition that a fact in the summary begins with the same characters as one of the values.
+    """Return the SQL condition that a member of the summary begins like one of the values of a condition.
 
-    Only the first `INDEXED_CHARACTERS` characters are compared, because the index contains no more.
+    The first `INDEXED_CHARACTERS` characters are compared, because the index contains no more.
     """
     start = MemberStart(item.c.summary, condition.field)
     wanted = [stored_text(one)[:INDEXED_CHARACTERS] for one in condition.values]
@@ -110,10 +107,10 @@ def _start(condition: Condition) -> ColumnElement[bool]:
 
 
 def _with_fact(condition: Condition, project_id: str, kind: Kind) -> Select[*tuple[Any, ...]]:
-    """Return a query for the ids and times of creation of the items whose fact has one of the values of the condition.
+    """Return a query for the items whose summary may have one of the values of the condition (see `Candidates`).
 
-    For a single value, the index of the fact returns the newest items first. For several values, the query has no
-    order, and its times are null: with an order, SQLite would read all items in the order of creation.
+    For a single value, the newest items come first, in the order of the index. For several values, the query has no
+    order, because SQLite would otherwise read all items in the order of creation.
     """
     present = (item.c.project_id == project_id, item.c.kind == kind.value, item.c.deleted_us.is_(None))
     if len(condition.values) > 1:
@@ -131,7 +128,7 @@ def _with_facet(condition: Condition, _: str, __: Kind) -> Select[*tuple[Any, ..
 
 
 def _in_range(condition: Condition, project_id: str, kind: Kind) -> Select[*tuple[Any, ...]]:
-    """Return a query for the items whose number or time is in the range of the condition.
+    """Return a query, without an order, for the items whose number or time is in the range of the condition.
 
     The query also finds deleted items, because the index that it uses does not contain the time of the deletion.
     """
@@ -143,6 +140,6 @@ def _in_range(condition: Condition, project_id: str, kind: Kind) -> Select[*tupl
 RANGES: dict[str, Comparison] = {
     "frames": frames_in_range, "created": COMPARISONS["created"], "updated": COMPARISONS["updated"],
 }  # fmt: skip
-"""Comparisons for the number and the times by which lists can be sorted; these fields are columns of an index."""
+"""Functions that convert conditions to SQL, for those fields with numbers or times for which there is an index."""
 CANDIDATES: dict[str, Candidates] = {**dict.fromkeys(INDEXED_FACTS, _with_fact), "tag": _with_tag}
-"""Functions that return the candidates for a condition, by the name of the field."""
+"""Functions that return the query for the items that may meet a condition `=`, by the name of the field."""

@@ -31,17 +31,17 @@ from marey_server.store.items.summaries import skeleton_of, summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import holdings
-from marey_server.store.quotas.holdings import Held
+from marey_server.store.quotas.holdings import ItemTotals
 from marey_server.store.tables import item, item_tag, lineage, revision_part
 from marey_server.store.transaction import Transaction
 
 Tree = dict[str, Any]
 
 DRAFTS_TOGETHER = 256
-"""Greatest number of drafts that are published with the same statements."""
+"""Greatest number of drafts that are published together, with one set of SQL statements."""
 
 _HEAD = (item.c.id, item.c.head, item.c.creator_id, item.c.skeleton_id)
-"""Columns of an item that a draft may use or revise."""
+"""Columns that are read of an item that a draft may use or revise."""
 
 _RACES = 20
 """Greatest number of tries to publish a draft if concurrent writes interfere."""
@@ -59,12 +59,13 @@ def publish(
 ) -> list[Published]:
     """Create items and revisions from drafts, all or none; return them in the order of the drafts.
 
-    In a document, `{"output": name}` refers to another draft and is replaced by the item and revision published from
-    it. The draft of a model may have a sample tree. The tree's `model_digest` may be such a reference, too, and is
-    replaced by the digest of the draft's model. With `refer_to_deleted`, documents may refer to items that are deleted.
+    In a document, `{"output": name}` refers to the draft `name`, and is replaced by the item and revision published
+    from this draft. In the sample tree of a model, `model_digest` may be such a reference, and is replaced by the
+    digest of the draft's model. With `refer_to_deleted`, documents may refer to deleted items.
+
     If an item already has the content of a draft, no new revision is created. Drafts with `same_skeleton` that would
-    change a skeleton (`skeleton_changes`) are left out, also from the result. `rights` are the rights of the user who
-    publishes; they may be None only if all drafts are hidden.
+    change the skeleton of an existing item are left out, and are missing in the result (see `skeleton_changes`).
+    `rights` are the rights of the user who publishes; they may be None only if all drafts are hidden.
 
     Raises `InvalidProblem` for a draft that is not valid, and `ConflictProblem` for a name that is taken. Raises
     `ForbiddenProblem` if `rights` do not allow writing to the folder of a new item or revision.
@@ -72,14 +73,17 @@ def publish(
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):
         twice = Counter(draft.name_in_batch for draft in drafts).most_common(1)[0][0]
-        raise InvalidProblem(f"Two results in the request have the name {twice!r}.", code="duplicate-output")
+        raise InvalidProblem(
+            f"Two results in the request have the name {twice!r}; give each result another name.",
+            code="duplicate-output",
+        )
     hold_off_purges(tx, project_row.id)
     require_places((draft for draft in drafts if draft.reuse != "by_content"), rights)
     publication = _Publication(tx, project_row, author_id, rights, job_id, refer_to_deleted)
     loaded = on_known_rigs(tx, project_row, without_skeleton_changes(tx, project_row, load_drafts(tx, drafts)))
     for together in _in_turns(loaded):
         publication.add(together)
-    holdings.hold(tx, project_row.id, publication.added)
+    holdings.count_added(tx, project_row.id, publication.added)
     faults.point("publish.before_commit")
     tx.after_commit(lambda: faults.point("publish.after_commit"))
     return [publication.done[draft.name_in_batch] for draft in drafts if draft.name_in_batch in publication.done]
@@ -165,7 +169,7 @@ class _Publication:
     job_id: str | None
     refer_to_deleted: bool
     done: dict[str, Published] = field(default_factory=dict)
-    added: dict[str | None, Held] = field(default_factory=dict)
+    added: dict[str | None, ItemTotals] = field(default_factory=dict)
     """Numbers of new items and their bytes, by the creator of the items; hidden or deleted items do not count."""
     _collection_ids: dict[str, str] = field(default_factory=dict)
 
@@ -283,10 +287,7 @@ class _Publication:
 
     @staticmethod
     def _first_of_equals(new: Sequence[_Ready]) -> list[_Ready]:
-        """Return the first draft of each content.
-
-        The other drafts with this content use the item that the first one creates.
-        """
+        """Return, of each group of drafts with equal content, the first; the others use the item that it creates."""
         firsts: dict[tuple[str | None, ...], _Ready] = {}
         for one in new:
             firsts.setdefault(one.required, one)
@@ -324,7 +325,7 @@ class _Publication:
         created = [(one, at) for at, one in zip(ids, new, strict=True) if at in made]
         self._write("item.created", [(one, _Head(at, 1, one.digests, self.author_id)) for one, at in created])
         counted = [at for one, at in created if not one.draft.hidden]
-        self._add(self.author_id, Held(len(counted), sum(rows[at]["stored_bytes"] for at in counted)))
+        self._add(self.author_id, ItemTotals(len(counted), sum(rows[at]["stored_bytes"] for at in counted)))
         for one in new:
             if one.draft.reuse == "new" and one.draft.name_in_batch not in self.done:
                 place = "/".join(filter(None, (one.draft.collection, one.draft.item_name)))
@@ -357,7 +358,7 @@ class _Publication:
         unchanged = item.c.head == head.number
         if write_head(self.tx, one.draft.kind, head.id, parts, one.bodies, unchanged, added_bytes=added):
             self._write("item.revised", [(one, replace(head, number=head.number + 1, parts=parts))])
-            self._add(head.creator_id, Held(stored_bytes=added))
+            self._add(head.creator_id, ItemTotals(stored_bytes=added))
 
     def _with_earlier_facts(self, one: _Ready, head: _Head) -> _Ready:
         """Return the draft of a clip, with empty facts about the recording filled in from the existing clip.
@@ -374,11 +375,11 @@ class _Publication:
         kept = {**one.digests, "info": digest_of_body(body)}
         return replace(one, digests=kept, bodies={**one.bodies, "info": body})
 
-    def _add(self, creator_id: str | None, more: Held) -> None:
-        self.added[creator_id] = self.added.get(creator_id, Held()) + more
+    def _add(self, creator_id: str | None, more: ItemTotals) -> None:
+        self.added[creator_id] = self.added.get(creator_id, ItemTotals()) + more
 
     def _write(self, event: OrdinaryEventKind, made: Sequence[tuple[_Ready, _Head]]) -> None:
-        """Insert the newest revisions of items, with their tags, sources and events."""
+        """Insert new revisions, which become the newest of their items, with their tags, sources and events."""
         if not made:
             return
         revisions = [NewRevision(head.id, head.number, head.parts, one.draft.message) for one, head in made]
@@ -410,10 +411,10 @@ class _Publication:
 
 
 def _names(draft: Draft) -> Iterator[str]:
-    """Yield the names to try for a new item.
+    """Yield the names to try for a new item, until one is free.
 
-    The first is the name that the draft asks for. If the draft reuses items with equal content, an item with other
-    content may have this name; therefore, numbered names follow without end: `walk-2`, `walk-3` and so on.
+    The first is the name of the draft. A draft with `reuse="by_content"` may get another name, because an item with
+    other content may have its name. So numbered names follow for it without end: `walk-2`, `walk-3` and so on.
     """
     yield draft.item_name
     if draft.reuse == "by_content":

@@ -38,10 +38,10 @@ from marey_server.store.database.clock import DAY_US, micros_of
 from marey_server.store.tables import collection, item, item_facet, item_tag
 
 Comparison = Callable[[Condition, str], ColumnElement[bool]]
-"""Function that returns the SQL of a condition in a project; the SQL is never null."""
+"""Function that converts a condition of a query to SQL, given the id of the project; the SQL is never null."""
 
 _MOST_FRAMES = 2.0**31 - 2
-"""Greatest number of frames in a comparison: less than the column `frames` can hold, and more than any item has."""
+"""Greatest number with which numbers of frames are compared: the column `frames` can hold it, and no item has more."""
 
 
 def sql_of(query: Query, project_id: str) -> ColumnElement[bool]:
@@ -58,7 +58,10 @@ def sql_of(query: Query, project_id: str) -> ColumnElement[bool]:
 
 
 def clips_like(condition: Likeness) -> list[str]:
-    """Return the ids of the clips that meet a condition. Raises `BadRequestProblem` if they were not searched for."""
+    """Return the ids of the clips that meet a condition `like(...)`, which must have been searched for before.
+
+    Raises `BadRequestProblem` if they were not, because only lists of clips accept such a condition.
+    """
     if condition.clips is None:
         raise BadRequestProblem(
             f"query, column {condition.column}: like(...) compares the newest revisions of existing clips, so only "
@@ -70,14 +73,17 @@ def clips_like(condition: Likeness) -> list[str]:
 
 
 def is_like(condition: Likeness) -> ColumnElement[bool]:
-    """Return the SQL condition that an item is one of the clips that meet a condition. Raises as `clips_like`."""
+    """Return the SQL condition that an item is among the clips of a condition `like(...)`.
+
+    Raises `BadRequestProblem` as `clips_like` does.
+    """
     listed = _TextsOf(literal(json.dumps(clips_like(condition)), Text()))
     found: ColumnElement[bool] = item.c.id.op("IN", is_comparison=True, return_type=Boolean())(listed)
     return found
 
 
 class _TextsOf(FunctionElement[str]):
-    """SQL expression for the texts in a JSON list, which is one parameter of the statement, however long it is."""
+    """SQL expression for the texts in a JSON list, which is a single parameter of the statement at any length."""
 
     type = Text()
     inherit_cache = True
@@ -98,7 +104,7 @@ def _any(made: list[ColumnElement[bool]]) -> ColumnElement[bool]:
 
 
 def _is_true(condition: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return the condition with null replaced by false."""
+    """Return an SQL condition with null replaced by false."""
     return func.coalesce(condition, false())
 
 
@@ -197,7 +203,7 @@ def stored_text(value: object) -> str:
 
 
 def _day_of(name: str) -> Comparison:
-    """Return a function that converts conditions on a field with a day to SQL."""
+    """Return a function that converts conditions on the member `name` of summaries, which is a day, to SQL."""
 
     def compare(condition: Condition, _: str) -> ColumnElement[bool]:
         stored: ColumnElement[Any] = item.c.summary[name].as_string()
@@ -238,7 +244,10 @@ def _time_of(column: ColumnElement[Any]) -> Comparison:
 
 
 def _span(one: object) -> tuple[int, int]:
-    """Return the first microsecond of a day (in UTC) or of a time, and its length in microseconds (1 for a time)."""
+    """Return the start of a day in UTC, or a time, in microseconds since 1970, and its length in microseconds.
+
+    The length of a time is 1.
+    """
     if isinstance(one, datetime):
         return micros_of(one), 1
     assert isinstance(one, date)
@@ -261,7 +270,7 @@ def _path(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def _folder(condition: Condition, project_id: str) -> ColumnElement[bool]:
-    """Return the condition on the folder of an item.
+    """Return the SQL condition on the folder of an item.
 
     `=` matches items in the given folder and in folders below it; `~` matches a part of the folder's path.
     """
@@ -281,7 +290,7 @@ def _tag(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def frames_in_range(condition: Condition, _: str) -> ColumnElement[bool]:
-    """Return the condition on the number of frames, written so that a database can use the index of this column.
+    """Return the SQL condition on the number of frames, written so that a database can use the index of the column.
 
     It selects the same items as the condition in `COMPARISONS`, but compares the column with whole numbers. A list must
     not use this form, unless it reads only few items. Otherwise SQLite uses this index instead of the index by which
@@ -298,7 +307,7 @@ def frames_in_range(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def facet_meets(condition: Condition) -> ColumnElement[bool]:
-    """Return the SQL condition that a row of `item_facet` has the name and the value that a query asks for."""
+    """Return the SQL condition that a row of `item_facet` meets a condition of a query on a facet."""
     named, value = item_facet.c.name == condition.field.removeprefix(FACET_PREFIX), item_facet.c.value  # never null
     if condition.operator == "has":
         return named
@@ -313,7 +322,7 @@ def _facet(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def _warning(condition: Condition, _: str) -> ColumnElement[bool]:
-    """Return the condition on the codes of warnings, which are stored as the text of a list: `["foot-slide", "gap"]`.
+    """Return the SQL condition on the codes of warnings, stored as the text of a list: `["foot-slide", "gap"]`.
 
     Codes contain no quotation marks or commas.
     """
@@ -362,5 +371,5 @@ COMPARISONS: dict[str, Comparison] = {
     "capture_system": _text_of("capture_system"),
     "consent_until": _day_of("consent_until"),
 }
-"""Comparisons by the name of the field."""
+"""Functions that convert a condition to SQL, by the name of the field."""
 assert set(COMPARISONS) == set(FIELDS), "every field of queries needs a comparison"

@@ -24,7 +24,10 @@ from marey_server.store.transaction import Transaction
 
 
 def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests: Collection[str]) -> set[str]:
-    """Return those of `digests` that are the current content of the part `part` in any item of the kind."""
+    """Return the digests, among `digests`, of documents that items of the project contain as their part `part`.
+
+    Only the newest revisions of items of the kind `kind` are searched, without deleted items.
+    """
     row = projects.require(tx, project)
     statement = (
         select(revision_part.c.document_digest)
@@ -41,7 +44,7 @@ def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests:
 
 
 def read_item(tx: Transaction, project: str, kind: Kind, item_id: str) -> Item:
-    """Return an item at its newest revision. Raises `NotFoundProblem`."""
+    """Return an item at its newest revision. Raises `NotFoundProblem` if it does not exist."""
     project_row = projects.require(tx, project)
     if reach.unreachable_items(tx, [item_id]):
         raise no_item(kind, item_id)
@@ -92,7 +95,7 @@ _PART = (
     .where(*_THIS_ITEM, revision_part.c.part == bindparam("part"))
 )
 _NEEDED_DELETED = and_(item.c.kind == Kind.SKELETON.value, item.c.purged_us.is_(None))
-"""Condition under which revisions of a deleted item can be read: revisions of clips may use a deleted skeleton."""
+"""SQL condition that revisions of a deleted item can be read: it is a skeleton, which clips may still use."""
 _PARTS_OF_PROJECT = Prepared(
     select(
         item.c.kind, and_(item.c.deleted_us.is_not(None), not_(_NEEDED_DELETED)).label("is_deleted"),
@@ -241,7 +244,7 @@ def find_part(
 def load_part(
     tx: Transaction, found: FoundPart, *, arrays: Literal["encoded", "decoded", "none"] = "encoded"
 ) -> dict[str, Any]:
-    """Load the document of a part, with its arrays in the form `arrays`."""
+    """Load the document of a part; `arrays` says whether its arrays are encoded, decoded (numpy) or references."""
     return documents.load_document(tx, found.digest, arrays=arrays)
 
 
@@ -285,16 +288,16 @@ def read_part(
 
 
 MOST_BYTES_AT_ONCE = 12 * MIB
-"""Bytes of documents that one answer contains, unless the first document alone is larger.
+"""Greatest total size in bytes of the documents in one answer; the first document may be larger.
 
-Together with the request and the encoded answer, they fit into the memory that one unknown client may hold
-(`process/memory.py`).
+The documents, the request and the encoded answer together fit into the memory that the server gives to one unknown
+client (`process/memory.py`).
 """
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedParts:
-    """Documents of several parts, in the order of a request, and their size in bytes; None for a missing part."""
+    """Documents of several parts in the order of a request, None for a missing part, and their total size in bytes."""
 
     documents: list[dict[str, Any] | None]
     size_bytes: int
@@ -303,10 +306,12 @@ class LoadedParts:
 def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> LoadedParts:
     """Load the documents of parts with encoded arrays, in the order of the request; None for a missing part.
 
-    The parts of deleted items count as missing, with two exceptions: revisions of clips may use a deleted skeleton, and
-    an attempt of a job can load parts of its inputs, because a version of a dataset may contain items that were deleted
-    later. If the documents together are too large, the list ends before the first document that does not fit; the first
-    document is always loaded.
+    The parts of deleted items count as missing, with two exceptions. Parts of deleted skeletons are loaded, because
+    revisions of clips may use them. An attempt of a job can load parts of its inputs, because a version of a dataset
+    may contain items that were deleted later.
+
+    The list ends before the first document with which all documents would have more than `MOST_BYTES_AT_ONCE`. The
+    first document is always loaded.
     """
     project_row = projects.require(tx, project)
     keys = {

@@ -34,17 +34,20 @@ def outputs_in(tree: Any) -> Iterator[str]:
 
 
 def with_model_digest(tree: Tree, digest: str | None) -> Tree:
-    """Return the tree with `digest` as its `model_digest`, if this member refers to the model of the same draft."""
+    """Return the sample tree with `digest` in its member `model_digest`, if that refers to the model of the same draft.
+
+    The tree is unchanged if the member is a digest already, or if `digest` is None.
+    """
     if digest is None or isinstance(tree["model_digest"], str):
         return tree
     return {**tree, "model_digest": digest}
 
 
 def with_imported_content(tree: Tree, before: Tree) -> Tree:
-    """Return the graph `tree` with an updated digest in its member `original`, if it was imported unchanged.
+    """Return the graph `tree`; if it is still as it was imported, update the content digest in its member `original`.
 
-    `before` is the graph with references to drafts, and `tree` the graph in which these references were resolved. If
-    `original` has the content digest of `before`, it gets the content digest of `tree`.
+    `before` is the graph with references to drafts; in `tree`, revisions replace these references. If `original` has
+    the content digest of `before`, the graph was not edited, and `original` gets the content digest of `tree`.
     """
     original = tree.get("original")
     if original is None or original["content"] != content_digest("graph", before):
@@ -99,7 +102,7 @@ class ReferenceCheck:
         self._seen: dict[tuple[str, int, Kind, str], Tree] = {}
 
     def know(self, published: Published, bodies: Mapping[str, Tree]) -> None:
-        """Remember the parts of a revision that this write has stored or found, so that no part is read twice."""
+        """Remember the documents of a published revision, so that `require` need not read them from the database."""
         for part, body in bodies.items():
             self._seen[published.item, published.revision, published.kind, part] = body
 
@@ -153,7 +156,10 @@ class ReferenceCheck:
                 self._referred(node["model"], Kind.MODEL, "model", pointer)
 
     def _referred(self, ref: Tree, kind: Kind, part: str, pointer: str) -> Tree:
-        """Return the document of the part `part` of the revision that `ref` names."""
+        """Return the document of the part `part` of the revision that `ref` names.
+
+        Raises `InvalidProblem` if the project has no such revision. `pointer` is the place of the reference.
+        """
         if "output" in ref:
             raise _invalid(
                 pointer,
@@ -170,7 +176,10 @@ class ReferenceCheck:
         return self._seen[key]
 
     def _look_up(self, item_id: str, number: int, kind: Kind, part: str) -> Tree | None:
-        """Return the document of a part, and lock its item, so that the item is not purged before this write ends."""
+        """Return the document of a part, or None if it does not exist.
+
+        The item is locked, so that it is not purged before this write ends.
+        """
         statement = (
             select(document.c.body)
             .join(revision_part, revision_part.c.document_digest == document.c.digest)

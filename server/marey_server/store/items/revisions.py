@@ -39,10 +39,11 @@ def write_head(
     *conditions: ColumnElement[bool],
     added_bytes: int,
 ) -> bool:
-    """Increase the number of the item's newest revision by one; return false if the item does not meet `conditions`.
+    """Increase the number of the item's newest revision by one, and update the summary of the item.
 
-    `parts` are the digests of the new revision's parts. `bodies` are the documents of these parts; documents of
-    unchanged parts may be omitted. `added_bytes` is the size of the changed parts, which counts towards quotas.
+    Returns false, and changes nothing, if the item is deleted or does not meet `conditions`. `parts` are the digests of
+    the new revision's parts, by name. `bodies` are the documents of these parts; documents of unchanged parts may be
+    omitted. `added_bytes` is the size of the changed parts, which counts towards quotas.
     """
     known = dict(bodies)
     for part, digest in parts.items():

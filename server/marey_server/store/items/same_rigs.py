@@ -57,14 +57,17 @@ class RigDocument:
 
     @cached_property
     def others(self) -> NDArray[np.float64]:
-        """The numbers that no motion replaces: rest rotations of the joints, and offsets of end sites."""
+        """Numbers that the motions of clips never replace: rest rotations of the joints, and offsets of end sites."""
         rotations = (joint.get("rest_rotation", _UNTURNED) for joint in self.body["joints"])
         sites = (site["offset"] for site in self.body.get("end_sites", ()))
         return np.array([*chain.from_iterable(rotations), *chain.from_iterable(sites)], float)
 
 
 def on_known_rigs(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
-    """In drafts of skeletons with `reuse="by_content"`, use an earlier hierarchy of the same rig (`is_same_rig`)."""
+    """Replace the hierarchies of new skeletons by existing hierarchies of the same rig (`is_same_rig`).
+
+    Only drafts of skeletons with `reuse="by_content"` are changed. Returns all drafts, in the same order.
+    """
     moved: dict[str, set[str]] = {}
     for one in loaded:
         joints = set(one.bodies.get("motion", {}).get("translated_joints", ()))
@@ -86,7 +89,10 @@ def on_known_rigs(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft
 
 
 def on_rig(one: LoadedDraft, rig: RigDocument, brought: PreparedDocument | StoredDocument | None = None) -> LoadedDraft:
-    """Return the draft of a skeleton with the hierarchy `rig`; `brought` is its document, or None if it is stored."""
+    """Return the draft of a skeleton with the hierarchy `rig` in place of its own.
+
+    `brought` is the document of this hierarchy, or None if the document is stored already.
+    """
     kept = brought or StoredDocument(rig.digest)
     return replace(one, contents={**one.contents, "hierarchy": kept}, bodies={**one.bodies, "hierarchy": rig.body})
 
@@ -94,10 +100,11 @@ def on_rig(one: LoadedDraft, rig: RigDocument, brought: PreparedDocument | Store
 def _known_rigs(
     tx: Transaction, project: ProjectRow, new: Mapping[str, RigDocument], moved: Mapping[str, Collection[str]]
 ) -> dict[str, RigDocument]:
-    """Return, by name, the hierarchies that new skeletons can use instead of their own, because the rig is the same.
+    """Find, for each new skeleton by name, an existing hierarchy of the same rig that it can use instead of its own.
 
-    The hierarchy belongs to a skeleton of the project, or to an earlier new skeleton. New skeletons whose own hierarchy
-    the project has are left out. The offset of the root is ignored, because every clip contains the root's position.
+    The hierarchy belongs to a skeleton of the project, or to an earlier skeleton in `new`. New skeletons whose own
+    hierarchy the project has already are left out. `moved` names the joints of each new skeleton whose offsets the
+    motions replace. The offset of the root is ignored, because every clip contains the root's position.
     """
     if {rig.digest for rig in new.values()} <= _stored_digests(tx, project).keys():
         return {}
@@ -118,7 +125,7 @@ def _known_rigs(
 
 
 def _stored_digests(tx: Transaction, project: ProjectRow) -> dict[str, str]:
-    """Return the digests of the hierarchies of a project, with the ids of their items, the oldest first."""
+    """Return the digests of the hierarchies of a project's skeletons, oldest first, each with the id of a skeleton."""
     statement = (
         select(revision_part.c.document_digest, item.c.id)
         .join(item, and_(item.c.id == revision_part.c.item_id, item.c.head == revision_part.c.number))
@@ -161,7 +168,10 @@ def first_of_rig(known: Sequence[RigDocument], new: RigDocument, moved: Callable
 
 
 def odd_offsets(known: RigDocument, new: RigDocument) -> frozenset[str] | None:
-    """Return the joints whose offsets differ; None if the structures, rest rotations or end sites differ."""
+    """Return the names of the joints whose offsets differ.
+
+    Returns None if the structures, the rest rotations or the end sites differ: then the rigs are different.
+    """
     if known.structure != new.structure or np.any(np.abs(known.others - new.others) > SAME_NUMBER):
         return None
     odd = np.any(np.abs(known.offsets - new.offsets) > SAME_NUMBER, axis=1)
@@ -169,7 +179,10 @@ def odd_offsets(known: RigDocument, new: RigDocument) -> frozenset[str] | None:
 
 
 def rig_difference(known: RigDocument, new: RigDocument, moved: Collection[str]) -> str:
-    """Return a clause for an error that states how two rigs differ; `moved` are joints whose offsets are ignored."""
+    """Return a clause for an error text that states how two rigs differ.
+
+    The offsets of the joints `moved` are ignored.
+    """
     if odd := sorted(set(known.names) ^ set(new.names)):
         return f"only one of them has {', '.join(odd[:5])}{', ...' if len(odd) > 5 else ''}"
     if known.structure != new.structure:

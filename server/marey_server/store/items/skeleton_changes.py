@@ -25,9 +25,10 @@ Tree = dict[str, Any]
 def without_skeleton_changes(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
     """Prevent drafts with `same_skeleton` from changing the skeletons of existing items; return the changed drafts.
 
-    If the skeleton of a draft is the same rig (`is_same_rig`) as the skeleton of the existing item, the draft refers to
-    the skeleton of the item instead, unless that is deleted. If it is another rig, the draft is left out, together with
-    the annotations of its clip, and with its skeleton if no other draft uses this skeleton.
+    If the skeletons of a draft and of the existing item are the same rig (`is_same_rig`), the draft refers to the
+    skeleton of the item instead. It does not if the skeleton of the item is deleted. If the rigs are different, the
+    draft is left out, together with the annotations of its clip. The skeleton of the draft is left out, too, if no
+    other draft uses it.
     """
     before = _skeletons_before(tx, project, [one for one in loaded if one.draft.same_skeleton])
     if not before:
@@ -69,7 +70,10 @@ def _moved_by(one: LoadedDraft) -> Collection[str]:
 
 
 def _rig(given: LoadedDraft | None, stored: _StoredSkeleton | None) -> RigDocument | None:
-    """Return the rig of a skeleton that is either another draft or stored; None if it is neither."""
+    """Return the rig of the skeleton that a draft refers to: another draft (`given`) or a stored skeleton.
+
+    Returns None if it is neither.
+    """
     if given is not None and "hierarchy" in given.contents:
         return RigDocument(given.contents["hierarchy"].digest, given.bodies["hierarchy"])
     return None if stored is None else stored.rig
@@ -78,10 +82,10 @@ def _rig(given: LoadedDraft | None, stored: _StoredSkeleton | None) -> RigDocume
 def _on_own_skeletons(
     tx: Transaction, loaded: Sequence[LoadedDraft], own: Mapping[str, _StoredSkeleton]
 ) -> list[LoadedDraft]:
-    """Return the drafts; a draft named in `own` refers to the skeleton given there, which its item already uses.
+    """Let the drafts that `own` names refer to the skeletons of their existing items, which `own` contains.
 
-    If only such drafts used a new skeleton, the draft of the new skeleton gets the rig of an existing skeleton, so that
-    no skeleton is created from it.
+    After this, a new skeleton may have no draft left that uses it. The draft of this skeleton then gets the rig of the
+    existing skeleton, so that no skeleton is created from it. Returns all drafts in the same order.
     """
     others = {name for one in loaded if one.draft.name_in_batch not in own for name in one.refers}
     replaced: dict[str, RigDocument] = {}
@@ -115,7 +119,7 @@ def _on_skeleton(tx: Transaction, one: LoadedDraft, reference: Tree) -> LoadedDr
 
 
 def _skeletons_before(tx: Transaction, project: ProjectRow, drafts: Sequence[LoadedDraft]) -> dict[str, str]:
-    """Return the ids of the skeletons of the items that drafts would revise, by the names of the drafts."""
+    """Return the ids of the skeletons that existing items use, by the names of the drafts that revise the items."""
     found = {}
     for some in in_lists(drafts):
         places = {(one.draft.kind.value, one.draft.collection, one.draft.item_name): one for one in some}

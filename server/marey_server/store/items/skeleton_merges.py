@@ -43,12 +43,12 @@ from marey_server.store.transaction import Transaction, in_lists
 Tree = dict[str, Any]
 
 _LOADED_TOGETHER = 50
-"""Number of items whose documents are loaded at once; few, because often the first item decides the result."""
+"""Number of items whose documents are loaded at once. It is small, because often the first item decides the result."""
 
 
 @dataclass
 class _Skeleton:
-    """Skeleton of the project, with the numbers of items whose newest revision uses it, by kind."""
+    """Skeleton of the project, with the number of items of each kind whose newest revision uses it (`users`)."""
 
     row: Any
     rig: RigDocument
@@ -72,7 +72,7 @@ class _Skeleton:
 
 
 @dataclass(frozen=True)
-class _User:
+class _UsingItem:
     """Item that uses a skeleton, with the documents of its newest revision."""
 
     row: Any
@@ -85,7 +85,7 @@ class _User:
 
     @property
     def moved(self) -> frozenset[str]:
-        """The joints whose offsets the motion replaces."""
+        """Names of the joints whose offsets the motion of the item replaces with translations."""
         return frozenset(self.bodies[SKELETON_PARTS[self.kind]].get("translated_joints", ()))
 
 
@@ -96,9 +96,10 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
     newest revision of the kept skeleton. Annotations of the clips get revisions that refer to the new revisions of the
     clips. The merged skeletons are deleted.
 
-    Raises `NotFoundProblem` for an unknown skeleton, `InvalidProblem` for named skeletons that are not the same rig,
-    `ConflictProblem` for a joint map made by hand that would be lost, `TooLargeProblem` for too many skeletons or
-    items, and `ForbiddenProblem` unless the caller is a maintainer of all folders.
+    Raises `NotFoundProblem` for an unknown skeleton, and `InvalidProblem` if the named skeletons are not one rig.
+    Raises `ConflictProblem` if a joint map that somebody has made or confirmed would be lost, or if another request
+    changes the items. Raises `TooLargeProblem` for too many skeletons or items, and `ForbiddenProblem` unless the
+    caller is a maintainer of all folders.
     """
     row = projects.require(tx, project)
     if request.dry_run:
@@ -161,7 +162,7 @@ def _find_skeletons(tx: Transaction, project: ProjectRow, request: SkeletonMerge
 
 
 def _uses(project: ProjectRow, skeletons: Sequence[str]) -> ColumnElement[bool]:
-    """Return the SQL condition that an item uses one of the skeletons, so that a merge must change the item."""
+    """Return the SQL condition for items of the project that use one of the skeletons, so that a merge changes them."""
     return and_(
         item.c.project_id == project.id, item.c.skeleton_id.in_(skeletons), item.c.deleted_us.is_(None),
         item.c.kind.in_([kind.value for kind in SKELETON_PARTS]),
@@ -178,7 +179,7 @@ def _count_users(tx: Transaction, project: ProjectRow, skeletons: Sequence[str])
     return counts
 
 
-def _users(tx: Transaction, project: ProjectRow, skeleton: str, *, lock: bool) -> Iterator[_User]:
+def _items_using(tx: Transaction, project: ProjectRow, skeleton: str, *, lock: bool) -> Iterator[_UsingItem]:
     """Yield the items whose newest revision uses a skeleton, each with its documents; with `lock`, lock their rows."""
     statement = item_rows().where(_uses(project, [skeleton])).order_by(item.c.id).limit(MOST_MOVED)
     rows = tx.execute(statement.with_for_update(of=item) if lock else statement).all()
@@ -190,7 +191,7 @@ def _users(tx: Transaction, project: ProjectRow, skeleton: str, *, lock: bool) -
         )
         for row in some:
             parts = digests[row.id, row.head]
-            yield _User(row, parts, {part: bodies[digest] for part, digest in parts.items() if digest in bodies})
+            yield _UsingItem(row, parts, {part: bodies[digest] for part, digest in parts.items() if digest in bodies})
 
 
 def _locked(statement: Any, request: SkeletonMergeRequest) -> Any:
@@ -202,7 +203,9 @@ def _rigs(
 ) -> list[tuple[_Skeleton, list[_Skeleton]]]:
     """Return each skeleton that is kept, with the skeletons that are merged into it.
 
-    The documents of clips and other items are read only if skeletons differ in offsets, which motions may replace.
+    Skeletons may differ in offsets that motions replace. Only in this case, the documents of clips and other items are
+    read. Raises `InvalidProblem` if named skeletons are not one rig, `ConflictProblem` if joint maps that somebody
+    edited differ, and `TooLargeProblem` if more than `MOST_MOVED` items would change.
     """
     best_first = sorted(
         skeletons,
@@ -242,15 +245,15 @@ def _rigs(
 
 
 def _moved(tx: Transaction, project: ProjectRow, skeleton: _Skeleton) -> frozenset[str]:
-    """Return the joints whose offsets the motions of all items that use a skeleton replace.
+    """Return the joints whose offsets are replaced by the motion of every item that uses a skeleton.
 
     The result is empty if no item uses the skeleton, or if more than `MOST_MOVED` items do.
     """
     if skeleton.user_count > MOST_MOVED:
         return frozenset()
     common: frozenset[str] | None = None
-    for user in _users(tx, project, skeleton.row.id, lock=False):
-        common = user.moved if common is None else common & user.moved
+    for one in _items_using(tx, project, skeleton.row.id, lock=False):
+        common = one.moved if common is None else common & one.moved
         if not common:
             break  # most motions replace no offset, so the first one decides
     return common or frozenset()
@@ -270,18 +273,22 @@ def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonM
 
 
 def _move(tx: Transaction, project: ProjectRow, merged: _Skeleton, kept: _Skeleton) -> None:
-    """Use the kept skeleton in new revisions of all items that use the merged one; move clips' annotations to them."""
+    """Replace the merged skeleton by the kept one, in new revisions of all items that use the merged skeleton.
+
+    The annotations of clips get revisions that refer to the new revisions of the clips. Raises `ConflictProblem` if
+    another request has changed one of the items.
+    """
     reference = {"item": kept.row.id, "revision": kept.row.head}
     message = f"The skeleton {merged.named['path']} was merged into {kept.named['path']}"
-    users = list(_users(tx, project, merged.row.id, lock=True))
-    if Counter(user.row.kind for user in users) != merged.users or any(not merged.odd <= user.moved for user in users):
+    found = list(_items_using(tx, project, merged.row.id, lock=True))
+    if Counter(one.row.kind for one in found) != merged.users or any(not merged.odd <= one.moved for one in found):
         raise ConflictProblem(
             f"Other requests changed items that use the skeleton {merged.named['path']} at the same time; try again.",
             code="contended",
             unnamed="Other requests changed items that use a skeleton at the same time; try again.",
         )
-    _publish(tx, project, [_draft(tx, user, reference, message) for user in users])
-    clips = {user.row.id: user.row.head for user in users if user.kind is Kind.CLIP}
+    _publish(tx, project, [_draft(tx, one, reference, message) for one in found])
+    clips = {one.row.id: one.row.head for one in found if one.kind is Kind.CLIP}
     _publish(tx, project, list(_moved_annotations(tx, project, clips, message)))
 
 
@@ -292,13 +299,13 @@ def _publish(tx: Transaction, project: ProjectRow, drafts: Sequence[Draft]) -> l
     return made
 
 
-def _draft(tx: Transaction, user: _User, reference: Tree, message: str) -> Draft:
-    """Return the draft of an item's revision with another skeleton; the arrays of its documents are the same."""
-    part = SKELETON_PARTS[user.kind]
-    changed = {part: {**user.bodies[part], "skeleton": reference}}
-    if "tree" in user.bodies:
-        changed["tree"] = {**user.bodies["tree"], "model_digest": digest_of_body(changed["model"])}
-    return _revised(tx, user.row, user.digests, changed, message)
+def _draft(tx: Transaction, one: _UsingItem, reference: Tree, message: str) -> Draft:
+    """Return the draft of a new revision of an item that refers to another skeleton; its arrays are the same."""
+    part = SKELETON_PARTS[one.kind]
+    changed = {part: {**one.bodies[part], "skeleton": reference}}
+    if "tree" in one.bodies:
+        changed["tree"] = {**one.bodies["tree"], "model_digest": digest_of_body(changed["model"])}
+    return _revised(tx, one.row, one.digests, changed, message)
 
 
 def _revised(tx: Transaction, row: Any, digests: Mapping[str, str], changed: Mapping[str, Tree], message: str) -> Draft:
@@ -311,9 +318,10 @@ def _revised(tx: Transaction, row: Any, digests: Mapping[str, str], changed: Map
 
 
 def _moved_annotations(tx: Transaction, project: ProjectRow, clips: Mapping[str, int], message: str) -> Iterator[Draft]:
-    """Yield drafts of the annotations of clips; `clips` are the revisions of the clips before the merge.
+    """Yield drafts in which the annotations of clips refer to the next revisions of the clips.
 
-    Annotations of earlier revisions stay as they are.
+    `clips` maps the ids of the clips to their newest revisions before the merge. Annotations that refer to earlier
+    revisions are left out.
     """
     for some in in_lists(sorted(clips)):
         of_clips = item.c.summary["clip"].as_string().in_(some)

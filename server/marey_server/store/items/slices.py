@@ -65,7 +65,10 @@ def _translation_columns(names: Sequence[str], wanted: Sequence[str]) -> NDArray
 def _cut(
     stored: EncodedArray, frames: range, columns: NDArray[np.intp] | None, *, encoded: bool
 ) -> NDArray[Any] | EncodedArray:
-    """Return frames and columns of an array; `columns` are indices into the flattened axes after the first."""
+    """Return some frames and columns of an array, whose first axis is the frames.
+
+    `columns` are indices into all other axes, flattened; None means all columns.
+    """
     if encoded and columns is None:
         return stored.cut_frames(frames.start, frames.stop)
     array = blocks.decode(stored.data, frames=slice(frames.start, frames.stop), columns=columns)

@@ -18,7 +18,7 @@ LABELS_SHOWN = 32
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Summary of an item, and the facts in it that have columns of their own."""
+    """Summary of an item (`shown`), and those of its values that are also columns of the table `item`."""
 
     shown: dict[str, Any]
     frames: int = 0
@@ -67,7 +67,7 @@ def take_record(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _moved(motion: Mapping[str, Any], skeleton: str | None, known: Mapping[str, Any]) -> Summary:
-    """Return the summary of a motion, with the facts in `known` added."""
+    """Return the summary of a motion: its length, rate, joints and skeleton, and the members of `known`."""
     frames = motion["poses"]["shape"][0]
     shown = {
         "frames": frames,

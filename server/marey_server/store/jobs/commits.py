@@ -52,8 +52,11 @@ from marey_versions.records import DatasetEntry, RevisionKey, key_of
 from marey_versions.tree.chunks import DamagedChunk
 
 Target = dict[str, Any]
-"""Stored commit of a job: the fields of `OutputsCommit`, `dataset_id`, `base` (the newest commit of the branch when the
-inputs were pinned), `within` (the dataset's folder), and `kinds` (of the outputs)."""
+"""Commit that a job is to make, in the form in which the job stores it.
+
+It has the fields of `OutputsCommit` and four others: `dataset_id`; `base`, the newest commit of the branch when the
+job's input revisions were fixed; `within`, the path of the dataset's folder; and `kinds`, the kinds of the outputs.
+"""
 
 
 # -- submission -------------------------------------------------------------------------------------------------------
@@ -116,8 +119,8 @@ def check_again(
 ) -> Target | None:
     """Check the commit of a job that is retried; return it, or None if the job makes no commit.
 
-    The commit keeps its base, which is an earlier head of the branch. But if the dataset was replaced by another one of
-    the same name, the commit gets a new base. Raises the errors of `check_target`.
+    The commit keeps its base, an earlier commit of the branch. If the dataset was deleted and another one has its name
+    now, the base is the newest commit of the branch in the new dataset. Raises the errors of `check_target`.
     """
     if target is None:
         return None
@@ -127,19 +130,19 @@ def check_again(
 
 
 def with_new_base(tx: Transaction, target: Target | None) -> Target | None:
-    """Return the commit that a job is to make, with the present head of the branch as the base.
+    """Return the commit that a job is to make, with the present newest commit of the branch as its base.
 
-    Called when outputs of other jobs are pinned as inputs of the job. `target` is returned unchanged if the branch does
-    not exist.
+    Called when the outputs of other jobs become inputs of the job. `target` is returned unchanged if it is None, or if
+    the branch does not exist.
     """
     ref = None if target is None else find_ref(tx, target["dataset_id"], target["branch"])
     return target if target is None or ref is None else {**target, "base": ref.digest}
 
 
 def shown_commit(row: Any) -> JobCommit | None:
-    """Return the commit of a job as a document, or None if the job makes none.
+    """Return the commit of a job as a document, or None if the job makes no commit.
 
-    A task makes none, because its parent job commits the outputs of all tasks.
+    A task makes no commit, because its parent job commits the outputs of all tasks.
     """
     target: Target | None = row.commit_to
     if target is None or row.parent_id is not None:
@@ -173,10 +176,10 @@ def _joined(*names: str) -> str:
 
 @dataclass(frozen=True)
 class PublishedOutputs:
-    """Published outputs of a job, and the values of the job's columns that the commit determines.
+    """Published outputs of a job, and the values of the columns of the job that record its commit.
 
-    If `failure` is set, nothing was published. The reason is that the author may not write to a folder of the outputs
-    any more, or that the commit is not allowed.
+    If `failure` is set, nothing was published. Either the author of the job may not write to a folder of the outputs
+    any more, or the commit is not allowed.
     """
 
     outputs: list[dict[str, Any]] = field(default_factory=list)
@@ -189,9 +192,10 @@ class PublishedOutputs:
         return self.columns.get("committed")
 
     def result(self, kind: str, result: dict[str, Any]) -> dict[str, Any]:
-        """Return the result of the job; entries for files (`reports_entries`) say what was published for each file.
+        """Return the result of the job, with what was published added to its entries for files.
 
-        Raises `InvalidProblem` if an entry is not valid.
+        Only results of kinds with `reports_entries` have such entries. Raises `InvalidProblem` if an entry is not
+        valid.
         """
         declaration = job_kinds().get(kind)
         if declaration is None or not declaration.reports_entries or "entries" not in result:
@@ -199,7 +203,8 @@ class PublishedOutputs:
         try:
             return published_result(result, {one["name"]: JobOutput.model_validate(one) for one in self.outputs})
         except ValidationError as error:
-            raise InvalidProblem("An entry for a file in the result of the job is not valid.") from error
+            detail = "The result of the job is not valid: each of its `entries` must be a valid `ImportEntry`."
+            raise InvalidProblem(detail) from error
 
 
 JOB_COLUMNS = (
@@ -255,9 +260,9 @@ def commit_tasks(tx: Transaction, row: Any) -> PublishedOutputs:
 
 
 def entries_of_tasks(tx: Transaction, row: Any) -> OutputEntries:
-    """Return the outputs of all tasks of a parent job as entries. `row` has the columns `JOB_COLUMNS`.
+    """Return the outputs of all tasks of a parent job as dataset entries. `row` has the columns `JOB_COLUMNS`.
 
-    At most `MOST_COMMITTED` + 1 outputs are read, because a commit of more than `MOST_COMMITTED` is refused.
+    At most `MOST_COMMITTED` + 1 outputs are read, because a commit of more than `MOST_COMMITTED` is refused anyway.
     """
     return _entries_of(tx, row, islice(_outputs_of_tasks(tx, row.id), MOST_COMMITTED + 1))
 
@@ -265,9 +270,10 @@ def entries_of_tasks(tx: Transaction, row: Any) -> OutputEntries:
 def commit_planned_tasks(
     tx: Transaction, row: Any, wanted: OutputEntries, planned: PlannedCommit | None
 ) -> PublishedOutputs | None:
-    """Commit the outputs `wanted` of a parent job as planned by an earlier transaction.
+    """Commit the outputs `wanted` of a parent job, as `planned` by an earlier transaction.
 
-    Returns None if the commit must be planned again. `row` has the columns `JOB_COLUMNS`.
+    Returns None if the commit must be planned again, because others have moved the branch. If the commit is refused,
+    the result contains the failure. `row` has the columns `JOB_COLUMNS`.
     """
     try:
         with tx.connection.begin_nested():
@@ -327,7 +333,9 @@ def _commit(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]]) -> 
     except ApiProblem as error:
         raise _CommitRefused(row.commit_to, error) from None
     except DamagedChunk as error:
-        problem = DamagedProblem(f"The stored data of the dataset are damaged: {error}.")
+        problem = DamagedProblem(
+            f"The stored data of the dataset are damaged: {error}. Ask the operator to run `marey db fsck`."
+        )
         raise _CommitRefused(row.commit_to, problem) from error
 
 

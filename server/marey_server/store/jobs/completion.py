@@ -32,8 +32,8 @@ from marey_server.store.jobs.fencing import (
     HELD,
     held,
     held_parameters,
-    hold,
     lease_lost,
+    lock_held_job,
     require_attempt,
     stored_answer,
 )
@@ -66,7 +66,11 @@ def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest)
 
 
 def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> list[BatchCompletionResult]:
-    """Complete many jobs of one worker in one transaction; each is accepted or refused separately."""
+    """Complete many jobs of one worker in one transaction; return the results in the order of `completions`.
+
+    Each completion is accepted or refused separately. Only attempts that were claimed with the caller's own token are
+    accepted.
+    """
     requests = {(one.job, one.fence): one for one in reversed(completions)}
     own = _claimed_by_caller(tx, requests)
     hold_off_purges_of_jobs(tx, (job_id for job_id, _ in own))
@@ -173,10 +177,11 @@ def _complete(
 def _keep_from_sharing(
     tx: Transaction, won: Collection[Any], requests: Mapping[_Place, CompleteRequest]
 ) -> set[_Place]:
-    """Remove the cache keys of jobs whose results must not be shared; return the attempts without a cache key.
+    """Remove the cache keys of completed jobs whose results must not be shared.
 
-    These are the jobs whose worker reports a result that is not shareable, the jobs whose worker has another version
-    of the job kind, and the parent jobs of both.
+    A result must not be shared if the worker reports that it is not shareable, or if the worker has another version of
+    the job kind. The result of a parent job must not be shared if the result of a task must not be shared. Returns all
+    completed attempts whose jobs have no cache key.
     """
     unshared = {(row.id, row.fence) for row in won if row.cache_key is None}
     barred = {(row.id, row.fence) for row in won if not _may_share(row.kind, requests[row.id, row.fence])}
@@ -190,7 +195,7 @@ def _keep_from_sharing(
 
 
 def _may_share(kind_name: str, request: CompleteRequest) -> bool:
-    """Return whether a result may be shared, and was computed with the version of the kind that this server knows."""
+    """Return whether the worker allows sharing the result and has the version of the job kind that the server knows."""
     try:
         known = find_kind(kind_name).code_version
     except UnknownKindError:  # an earlier version of the server accepted the job
@@ -315,7 +320,7 @@ def fail(
         if earlier["state"] == JobState.SUCCEEDED:
             raise lease_lost(job_id, fence)
         return FailAnswer(**earlier)
-    row = hold(tx, job_id, fence, *ENDING_COLUMNS)
+    row = lock_held_job(tx, job_id, fence, *ENDING_COLUMNS)
     outcome = decide_outcome(row, request, policy, poisoned=_is_poisoned(tx, job_id, request.signature))
     answer = FailAnswer(
         job=job_id,

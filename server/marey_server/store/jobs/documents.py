@@ -38,17 +38,18 @@ def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
     return [found[one] for one in ids]
 
 
-_UNSAID = {column.key: getattr(column.default, "arg", None) for column in job.c}
+_DEFAULTS = {column.key: getattr(column.default, "arg", None) for column in job.c}
 """Initial values of columns, for those columns that `new_row` omits."""
 
 
 def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:
-    """Return the document of a job that this transaction inserted for the caller, without reading the row back.
+    """Return the document of a job that this transaction has inserted for the caller, without reading the database.
 
-    The result equals that of `job_documents`. `row` must be the row as it was inserted, of a job without tasks.
+    `row` is the row as it was inserted, and `after` contains the ids of the jobs on which the job depends. The job must
+    not have tasks. The result equals that of `job_documents`.
     """
     names = {"project_name": project_name, "author_name": tx.principal.user_name}
-    return _document(SimpleNamespace(**{**_UNSAID, **row, **names}), tuple(sorted(after)), {}, None)
+    return _document(SimpleNamespace(**{**_DEFAULTS, **row, **names}), tuple(sorted(after)), {}, None)
 
 
 def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
@@ -69,7 +70,10 @@ _DEPENDENCIES = Prepared(
 
 
 def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
-    """Return, for each job, the ids of the jobs that it depends on, except the job whose result it shares."""
+    """Return the ids of the jobs on which each job depends, by job; jobs without dependencies are left out.
+
+    The job whose result a job waits to share is no dependency in this sense.
+    """
     shared = {row.id: row.cached_from for row in rows}
     found: dict[str, tuple[str, ...]] = {}
     for row in tx.run(_DEPENDENCIES, {"ids": list(shared)}):

@@ -49,7 +49,7 @@ def failure_document(reason: FailureReason, code: str, detail: str) -> dict[str,
 
 
 def dependency_failure(cause: str, state: str) -> dict[str, Any]:
-    """Return the failure of a job whose dependency did not succeed."""
+    """Return the failure of a job that depends on the job `cause`, which ended in `state` without success."""
     detail = f"This job needs {cause} to succeed, but {cause} is {state}."
     return failure_document(FailureReason.DEPENDENCY_FAILED, "dependency-failed", detail)
 
@@ -70,7 +70,7 @@ def end_jobs(tx: Transaction, condition: ColumnElement[bool], state: str, **valu
 
 @dataclass(frozen=True, slots=True)
 class AttemptEnd:
-    """End of one attempt."""
+    """End of one attempt: its outcome, and the answer that a repeated request with the same `write_id` gets."""
 
     job_id: str
     fence: int

@@ -16,9 +16,10 @@ from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
 
 ENDED = "consent_ended"
-"""Member of the result of an export job: ids of those clips of the exported input whose consent had ended.
+"""Name of a member of the result of an export job: the ids of the exported clips whose consent had ended.
 
-In the inputs that a worker gets, the member with this name is the last day of the consent.
+In the inputs that a worker gets, a clip has a member with this name if its consent has ended: the last day of the
+consent.
 """
 
 
@@ -37,7 +38,7 @@ def lease_inputs(tx: Transaction, kind_name: str, inputs: Mapping[str, Any]) -> 
     """Return the inputs of a job in the form that a worker gets.
 
     Each clip that the job exports and whose consent has ended gets the additional member `ENDED`, the last day of the
-    consent. The consent has ended if this day is before the present day; the day of the submission does not matter.
+    consent. The consent has ended if this day is before today (UTC), whenever the job was submitted.
     """
     try:
         kind = find_kind(kind_name)
@@ -58,9 +59,8 @@ def lease_inputs(tx: Transaction, kind_name: str, inputs: Mapping[str, Any]) -> 
 def may_share(tx: Transaction, kind_name: str, inputs: Mapping[str, Any], result: Mapping[str, Any] | None) -> bool:
     """Return whether consents allow a new job to share the result of an identical job.
 
-    If the job exports clips, the consents of the same clips must have ended for both jobs. So the result is not shared
-    if the consent for another clip has ended since. It is not shared either if a later last day of a consent was
-    recorded.
+    If the job exports clips, the clips whose consent has ended must be the same for both jobs. So the result is not
+    shared if the consent for a further clip has ended since, or if a consent was prolonged.
     """
     try:
         kind = find_kind(kind_name)
@@ -79,8 +79,8 @@ def record_permission(
 ) -> None:
     """Record an event if a new job may export clips whose consent has ended; the event names these clips.
 
-    Clips that are not known yet, or whose consent ends before the job runs, are missing in the event. The result of the
-    job lists them, too. Raises `ForbiddenProblem` unless the caller is a maintainer or an owner.
+    The event does not name clips that are not known yet, or whose consent ends between now and the run of the job; the
+    result of the job names all of them. Raises `ForbiddenProblem` unless the caller is a maintainer or an owner.
     """
     if kind.exports is None or not params.get("allow_expired_consent"):
         return

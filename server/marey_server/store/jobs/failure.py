@@ -42,18 +42,25 @@ ENDING_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class AttemptOutcome:
-    """Next state of a job after an attempt, outcome of the attempt, and wait before a retry."""
+    """Decision about a job after an attempt: the next state of the job, and the outcome of the attempt.
+
+    `rest_us` is the wait before a retry in microseconds; it is None if the job is not retried.
+    """
 
     state: str
     attempt_outcome: str
     rest_us: int | None = None
     failure: dict[str, Any] | None = None
     counts_as: Literal["attempt", "interruption", "unstarted"] = "attempt"
-    """Limit against which the attempt counts: `max_attempts`, or a limit of the policy."""
+    """Limit towards which the attempt counts: `max_attempts` of the job ("attempt"), or a limit of `QueuePolicy`."""
 
 
 def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned: bool) -> AttemptOutcome:
-    """Return the outcome of an attempt that the worker reports as failed. `row` holds `ENDING_COLUMNS`."""
+    """Decide what happens after an attempt that the worker reports as failed.
+
+    `row` has the columns `ENDING_COLUMNS`. With `poisoned`, an earlier attempt failed with the same signature, so the
+    job is not retried.
+    """
     if row.cancel_requested_us is not None:
         return AttemptOutcome("cancelled", "cancelled")
     if not row.author_may_run:
@@ -74,7 +81,7 @@ def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, 
 
 
 def decide_expired_outcome(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
-    """Return the outcome of an attempt whose lease expired. A retry is queued without delay.
+    """Decide what happens after an attempt whose lease has expired. A retry is queued without delay.
 
     An attempt that has written nothing does not count as a try, because the answer to its claim may have been lost. If
     the lease was renewed until the deadline of the job, the worker was alive and did not stop in time. If the lease
@@ -151,7 +158,7 @@ def apply_outcome(
 
 
 def end_for_lost_author(tx: Transaction, job_id: str, fence: int) -> None:
-    """End a job whose author may no longer run it, if the attempt still holds the job."""
+    """End a job whose author may no longer run it; do nothing if the attempt no longer holds the job."""
     hold_off_purges_of_jobs(tx, [job_id])
     condition = and_(held(job_id, fence), not_(AUTHOR_MAY_RUN))
     row = tx.execute(select(*ENDING_COLUMNS).where(condition).with_for_update()).one_or_none()

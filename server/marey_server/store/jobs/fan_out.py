@@ -150,9 +150,10 @@ def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _combine(known: Any, value: Any) -> Any:
-    """Return `known` combined with `value`: numbers are added, lists joined and objects merged.
+    """Return `known` combined with `value`: numbers are added, lists joined (up to `MOST_GATHERED`), objects merged.
 
-    If `value` has another type, `known` is returned. If `known` has another type than `value`, `known` is ignored.
+    If `value` is no number, list or object, `known` is returned. If `known` has another type than `value`, the result
+    is `value` alone.
     """
     if isinstance(value, int | float) and not isinstance(value, bool):
         return value + (known if isinstance(known, int | float) else 0)

@@ -52,20 +52,25 @@ HELD = and_(
     job.c.state == RUNNING,
     tuple_(job.c.id, job.c.fence).in_(bindparam("held_attempts", expanding=True)),
 )
-"""The condition `held` for several attempts, in prepared statements; `held_parameters` gives the attempts."""
+"""SQL condition that one of several attempts still holds its job, as `held`, for prepared statements.
+
+`held_parameters` returns the parameters that name the attempts.
+"""
 
 
 def held_parameters(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
-    """Return the parameters of the condition `HELD` for attempts."""
+    """Return the parameters of the condition `HELD` for attempts, each given by the id of its job and its fence."""
     return {"held_ids": [job_id for job_id, _ in attempts], "held_attempts": list(attempts)}
 
 
 UNCOUNTED: ColumnElement[int] = case((job.c.counted_fence < job.c.fence, 1), else_=0)
-"""SQL expression: 1 while the attempt that holds the job has written nothing and is not counted yet; else 0."""
+"""SQL expression: 1 if the attempt that holds the job was not counted yet, because it has written nothing; else 0."""
 
 COUNT_ATTEMPT: dict[str, Any] = {"attempt": job.c.attempt + UNCOUNTED, "counted_fence": job.c.fence}
-"""Values that every write of an attempt sets in its job: an attempt counts from its first write, not from its claim,
-because the answer to the claim may have been lost."""
+"""Values that every write of an attempt sets in its job, so that the first write counts the attempt.
+
+The claim does not count the attempt, because its answer may have been lost.
+"""
 
 _MAY_WRITE = or_(
     user.c.administrator.is_(True),
@@ -78,7 +83,7 @@ _MAY_WRITE = or_(
 AUTHOR_MAY_RUN: ColumnElement[bool] = or_(
     job.c.author_id.is_(None), exists().where(user.c.id == job.c.author_id, user.c.disabled.is_(False), _MAY_WRITE)
 )
-"""The condition that the author of a job still has a role that may submit jobs, or that the job has no author.
+"""SQL condition that the author of a job still has a role that may submit jobs, or that the job has no author.
 
 A role in one folder suffices; the transaction that publishes results checks the role in the folders of the results.
 """
@@ -98,11 +103,11 @@ def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
         raise lease_lost(job_id, fence)
 
 
-def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
-    """Lock the job for this transaction and return `columns` of its row.
+def lock_held_job(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
+    """Lock the job of an attempt until the transaction ends, and return `columns` of the job's row.
 
-    If this is the first write of the attempt, the attempt is counted as a try of the job. Raises `LeaseLostProblem` if
-    the attempt no longer holds the job.
+    If this is the first write of the attempt, the attempt is counted towards `max_attempts`. Raises `LeaseLostProblem`
+    if the attempt no longer holds the job.
     """
     holding = held(job_id, fence)
     statement = select(job.c.project_id, UNCOUNTED.label("uncounted"), *columns).where(holding).with_for_update()
@@ -124,7 +129,7 @@ def lease_lost(job_id: str, fence: int) -> LeaseLostProblem:
 
 
 def stored_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> dict[str, Any] | None:
-    """Return the stored answer for this `write_id`, or None."""
+    """Return the answer that an earlier request of the attempt with this `write_id` got, or None."""
     statement = select(attempt.c.answer).where(
         attempt.c.job_id == job_id, attempt.c.fence == fence, attempt.c.write_id == write_id
     )

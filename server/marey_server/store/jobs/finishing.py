@@ -2,8 +2,8 @@
 
 A read transaction plans the commit. Several short writes store the chunks of its tree. A last write ends the job and
 moves the branch. If others have committed since the plan was computed, the last write adds their changes to the plan.
-If their changes concern the same entries, the commit is planned again. The same happens if items of the project were
-purged meanwhile. If the server stops in between, nothing but chunks has been stored, and the next server begins again.
+If their changes concern the same entries, or if items of the project were purged since, the commit is planned again. If
+the server stops before the last write, nothing but chunks has been stored, and the next server begins again.
 """
 
 from __future__ import annotations
@@ -55,7 +55,10 @@ def _deferred_jobs(tx: Transaction) -> list[str]:
 
 
 def _commit_one(database: Database, job_id: str) -> bool:
-    """Commit the outputs of one job, and end it; return whether it has ended."""
+    """Commit the outputs of one job, and end it; return whether it has ended now.
+
+    Errors are only logged, except `UnavailableProblem`, which is raised.
+    """
     try:
         for _ in range(MOST_PLANS):
             plan = database.read(SYSTEM, _plan, job_id)
@@ -82,7 +85,7 @@ def _portions(chunks: Mapping[str, bytes]) -> Iterator[Mapping[str, bytes]]:
 
 @dataclass(frozen=True)
 class _JobPlan:
-    """Outputs of a job, and their planned commit; or the reason why no commit was planned."""
+    """Planned commit of the outputs of a job, or the reason why no commit was planned."""
 
     job_id: str
     project_id: str
@@ -93,7 +96,7 @@ class _JobPlan:
     commit: PlannedCommit | None = None
     """The planned commit; None if the branch does not exist any more."""
     failure: dict[str, Any] | None = None
-    """Failure of the job, because its commit cannot be computed."""
+    """Failure with which the job must end, because its commit cannot be computed; None if it can."""
 
     @property
     def chunks(self) -> Mapping[str, bytes]:
@@ -105,7 +108,10 @@ _COLUMNS = (*commits.JOB_COLUMNS, job.c.cancel_requested_us)
 
 
 def _plan(tx: Transaction, job_id: str) -> _JobPlan | None:
-    """Plan the commit of a job; None if the job has ended already. No commit is planned for a cancelled job."""
+    """Plan the commit of a job; return None if the job has ended already.
+
+    For a job whose cancellation was requested, the result contains no commit.
+    """
     row = tx.execute(select(*_COLUMNS).where(job.c.id == job_id, DEFERRED)).first()
     if row is None:
         return None
@@ -120,7 +126,7 @@ def _plan(tx: Transaction, job_id: str) -> _JobPlan | None:
         return replace(plan, failure=commits.refused_commit(row.commit_to, error.error_code, error.detail))
     except DamagedChunk as error:
         log.exception("the outputs of %s cannot be committed", job_id)
-        detail = f"The stored data of the dataset are damaged: {error}."
+        detail = f"The stored data of the dataset are damaged: {error}. Ask the operator to run `marey db fsck`."
         return replace(plan, failure=commits.refused_commit(row.commit_to, DamagedProblem.code, detail))
 
 

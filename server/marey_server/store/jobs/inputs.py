@@ -32,7 +32,10 @@ from marey_server.store.transaction import Transaction, in_lists
 MOST_INPUTS = 100_000
 
 Pin = dict[str, Any]
-"""Stored input: the fields of `PinnedInput`, or, before the input exists, `job`: the id of the job that produces it."""
+"""Input as a job stores it: an exact revision of an item, with the fields of `PinnedInput`.
+
+Before the input exists, it has the field `job`, the id of the job that produces it, instead.
+"""
 
 PinnedInputs = dict[str, list[Pin]]
 
@@ -80,10 +83,10 @@ def pin_inputs(
     known: dict[str, FoundItem],
     at: str = "",
 ) -> PinnedInputs:
-    """Pin every input to the named revision, or else to the newest; collections are replaced by their items.
+    """Determine the exact revision of every input: the named revision, or else the newest one.
 
-    Outputs of other jobs are pinned later (`late_inputs`). `known` holds the items that `find_items` returned for the
-    request.
+    Collections are replaced by their items. Inputs that are outputs of other jobs are determined later (`late_inputs`).
+    `known` contains the items that `find_items` returned for the request.
 
     Raises `InvalidProblem`, which lists all faults with pointers below `at`. Faults are an input that the kind does not
     have, a required input without a value, and an empty collection. Other faults are an item or revision that is not in
@@ -182,7 +185,10 @@ def _pin_input(
 
 
 def late_inputs(request: JobCreate, at: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield the inputs that other jobs produce: position in the request, name of the input, and id of the other job."""
+    """Yield the inputs that other jobs produce.
+
+    Each value contains the JSON Pointer to the input in the request, the name of the input, and the id of the job.
+    """
     for name, choices in request.inputs.items():
         for index, choice in enumerate(_as_many(choices)):
             if isinstance(choice, JobOutputsInput):
@@ -210,10 +216,10 @@ def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: st
 def _entries_of(
     tx: Transaction, project: ProjectRow, spec: InputSpec, choice: DatasetInput, place: str, errors: list[FieldError]
 ) -> Iterator[Pin]:
-    """Yield a pin (exact revision) for each entry of the dataset version that `choice` names; add faults to `errors`.
+    """Yield an exact revision (`Pin`) for each entry of the dataset version that `choice` names.
 
-    Each pin has the name and the folder of the entry in this version. `place` is the JSON Pointer to `choice` in the
-    request.
+    The pin has the name and the folder of the entry in this version, not those of the item. Faults are added to
+    `errors`; `place` is the JSON Pointer to `choice` in the request.
     """
     try:
         version = datasets.entries_of_kind(
@@ -281,7 +287,7 @@ _KINDS = frozenset(kind.value for kind in Kind)
 
 
 class NamingJob(NamedTuple):
-    """Job with its inputs, parameters and outputs, which can name items, in the form in which its row stores them."""
+    """Job with those columns of its row that can name items: inputs, parameters and outputs."""
 
     id: str
     inputs: Mapping[str, Any] = {}
@@ -292,7 +298,8 @@ class NamingJob(NamedTuple):
     def items(self) -> set[str]:
         """Return the ids of the items that the job names.
 
-        Inputs that were split among tasks are left out, and so are inputs whose items do not exist yet.
+        Two kinds of inputs are left out: an input that was split among tasks, because the tasks name its items, and
+        inputs that other jobs have not produced yet.
         """
         found = {one["item"] for one in self.outputs}
         for pins in self.inputs.values():

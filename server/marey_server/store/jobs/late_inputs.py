@@ -111,9 +111,10 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
 
 
 def _take_room(tx: Transaction, submission: Submission, room: dict[str, int]) -> None:
-    """Count the tasks of a job against the quota of its author; `room` has the number of jobs left for each author.
+    """Count the tasks of a job towards the quota `user_jobs` of its author.
 
-    Raises `LateInputError` if the quota would be exceeded.
+    `room` contains the number of jobs that each author may still have; it is updated. Raises `LateInputError` if the
+    quota would be exceeded.
     """
     tasks, author_id = layout.count_tasks(submission), submission.author_id
     if not tasks or author_id is None:
@@ -130,9 +131,10 @@ def _take_room(tx: Transaction, submission: Submission, room: dict[str, int]) ->
 
 
 def _count_inputs(tx: Transaction, submission: Submission, known: int) -> None:
-    """Count the inputs that a job gets now against the quota of its author; `known` were counted at the submission.
+    """Count the inputs that a job gets now towards the quota `user_daily_inputs` of its author.
 
-    Raises `LateInputError` if the quota would be exceeded.
+    `known` is the number of inputs that were counted at the submission. Raises `LateInputError` if the quota would be
+    exceeded.
     """
     if submission.author_id is None:
         return
@@ -183,8 +185,8 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
         if spec is None:
             raise LateInputError(
                 "unknown-input",
-                f"In this version of the server, jobs of the kind {kind.name} have no input {name!r}. Submit a job "
-                f"with the inputs that they have: {', '.join(map(repr, kind.inputs)) or 'none'}.",
+                f"In this version of the server, jobs of the kind {kind.name} have no input {name!r}. Submit a new "
+                f"job; its inputs may be: {', '.join(map(repr, kind.inputs)) or 'none'}.",
             )
         chosen: dict[tuple[str, int], Pin] = {}
         for entry in entries:
@@ -226,7 +228,10 @@ def _resolved(
 
 
 def _outputs(tx: Transaction, project_id: str, job_id: str) -> _Made:
-    """Return the outputs of a job or of its tasks, each item at its newest revision; deleted items are omitted."""
+    """Return the outputs of a job or of its tasks, without deleted items.
+
+    If the job or its tasks published several revisions of an item, only the last of these is returned.
+    """
     columns = (job.c.size, job.c.gathers, job.c.outputs, job.c.into_path)
     row = tx.execute(select(*columns).where(job.c.id == job_id)).one()
     published = [row.outputs]

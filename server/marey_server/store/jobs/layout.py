@@ -1,10 +1,10 @@
 """Rows for checked submissions: one job, or a parent job with its tasks; and the cache keys of jobs.
 
 Jobs with the same cache key are identical: kind, version of the kind, parameters, seed and inputs are equal. Inputs are
-equal if the item, its name, its path, and the content of the documents that the kind reads are equal, because results
-are named after inputs and refer to them. A kind can require that further values are equal: the collection of the
-results, or the newest revision of an item that the parameters name. Jobs whose result depends on data that is read
-while they run have no cache key.
+equal if four things are equal: the item, its name, its path, and the content of the documents that the kind reads. The
+item, its name and its path count, because results refer to inputs and are named after them. A kind can require that
+further values are equal: the collection of the results, or the newest revision of an item that the parameters name.
+Jobs whose result depends on data that is read while they run have no cache key.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Submission:
     labels_key: str
     author_id: str | None
     after: tuple[str, ...] = ()
-    """Ids of the jobs that must succeed first, including those that produce its inputs."""
+    """Ids of the jobs that must succeed before this job runs, including those that produce its inputs."""
     unbound: bool = False
     """Whether some inputs are outputs of jobs that have not succeeded yet."""
     id: str = field(default_factory=lambda: new_id("job"))
@@ -52,7 +52,7 @@ class Submission:
 
 @dataclass
 class NewJob:
-    """Job that is about to be inserted."""
+    """Job that is about to be inserted: a single job, a parent job (`size` tasks) or a task (`position`)."""
 
     id: str
     project_id: str
@@ -69,12 +69,12 @@ class NewJob:
 
     @property
     def cache_mode(self) -> str:
-        """The setting of the request that says whether a cached result may be used."""
+        """Setting of the request: whether the job may use a cached result ("use"), or must compute its own."""
         return self.submission.request.cache
 
     @property
     def labels_key(self) -> str:
-        """The labels that a worker must have."""
+        """Labels that a worker must have, as one sorted text."""
         return self.submission.labels_key
 
     @property
@@ -84,7 +84,7 @@ class NewJob:
 
     @property
     def concurrency_key(self) -> str | None:
-        """The key of the request; jobs with the same key run one after the other."""
+        """Concurrency key of the request: of the jobs of a project with the same key, only one runs at a time."""
         return self.submission.request.concurrency_key
 
     @property
@@ -93,7 +93,7 @@ class NewJob:
         return self.submission.unbound
 
     def as_ended(self) -> Ended:
-        """Return this job as an ended job; it never starts, because a job on which it depends did not succeed."""
+        """Return this job as an ended job, for a job that never starts because one of its dependencies failed."""
         return Ended(self.id, self.project_id, self.state, self.parent_id, self.failure)
 
 
@@ -115,10 +115,10 @@ def request_of(row: Row[Any]) -> JobCreate:
 
 
 def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dict[str, result_cache.SharedResult]]:
-    """Split jobs with known inputs into tasks, and give them their cache keys.
+    """Split jobs with known inputs into tasks, and set the cache keys of the jobs and tasks.
 
-    Returns the tasks, and a mapping for the jobs that share a result. It maps the id of such a job to the job that has
-    computed, or is computing, this result.
+    Returns two values: the tasks, and the results that are shared. The second value maps the id of a job or task to the
+    job that has computed its result, or is computing it.
     """
     gathering = [one for one in heads if one.submission.kind.gathering is not None]
     sources = _let_share(tx, gathering)
@@ -128,7 +128,7 @@ def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dic
 
 
 def _let_share(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
-    """Set the cache keys of jobs, and let those jobs wait whose results other jobs have computed or are computing.
+    """Set the cache keys of jobs; jobs whose results other jobs have computed or are computing become waiting jobs.
 
     Returns, by the id of each waiting job, the job whose result it will share.
     """
@@ -155,9 +155,10 @@ def count_inputs(submission: Submission) -> int:
 
 
 def _spread(head: NewJob) -> list[NewJob]:
-    """Make a job with several tasks a parent job, and return its tasks, which start together with it.
+    """Make a job that is split a parent job, and return its tasks.
 
-    A job with one task is unchanged, and the result is empty.
+    The tasks are queued if the job was queued, wait if it waits, and are cancelled if it has failed. A job that is not
+    split (`count_tasks`) is unchanged, and the result is empty.
     """
     if not count_tasks(head.submission):
         return []
@@ -178,7 +179,11 @@ def _spread(head: NewJob) -> list[NewJob]:
 
 
 def _shares(submission: Submission) -> list[PinnedInputs]:
-    """Return the inputs of each task: a share of the input that is split, or all inputs if none is split."""
+    """Return the inputs of each task.
+
+    If the job kind splits an input, each task gets a share of this input, and the whole of every other input.
+    Otherwise, each task gets all inputs.
+    """
     fanned = submission.kind.fan_out
     if fanned is None:
         return [submission.pins] * submission.task_count
@@ -218,7 +223,7 @@ def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
 
 
 def place_in_trace(tx: Transaction) -> dict[str, str] | None:
-    """Return the first value of the column `environment` of a new job: only its trace header, or None."""
+    """Return the initial value of the column `environment` of a job: its trace header, or None without a trace."""
     header = tx.trace_of_jobs(tx.principal)
     return None if header is None else {HEADER: header}
 
@@ -261,9 +266,9 @@ def _set_cache_keys(tx: Transaction, jobs: Sequence[NewJob]) -> None:
 
 
 def _has_key(submission: Submission) -> bool:
-    """Return whether a job has a cache key.
+    """Return whether a job gets a cache key.
 
-    A job has a cache key if its result depends only on the values from which the key is computed.
+    It does if its result depends only on the values from which the key is computed.
     """
     kind, params = submission.kind, submission.params
     given = {name for name, pins in submission.pins.items() if pins}
@@ -275,9 +280,9 @@ def _has_key(submission: Submission) -> bool:
 
 
 def _cache_key(one: NewJob, parts: Mapping[tuple[str, int], dict[str, str]], newest: Mapping[str, int]) -> str:
-    """Return the digest that identifies a computation.
+    """Return the digest that is equal for all jobs that must compute the same result.
 
-    `parts` is the result of `_part_digests`; `newest` holds the newest revisions of `_named_items`.
+    `parts` is the result of `_part_digests`; `newest` is the result of `_newest_revisions`.
     """
     submission, kind, params = one.submission, one.submission.kind, one.submission.params
     inputs = _input_contents(kind, one.pins, parts)
@@ -310,7 +315,10 @@ def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]
 
 
 def _named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:
-    """Return the ids of items that the parameters name and whose newest revisions the job reads."""
+    """Return the ids of the items that parameters of a job name and whose newest revisions the job reads.
+
+    The kind of the job declares these parameters (`newest_of`).
+    """
     return [params[name] for name in kind.newest_of if params.get(name)]
 
 
@@ -328,7 +336,7 @@ def _part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple
 def _input_contents(
     kind: KindDeclaration, pins: Mapping[str, Any], parts: Mapping[tuple[str, int], dict[str, str]]
 ) -> dict[str, Any]:
-    """Return the content of a job's inputs, independent of their revision numbers."""
+    """Return what the cache key contains of a job's inputs, by name; revision numbers have no influence."""
     return {
         name: [_content(pin, kind.inputs[name].parts, parts[pin["item"], pin["revision"]]) for pin in many]
         for name, many in pins.items()

@@ -10,7 +10,7 @@ from sqlalchemy import Row, insert, select, update
 from marey_schemas.queue.jobs import JobState
 from marey_schemas.queue.worker_protocol import LogAnswer
 from marey_server.errors import ConflictProblem
-from marey_server.store.jobs.fencing import hold, require_attempt
+from marey_server.store.jobs.fencing import lock_held_job, require_attempt
 from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.tables import attempt, job_log
 from marey_server.store.transaction import Transaction
@@ -30,16 +30,18 @@ def append_log(
 ) -> LogAnswer:
     """Append `data` at `offset`, which must be the end of the attempt's log; a repeated append changes nothing.
 
-    Raises `LogOffset` with the current end, and `LeaseLostProblem` if the attempt no longer holds the job.
+    A log that reaches the limit of the policy is closed with a note, and ignores further data (`capped`). Raises
+    `LogOffset`, with the end of the log, for any other offset, and `LeaseLostProblem` if the attempt no longer holds
+    the job.
     """
     require_attempt(tx.principal, job_id, fence)
-    hold(tx, job_id, fence)
+    lock_held_job(tx, job_id, fence)
     of_attempt = (attempt.c.job_id == job_id) & (attempt.c.fence == fence)
     length: int = tx.execute(select(attempt.c.log_bytes).where(of_attempt)).scalar_one()
     if length >= policy.log_limit_bytes:
         return LogAnswer(offset=length, capped=True)
     if offset != length:
-        if _is_said(tx, job_id, fence, offset, data):
+        if _is_repeated(tx, job_id, fence, offset, data):
             return LogAnswer(offset=length)
         detail = f"The log has {length} bytes; the next piece must begin there, not at {offset}."
         raise LogOffset(detail, context={"offset": length})
@@ -53,7 +55,7 @@ def append_log(
     return LogAnswer(offset=length + len(data), capped=capped)
 
 
-def _is_said(tx: Transaction, job_id: str, fence: int, offset: int, data: bytes) -> bool:
+def _is_repeated(tx: Transaction, job_id: str, fence: int, offset: int, data: bytes) -> bool:
     statement = select(job_log.c.data).where(
         job_log.c.job_id == job_id, job_log.c.fence == fence, job_log.c.offset == offset
     )
@@ -63,11 +65,11 @@ def _is_said(tx: Transaction, job_id: str, fence: int, offset: int, data: bytes)
 
 @dataclass(frozen=True, slots=True)
 class LogPage:
-    """Page of a job's log, which joins the output of all attempts."""
+    """Page of a job's log, which is the output of all attempts, one after the other."""
 
     data: bytes
     offset: int
-    """Offset of the next page."""
+    """Offset in bytes at which the next page begins."""
     sealed: bool
     """Whether the log is complete and this page reaches its end."""
 

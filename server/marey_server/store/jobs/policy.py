@@ -25,7 +25,7 @@ class QueuePolicy:
     longest_backoff_s: float = 15 * 60.0
     max_interruptions: int = 20
     max_unstarted: int = 10
-    """Greatest number of claims of a job that are lost before the first write of the attempt.
+    """Greatest number of claims of a job whose leases expire before the worker has written anything.
 
     Such claims do not count as attempts, because the answer to the claim may have been lost. Without this limit, a job
     that kills each worker at once would never end.
@@ -44,7 +44,11 @@ class QueuePolicy:
         return round(self.end_grace_s * SECOND_US)
 
     def backoff_us(self, failures: int) -> int:
-        """Return the wait in microseconds before a retry; each failure makes it four times as long, up to a limit."""
+        """Return the wait in microseconds before a retry, which begins with `first_backoff_s`.
+
+        Each failure makes the wait four times as long, up to `longest_backoff_s`. Up to a quarter of
+        the wait is subtracted at random.
+        """
         backoff = Backoff(
             self.first_backoff_s, self.longest_backoff_s, factor=4.0, jitter=0.25, random_unit=self.random_unit
         )

@@ -81,7 +81,10 @@ def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
 
 
 def _facts_of(end: Ended) -> dict[str, Any]:
-    """Return the body of the event that reports the end of a job: its failure, or the commit with its outputs."""
+    """Return the body of the event that reports the end of a job.
+
+    It is the failure of the job, or names the commit with its outputs, or is empty.
+    """
     return end.failure or ({} if end.commit is None else {"commit": end.commit})
 
 
@@ -115,11 +118,12 @@ def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
 
 
 def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
-    """Update waiting jobs after jobs on which they depend have ended.
+    """Update waiting jobs after jobs on which they depend have ended; return the jobs that have ended as a result.
 
-    `upstream` lists the ended jobs by the id of the waiting job. Jobs whose dependencies have all succeeded are made
-    ready; jobs that can no longer run are ended. If jobs waited for a result that must not be shared, all of them are
-    queued, because their own results can probably not be shared either. Returns the jobs that have ended.
+    `upstream` maps the id of each waiting job to the ended jobs. Jobs whose dependencies have all succeeded are made
+    ready, and jobs of which a dependency did not succeed are ended. Jobs that waited to share a result get the result
+    or, if the other job did not succeed, wait for another identical job or are queued. If the result must not be
+    shared, all jobs that waited for it are queued, because their own results can probably not be shared either.
     """
     following: list[Ended] = []
     left: dict[str, int] = {}
@@ -131,7 +135,7 @@ def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[En
         if row.cached_from is not None:
             (orphans if missed else shared if upstream[row.id][0].shareable else alone).append(row)
         elif missed:
-            following += _doom(tx, row, missed[0])
+            following += _end_unrunnable(tx, row, missed[0])
         else:
             left[row.id] = row.dependencies_left - len(upstream[row.id])
     _store_counts(tx, left)
@@ -148,7 +152,7 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
         tx.execute(statement, [{"of_job": job_id, "left": count} for job_id, count in left.items()])
 
 
-def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
+def _end_unrunnable(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
     """End a waiting job because the job `cause`, on which it depends, did not succeed; return the ended jobs.
 
     The waiting job fails, or is cancelled if its `on_failure` is `skip`. Its tasks are cancelled.
@@ -164,7 +168,7 @@ def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
 
 
 def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
-    """Start a parent job and make its tasks ready; return the jobs that ended as a result."""
+    """Start a parent job, and make its waiting tasks ready; return the jobs that ended as a result."""
     tasks = tx.execute(
         select(*READY_COLUMNS).where(job.c.parent_id == row.id, job.c.state == WAITING).order_by(job.c.position)
     ).all()
@@ -197,9 +201,10 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel the unstarted tasks of parent jobs in which a task has failed; return the cancelled tasks.
+    """Cancel those tasks of the given parent jobs that have not started, and return the cancelled tasks.
 
-    Applies only to parent jobs for which a worker would combine the results of the tasks.
+    Called when a task of each of these jobs has failed. Tasks are cancelled only if a worker would have combined the
+    results of all tasks, so that the results of the remaining tasks are not needed any more.
     """
     if not parents:
         return []

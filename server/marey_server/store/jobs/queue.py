@@ -82,15 +82,18 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     worker uses another version of the protocol.
     """
     if request.protocol != PROTOCOL_VERSION:
-        detail = f"The worker uses version {request.protocol} of the protocol, but the server uses {PROTOCOL_VERSION}."
+        detail = (
+            f"The worker uses version {request.protocol} of the protocol, but the server uses version "
+            f"{PROTOCOL_VERSION}. Install the same version of Marey for both."
+        )
         raise InvalidProblem(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
     scopes = require_worker(tx.principal, request)
     claim_id = request.claim_id if tx.principal.token_key else None
-    wanted = _wanted(tx, request, scopes, policy)
-    places, turns = _read_turns(tx, claim_id, wanted)
+    queries = _claim_queries(tx, request, scopes, policy)
+    places, turns = _read_turns(tx, claim_id, queries)
     if claim_id is not None and places:
         return _leases_again(tx, claim_id, places, policy)
-    rows = _claim_in_turn(tx, wanted, turns, request.max)
+    rows = _claim_in_turn(tx, queries, turns, request.max)
     if not rows:
         return []
     tokens = [_issue_token(tx, claim_id, row) for row in rows]
@@ -125,17 +128,20 @@ _CLAIMED_BEFORE = Prepared(
 )
 
 
-def _read_turns(tx: Transaction, claim_id: str | None, wanted: _Wanted) -> tuple[list[tuple[str, int]], list[Turn]]:
-    """Return the attempts of an earlier claim with the same `claim_id`, if any, and the projects that have jobs.
+def _read_turns(
+    tx: Transaction, claim_id: str | None, queries: _ClaimQueries
+) -> tuple[list[tuple[str, int]], list[Turn]]:
+    """Return the attempts of an earlier claim with the same `claim_id`, and the projects that have jobs.
 
-    Two concurrent claims with the same `claim_id` run one after the other.
+    The attempts are given by job and fence; there are none without an earlier claim. Concurrent claims with the same
+    `claim_id` run one after the other.
     """
     if claim_id is None:
-        return [], turns_of(tx.run(wanted.turns, wanted.of_turns))
+        return [], turns_of(tx.run(queries.turns, queries.of_turns))
     token_id = tx.principal.token_id
     tx.lock(f"claim {token_id} {claim_id}")
     before, rows = tx.run_together(
-        (_CLAIMED_BEFORE, {"token": token_id, "claim": claim_id}), (wanted.turns, wanted.of_turns)
+        (_CLAIMED_BEFORE, {"token": token_id, "claim": claim_id}), (queries.turns, queries.of_turns)
     )
     return [(row.job_id, row.fence) for row in before], turns_of(rows)
 
@@ -155,10 +161,10 @@ def _leases_again(
 
 
 def _issue_token(tx: Transaction, claim_id: str | None, row: Row[Any]) -> IssuedToken:
-    """Return a token for the attempt.
+    """Return a new token for an attempt.
 
-    If the claim has a `claim_id`, it may be repeated. Then the token is derived from the caller's token, the claim and
-    the attempt. So a repetition gets the same token although no secret is stored.
+    A claim with a `claim_id` may be repeated. So its token is derived from the caller's token, the `claim_id` and the
+    attempt: a repetition gets the same token, although the server stores no secret.
     """
     if claim_id is None:
         return issue_attempt_token()
@@ -190,10 +196,11 @@ def heartbeat(
 
 
 def _renewed(tx: Transaction, policy: QueuePolicy) -> dict[str, Any]:
-    """Return the values that renew a lease.
+    """Return the values of the columns of a job that renew its lease.
 
-    The time for which the lease had expired does not count towards the time limit: the clock of the database may have
-    jumped. The worker measures the limit with its own clock; the server's limit is for workers that do not stop.
+    If the lease has expired, the time since then does not count towards the time limit of the job, because the clock of
+    the database may have jumped. Workers stop at the limit by their own clocks; the server's limit is only for workers
+    that do not stop.
     """
     late = and_(job.c.lease_expires_us < tx.now_us, job.c.cancel_requested_us.is_(None))
     deadline_us = job.c.deadline_us + case((late, tx.now_us - job.c.lease_expires_us), else_=0)
@@ -229,7 +236,7 @@ _LEASE_COLUMNS = (
 
 
 def _claim_statement(*, one_job: bool) -> ReturningUpdate[*tuple[Any, ...]]:
-    """Return the statement that picks jobs of one project and claims them."""
+    """Return the statement that claims jobs of one project; with `one_job`, only the job that a claim names."""
     pick = _pick(one_job=one_job)
     now_us = bindparam("now_us", type_=BigInteger)
     deadline_us = now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US
@@ -284,8 +291,8 @@ def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
 _CLAIM_STATEMENTS = {one_job: Prepared(_claim_statement(one_job=one_job)) for one_job in (False, True)}
 
 
-class _Wanted(NamedTuple):
-    """Statements of a claim, and their parameters, such as the kinds and labels in the request."""
+class _ClaimQueries(NamedTuple):
+    """Statements that find projects with jobs for a claim (`turns`) and claim jobs (`claim`), with their parameters."""
 
     turns: Prepared
     of_turns: Mapping[str, Any]
@@ -293,7 +300,7 @@ class _Wanted(NamedTuple):
     of_claim: Mapping[str, Any]
 
 
-def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], policy: QueuePolicy) -> _Wanted:
+def _claim_queries(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], policy: QueuePolicy) -> _ClaimQueries:
     caller = tx.principal
     own_projects = caller.kind == "user" and not caller.administrator
     restriction = Restriction(request.job is not None, "work" not in scopes, own_projects)
@@ -310,15 +317,15 @@ def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], polic
     if restriction.own_projects:
         projects["user"] = caller.user_id
     lease = {"lease_ttl": policy.lease_ttl_us, "end_grace": policy.end_grace_us}
-    return _Wanted(
+    return _ClaimQueries(
         statement_of_turns(restriction), jobs | projects, _CLAIM_STATEMENTS[restriction.one_job], jobs | lease
     )
 
 
-def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most: int) -> list[Row[Any]]:
-    """Claim up to `most` jobs, from each project as many as it has turns in this claim; return the rows of the jobs.
+def _claim_in_turn(tx: Transaction, queries: _ClaimQueries, turns: Sequence[Turn], most: int) -> list[Row[Any]]:
+    """Claim up to `most` jobs, from each project as many as `next_projects` gives to it; return the rows of the jobs.
 
-    If a project has fewer jobs than turns, the other projects share its turns.
+    If a project has fewer jobs, the remaining ones are taken from the other projects.
     """
     rows: list[Row[Any]] = []
     served: set[Turn] = set()
@@ -327,7 +334,7 @@ def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most
         for turn, share in shares.items():
 
             def take(number: int, turn: Turn = turn) -> list[Row[Any]]:
-                return tx.run(wanted.claim, {**wanted.of_claim, "of_project": turn.project_id, "most": number})
+                return tx.run(queries.claim, {**queries.of_claim, "of_project": turn.project_id, "most": number})
 
             taken = take_within_limit(tx, turn, share, take, may_wait=not rows)
             rows += taken
@@ -361,7 +368,7 @@ def _leases(
 
 
 def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
-    """Return, for each parent job of the given tasks, its number of tasks, by the id of the parent job."""
+    """Return the numbers of tasks of the parent jobs of the given tasks, by the id of the parent job."""
     parents = {row.parent_id for row in rows if row.parent_id is not None}
     if not parents:
         return {}
@@ -369,7 +376,7 @@ def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
 
 
 def _trace(tx: Transaction, row: Row[Any]) -> JobTrace | None:
-    """Return the trace of a job, with the seconds for which the job could have run before it was claimed."""
+    """Return the trace of a job, or None without a trace; it contains how long the job was ready before the claim."""
     header = trace_header(row.environment)
     return None if header is None else JobTrace(traceparent=header, waited_s=_delay_s(tx, row))
 

@@ -19,7 +19,7 @@ from marey_server.store.tables import document, document_blob, item, job, job_bl
 from marey_server.store.transaction import Transaction, in_lists
 
 PinnedPlace = tuple[str, int]
-"""Id and revision of an item."""
+"""Revision of an item: the id of the item, and the number of the revision."""
 
 MOST_DOCUMENTS = 50_000
 """Greatest number of documents that are searched for references of one job."""
@@ -72,9 +72,10 @@ def unreachable_places(tx: Transaction, wanted: Iterable[PinnedPlace]) -> set[Pi
 
 
 def reachable_blobs(tx: Transaction, digests: Collection[str]) -> set[str]:
-    """Return those of the given blobs that the attempt may read.
+    """Return those of the given blobs that the caller, an attempt, may read.
 
-    These are the blobs of its job, of the tasks of this job, and of the documents that the attempt may read.
+    These are the blobs that belong to its job, to the tasks of this job, and to the documents that the attempt may
+    read.
     """
     principal = tx.principal
     of_job = (
@@ -121,7 +122,7 @@ def _ids_in(text: str) -> list[str]:
 
 
 def _named_items(tx: Transaction, pins: Pins) -> frozenset[str]:
-    """Return the items to which the documents of the inputs refer, directly or through other items."""
+    """Return the ids of the items to which the job of the attempt leads: its inputs refer to them, directly or not."""
     job_id = tx.principal.job_id or ""
     found = _named.get(job_id)
     if found is None:
@@ -147,7 +148,7 @@ def _follow(tx: Transaction, pins: Pins) -> set[str]:
 
 
 def _texts(tx: Transaction, items: Collection[str]) -> Iterator[Any]:
-    """Yield the JSON text of each document of items, with the item and the revision."""
+    """Yield the JSON texts of all documents of items, as rows with the item, the revision and the text."""
     statement = (
         select(revision_part.c.item_id, revision_part.c.number, cast(document.c.body, Text).label("text"))
         .join(document, document.c.digest == revision_part.c.document_digest)

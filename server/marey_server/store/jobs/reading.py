@@ -56,7 +56,7 @@ class JobFilters:
 
 
 def read_job(tx: Transaction, job_id: str) -> Job:
-    """Return a job with its state and progress. Raises `NotFoundProblem`."""
+    """Return a job with its state and progress. Raises `NotFoundProblem` if it does not exist."""
     row, _ = find_job(tx, job_id)
     return as_documents(tx, [row])[0]
 
@@ -85,7 +85,11 @@ def list_jobs(
 
 
 def read_result_file(tx: Transaction, project: str, job_id: str, name: str) -> tuple[StoredFile, Job]:
-    """Return the reference to a file of a job's result, and the job. Raises `NotFoundProblem`."""
+    """Return the reference to a file of a job's result, and the job.
+
+    `name` is the member of the result that names the file. Raises `NotFoundProblem` if the project has no such job, or
+    the result no such file.
+    """
     row, project_row = find_job(tx, job_id)
     found = as_documents(tx, [row])[0]
     entry = found.result or {}
@@ -175,11 +179,11 @@ MOST_PARTS = 100
 
 
 def _parts(project_id: str, filters: JobFilters, order: listing.Order) -> list[Select[*tuple[Any, ...]]]:
-    """Return queries for the ids of the jobs in a list, one query for each pair of a state and a kind if possible.
+    """Return queries for the ids of the jobs in a list; together, they select all jobs of the list.
 
-    An index contains the jobs of such a pair in the order of the list. Without these queries, a list of few jobs, such
-    as waiting jobs, would read all jobs of the project. Succeeded jobs are not indexed by state, because most jobs have
-    succeeded.
+    If possible, there is one query for each pair of a state and a kind: an index contains the jobs of each pair in the
+    order of the list. Without these queries, a list of few jobs, such as waiting jobs, would read all jobs of the
+    project. There is no index of succeeded jobs by state, because most jobs have succeeded.
     """
     pairs = [(state, kind) for state in filters.states or (None,) for kind in filters.kinds or (None,)]
     if filters.parent is not None or order.columns[0][0] is not SORT_KEYS["created_at"] or len(pairs) > MOST_PARTS:
@@ -263,7 +267,10 @@ def find_job(tx: Transaction, job_id: str) -> tuple[Row[Any], ProjectRow]:
 
 
 def require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) -> None:
-    """Check that the caller owns the job or is a maintainer. Raises `ForbiddenProblem`."""
+    """Raise `ForbiddenProblem` unless the caller is the author of the job or a maintainer of the project.
+
+    `what` is the verb in the error text, such as "cancel".
+    """
     if roles.includes(project.role, Role.MAINTAINER):
         return
     if row.author_id != tx.principal.user_id:  # who may be a contributor in some folders only

@@ -27,11 +27,11 @@ PAGE = 256
 
 
 class StartGrace:
-    """Delay before leases may be reclaimed, after this process has started or the database was unreachable.
+    """Delay before expired leases are reclaimed, after a time in which workers could not renew their leases.
 
-    Leases expire while no worker can renew them. The delay is as long as a lease; in this time, live workers renew
-    their leases. The delay also starts after a jump of the clock, and after a long write that blocked all other writes,
-    and therefore heartbeats.
+    The delay is as long as a lease; in this time, live workers renew their leases. It begins when this process has
+    started, when the database was unreachable, when the clock has jumped, and after a long write that blocked all other
+    writes, also heartbeats.
     """
 
     def __init__(self, policy: QueuePolicy = DEFAULT_POLICY) -> None:
@@ -42,7 +42,10 @@ class StartGrace:
         self._seen_us = 0
 
     def over(self, now_us: int) -> bool:
-        """Return whether leases may be reclaimed; `now_us` is the time of the database."""
+        """Return whether the delay has passed, so that leases may be reclaimed; `now_us` is the time of the database.
+
+        The delay starts again if the last call was too long ago, or at a later time than `now_us`.
+        """
         with self._lock:
             if self._since_us is None or not 0 <= now_us - self._seen_us <= self._longest_silence_us:
                 self._since_us = now_us
@@ -68,11 +71,11 @@ def reap_page(
     after: tuple[int, str] | None = None,
     limit: int = PAGE,
 ) -> ReapedPage:
-    """Reclaim up to `limit` jobs whose leases have expired, the longest overdue first, after the position `after`.
+    """Reclaim up to `limit` jobs whose leases have expired, the longest overdue first.
 
-    Each job has its own UPDATE with the condition that no other attempt has claimed the job and the lease has expired.
-    So a heartbeat or a result at the same time is either accepted, or refused because the lease is lost. If a job
-    cannot be reclaimed, the others are reclaimed nevertheless.
+    `after` is the position that the previous page returned. Each job is changed only on the condition that its lease is
+    still expired and no other attempt has claimed it. So a concurrent heartbeat or result is either accepted, or
+    refused because the lease is lost. If a job cannot be reclaimed, the others are reclaimed nevertheless.
     """
     overdue = and_(job.c.state == RUNNING, job.c.lease_expires_us <= tx.now_us)
     statement = select(*ENDING_COLUMNS).where(overdue).order_by(job.c.lease_expires_us, job.c.id).limit(limit)
@@ -92,7 +95,8 @@ def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
     """Reclaim a job whose lease has expired, and return whether this succeeded.
 
     Reclaiming ends the attempt and the lease. The job is queued again, or it ends, and then the jobs that depend on it
-    are updated. Raises `OperationalError`; any other error is logged, and the result is False.
+    are updated. An error is logged, and the result is False. Only `OperationalError` is raised, because it concerns the
+    database and not this job.
     """
     try:
         with tx.connection.begin_nested():
@@ -112,7 +116,10 @@ def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
 def claim_after_reaping(
     tx: Transaction, request: ClaimRequest, grace: StartGrace, policy: QueuePolicy = DEFAULT_POLICY
 ) -> list[Lease]:
-    """Claim jobs; if there are none, reclaim the jobs whose leases have expired, and try to claim once more."""
+    """Claim jobs; if there are none, reclaim the jobs whose leases have expired, and try to claim once more.
+
+    Nothing is reclaimed during `grace`.
+    """
     leases = claim(tx, request, policy)
     if not leases and grace.over(tx.now_us) and reap_page(tx, policy).taken:
         leases = claim(tx, request, policy)

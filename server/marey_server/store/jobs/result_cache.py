@@ -41,7 +41,7 @@ MEASURED_PER_OUTPUT = 5
 class SharedResult(NamedTuple):
     """Job whose result other jobs share, now or as soon as it has finished.
 
-    `leased` says whether a worker runs the job. The other fields are those that decide when a queued job runs.
+    `leased` says whether a worker runs the job. The labels, the priority and the concurrency key decide when it runs.
     """
 
     id: str
@@ -53,14 +53,14 @@ class SharedResult(NamedTuple):
 
     @classmethod
     def of(cls, one: Any, *, finished: bool = False, leased: bool = False) -> SharedResult:
-        """Return a job, given as a row or as a new job, as the source of a result."""
+        """Return a job, given as a database row or as a `NewJob`, as a job whose result others can share."""
         return cls(one.id, finished, leased, one.labels_key, one.priority, one.concurrency_key)
 
     def is_no_later_than(self, other: Any) -> bool:
-        """Return whether this job has finished, or starts no later than the queued job `other` would.
+        """Return whether this job has finished, or starts no later than the queued job `other` would start.
 
-        A job that needs a label which `other` does not need may never start. This also holds if a worker runs it now,
-        because the worker may be lost.
+        The result is false if this job needs a label that `other` does not need: perhaps no worker has this label. This
+        is so even while a worker runs this job, because the worker may be lost.
         """
         if self.finished:
             return True
@@ -82,31 +82,32 @@ _COMMON_COLUMNS = (
 )
 CANDIDATE_COLUMNS = (*_COMMON_COLUMNS, job.c.concurrency_key)
 READY_COLUMNS = (*CANDIDATE_COLUMNS, job.c.kind, job.c.size, job.c.unbound, job.c.cached_from)
-"""Columns of waiting jobs that are to be queued."""
+"""Columns of waiting jobs that are read to make the jobs ready."""
 
 _BY_ID = job.c.id.concat("")
-"""Id of a job for ORDER BY. With the plain column, SQLite would read all jobs by the index of the ids."""
+"""SQL expression for the id of a job in ORDER BY; with the plain column, SQLite would read all jobs by their ids."""
 
 _task = job.alias("task")
 _KEY_OF_TASKS = select(_task.c.concurrency_key).where(_task.c.parent_id == job.c.id).limit(1).scalar_subquery()
 _KEY_OF_SOURCE = case(
     (and_(job.c.size.is_not(None), job.c.state == RUNNING), _KEY_OF_TASKS), else_=job.c.concurrency_key
 ).label("concurrency_key")
-"""Concurrency key of a job. For a parent job whose tasks run, the key of the tasks: its own row has no key."""
+"""SQL expression for the concurrency key of a job; for a parent job whose tasks run, it is the key of the tasks."""
 _SOURCE_COLUMNS = (*_COMMON_COLUMNS, _KEY_OF_SOURCE, job.c.state, job.c.lease_expires_us)
 
 
 def decide(tx: Transaction, candidates: Sequence[Any], *, finished: bool = True) -> dict[str, SharedResult]:
     """Find, for each of `candidates`, the job whose result it can share.
 
-    A candidate is a new job, or a row with `CANDIDATE_COLUMNS`. Candidates that cannot share a result are omitted. Of
-    several identical candidates, the first computes the result and the others share it. But a candidate never waits for
-    a job that may start later than the candidate itself would. In each project, this function runs for one transaction
-    at a time. The found jobs are locked: none of them ends before the transaction has recorded which jobs share its
-    result. Results of finished jobs are used only if `finished` is true.
+    A candidate is a new job, or a row with `CANDIDATE_COLUMNS`. The result maps ids of candidates to the found jobs;
+    candidates that cannot share a result are left out. Of several identical candidates, the first computes the result
+    and the others share it. But a candidate never waits for a job that may start later than the candidate itself would.
+    Results of finished jobs are used only if `finished` is true.
 
-    A transaction that ends a job has locked this job before it calls this function, and a submission locks it here. So
-    the two can deadlock; `Database.write` then runs one of them again.
+    The function locks each project of the candidates, so that only one transaction at a time decides for a project. It
+    also locks the found jobs, so that none ends before the transaction has recorded who shares its result. A
+    transaction that ends a job locks this job before the project, a submission after the project. So the two can
+    deadlock; `Database.write` then runs one of them again.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
@@ -128,10 +129,10 @@ def decide(tx: Transaction, candidates: Sequence[Any], *, finished: bool = True)
 def _known_sources(
     tx: Transaction, asking: Sequence[Any], *, finished: bool
 ) -> dict[tuple[str, str], list[SharedResult]]:
-    """Return, for each project and cache key, the newest succeeded job, then the queued and running jobs.
+    """Return, for each project and cache key, the jobs whose result can be shared, the best first.
 
-    Of these, jobs that a worker runs come first, then the others in the order of their priority. Jobs that wait for
-    their next attempt after a failure are left out, because a candidate may start earlier.
+    The newest succeeded job comes first, then the jobs that a worker runs, then the other jobs by priority. Jobs that
+    wait for their next attempt after a failure are left out, because a candidate may start earlier.
     """
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
@@ -166,8 +167,7 @@ def _known_sources(
 def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[Ended]:
     """Let waiting jobs share the results of other jobs, now or as soon as these have finished; return the ended jobs.
 
-    `joining` contains pairs: the row of a waiting job, of which only `id` is read, and the job that has or computes the
-    result.
+    Each pair in `joining` is a waiting job, of which only the `id` is read, and the job whose result it shares.
     """
     if not joining:
         return []
@@ -186,9 +186,9 @@ def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[E
 def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
     """Give waiting jobs the results of the finished jobs that their `cached_from` names; return the jobs that ended.
 
-    A transaction serves a limited number of jobs and outputs; the leading server process serves the remaining jobs
-    later. If the result is no longer stored, or cannot be published again, the waiting job is queued, or waits for
-    another identical job. Only the `id` of the rows is read.
+    Of `rows`, only the `id` is read. One transaction publishes the results for a limited number of jobs and outputs;
+    the leading server process does it for the others later. If a result is no longer stored, or cannot be published
+    again, the waiting job is queued, or waits for another identical job.
     """
     ended: list[Ended] = []
     unserved: list[str] = []
@@ -204,9 +204,10 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
 
 
 def share_waiting(tx: Transaction) -> list[Ended]:
-    """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist; return the jobs that have ended.
+    """Give at most `SHARED_AT_ONCE` waiting jobs the results for which they wait, if these exist now.
 
-    Jobs that wait for the result of a job that was deleted meanwhile are queued, or wait for another identical job.
+    Returns the jobs that have ended. If the job that should compute the result was deleted, the waiting job is queued,
+    or waits for another identical job.
     """
     source = job.alias("source")
     statement = (
@@ -232,7 +233,7 @@ _UNUSABLE = (ApiProblem, DamagedChunk, LookupError, TypeError, ValueError)
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     """Give one job the result for which it waits; return the jobs that ended, none if the job cannot have the result.
 
-    An error that concerns this job must not affect the job that computed the result, or others that wait for it.
+    Errors are not raised, because they concern only this job, and not the others that share the result.
     """
     try:
         with tx.connection.begin_nested():
@@ -244,12 +245,12 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 
 
 def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
-    """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
+    """Publish the shared result as the result of a waiting job, and end this job; return the jobs that ended.
 
-    The waiting job does not end if the other job has no cache key any more, because its result is not to be shared. It
-    does not end either if the result is no longer stored, or if the author of the waiting job may not run jobs any
-    more. For jobs that export clips, the clips whose consent has ended must be the same for both jobs; otherwise, the
-    waiting job does not end. Raises the errors of `publish`.
+    In four cases, nothing is done and the result is empty: the result is not to be shared any more (the other job has
+    no cache key); it is no longer stored; the author of the waiting job may not run jobs any more; or both jobs export
+    clips, and the clips whose consent has ended are not the same. The waiting job fails if its outputs cannot be
+    committed. Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
@@ -273,7 +274,7 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
     tx.shared_outputs += len(drafts) + staging.number_measured(drafts) // MEASURED_PER_OUTPUT
     named = set(staging.named_blobs(row.result))
-    if not staging.take_up_documents(tx, drafts) or not blobs.share_with_job(tx, row.id, named):
+    if not staging.renew_documents(tx, drafts) or not blobs.share_with_job(tx, row.id, named):
         return []
     made = commits.publish_outputs(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
     if made.failure is not None:
@@ -293,9 +294,9 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
 
 
 def _compute_again(tx: Transaction, job_ids: Sequence[str]) -> None:
-    """Let jobs compute a result that they waited to share: of identical jobs, one is queued and the others wait for it.
+    """Let jobs that cannot share a result compute it: of identical jobs, one is queued and the others wait for it.
 
-    Results of finished jobs are not used, because the jobs were unable to share such results before.
+    Results of finished jobs are not used, because the jobs could not share such a result before.
     """
     statement = select(*READY_COLUMNS).where(job.c.state == WAITING).order_by(job.c.id)
     for some in in_lists(job_ids):
@@ -307,7 +308,7 @@ def _compute_again(tx: Transaction, job_ids: Sequence[str]) -> None:
 def stop_sharing(tx: Transaction, rows: Sequence[Any]) -> None:
     """Remove the links from waiting jobs to the jobs whose results they would have shared.
 
-    The caller must then `admit` or `enqueue` the jobs.
+    The caller must then call `admit` or `enqueue` for the waiting jobs.
     """
     if rows:
         ids = [row.id for row in rows]
@@ -318,9 +319,9 @@ def stop_sharing(tx: Transaction, rows: Sequence[Any]) -> None:
 
 
 def admit(tx: Transaction, rows: Sequence[Any], *, finished: bool = True) -> list[Ended]:
-    """Queue waiting jobs without unfinished dependencies, or let them share results; return the ended jobs.
+    """Queue jobs whose dependencies have all succeeded, or let them share results; return the jobs that have ended.
 
-    The rows hold `READY_COLUMNS`. Results of finished jobs are used only if `finished` is true.
+    The rows have the columns `READY_COLUMNS`. Results of finished jobs are used only if `finished` is true.
     """
     decisions = decide(tx, rows, finished=finished)
     enqueue(tx, [row for row in rows if row.id not in decisions])
@@ -328,7 +329,7 @@ def admit(tx: Transaction, rows: Sequence[Any], *, finished: bool = True) -> lis
 
 
 def enqueue(tx: Transaction, rows: Sequence[Any]) -> None:
-    """Queue waiting jobs without unfinished dependencies; the rows hold `READY_COLUMNS`."""
+    """Queue waiting jobs whose dependencies have all succeeded; the rows have the columns `READY_COLUMNS`."""
     if rows:
         tx.execute(
             update(job)
@@ -344,7 +345,8 @@ def enqueue(tx: Transaction, rows: Sequence[Any]) -> None:
 def forget_results(tx: Transaction, job_ids: Sequence[str]) -> None:
     """Forget the results of ended jobs, so that identical jobs compute them again.
 
-    Deletes the drafts that the jobs staged. Jobs that wait to share one of the results are queued.
+    Deletes the drafts that the jobs staged. Of identical jobs that wait to share one of the results, one is queued, and
+    the others wait for it.
     """
     for some in in_lists(job_ids):
         tx.execute(delete(staged_output).where(staged_output.c.job_id.in_(some)))

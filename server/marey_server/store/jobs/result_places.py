@@ -18,7 +18,7 @@ from marey_server.store.jobs.inputs import Pin, PinnedInputs
 
 
 class Clash(NamedTuple):
-    """Conflict between the paths of results; `place` points to the field of the submission that causes the conflict."""
+    """Conflict between the paths of a job's results; `place` is the JSON Pointer to the field that causes it."""
 
     place: str
     code: str
@@ -26,9 +26,9 @@ class Clash(NamedTuple):
 
 
 def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str) -> Clash | None:
-    """Return a conflict among the places of a job's results, or None.
+    """Return a conflict between the folders and names under which a job would store its results, or None.
 
-    Names are not compared if an input is the result of another job, because this result may not exist yet.
+    The names are not compared if an input is the result of another job, because this result may not exist yet.
     """
     unclear = kind.unclear_place(params, into) if kind.unclear_place is not None else None
     if unclear is not None:
@@ -44,8 +44,8 @@ def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str
 def result_folders(kind: KindDeclaration, params: Mapping[str, Any], pins: PinnedInputs, into: str) -> list[str]:
     """Return the folders of a job's results, as far as they are known before the job runs.
 
-    If results follow the places of inputs that other jobs create, only `into` is known, or nothing. When the results
-    are published, their real folders are checked again.
+    If results are stored where the inputs are, and other jobs create these inputs, only `into` is known, or nothing.
+    When the results are published, their real folders are checked again.
     """
     if named := pins.get(kind.named_after or "", ()):
         in_place = kind.in_place is not None and params.get(kind.in_place)
@@ -57,7 +57,7 @@ def result_folders(kind: KindDeclaration, params: Mapping[str, Any], pins: Pinne
 
 
 def _too_long(kind: KindDeclaration, pins: PinnedInputs, into: str) -> tuple[str, str] | None:
-    """Return code and detail of the conflict if the path of a result, below `into`, would be too long."""
+    """Return the code and the text of the conflict if the path of a result would be too long; None if not."""
     kept = [pin for name, spec in kind.inputs.items() if spec.many for pin in pins.get(name, ()) if "job" not in pin]
     for folder in sorted({"", *map(_folder, kept)}) if into else ():
         try:
@@ -79,7 +79,10 @@ def _same_name(named: list[Pin]) -> tuple[str, str] | None:
 def _over_another_input(
     kind: KindDeclaration, params: Any, pins: Mapping[str, list[Pin]], into: str
 ) -> tuple[str, str] | None:
-    """Return code and detail of the conflict if the result of one input would replace another input of the same job."""
+    """Return the code and the text of the conflict if the result for one input would replace another input.
+
+    Returns None if there is no such conflict.
+    """
     named = pins.get(kind.named_after or "", [])
     if kind.in_place is not None and getattr(params, kind.in_place):
         return None

@@ -31,12 +31,15 @@ UNSUCCESSFUL = ("failed", "cancelled")
 
 
 def retry_job(tx: Transaction, job_id: str) -> Job:
-    """Submit a failed or cancelled job again, and return the new job; results of the old job's tasks are used again.
+    """Submit a failed or cancelled job again, and return the new job.
 
-    The new job has the same inputs. If other jobs should have created an input but did not, the retries of these jobs
-    create it. Unsuccessful dependencies are retried before the job. Dependants that ended only because of this job are
-    retried after it, so that the rest of a pipeline continues. Jobs that the caller may not retry are left out. Raises
-    `ConflictProblem` for a task, and for a job that has not ended or has succeeded.
+    The new job has the same inputs, and can share the results of tasks of the old job that have succeeded. If other
+    jobs should have created an input but did not, the retries of these jobs create it. Unsuccessful dependencies are
+    retried before the job. Dependants that ended only because of this job are retried after it, so that the rest of a
+    pipeline continues; dependants that the caller may not retry are left out.
+
+    Raises `ConflictProblem` for a task, and for a job that has not ended or has succeeded. Raises `ForbiddenProblem`
+    for a job, or a dependency, of another user, unless the caller is a maintainer.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
@@ -60,7 +63,7 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
 
 
 class _Family:
-    """Set of jobs that are retried together."""
+    """Set of jobs that are retried together, with what each of them depends on."""
 
     def __init__(self, tx: Transaction, project: ProjectRow) -> None:
         self._tx = tx
@@ -84,7 +87,7 @@ class _Family:
         """Add the jobs that ended only because one of the jobs in this set did not succeed, recursively."""
         behind: Collection[str] = list(self._rows)
         while behind:
-            rows = {row.id: row for row in self._doomed_after(behind)}
+            rows = {row.id: row for row in self._ended_because_of(behind)}
             needs = _needs(self._tx, rows)
             others = {latest for one in needs.values() for latest in one.values()} - self._rows.keys()
             missing = {one for one, state in _states(self._tx, others).items() if state in UNSUCCESSFUL}
@@ -113,8 +116,8 @@ class _Family:
             )
             raise ConflictProblem(detail, code="too-many")
 
-    def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
-        """Return the jobs that ended only because one of the given jobs did not succeed.
+    def _ended_because_of(self, ids: Collection[str]) -> Iterable[Row[Any]]:
+        """Return the jobs that could not run because one of the given jobs, on which they depend, did not succeed.
 
         Jobs that have a retry already, or that the caller may not retry, are left out.
         """
@@ -134,8 +137,8 @@ class _Family:
         )
         whole = roles.includes(self._project.role, Role.MAINTAINER)
         for row in self._tx.execute(statement):
-            doomed = row.failure is None or row.failure["reason"] == FailureReason.DEPENDENCY_FAILED
-            if doomed and row.id not in self._rows and (whole or row.author_id == self._tx.principal.user_id):
+            could_not_run = row.failure is None or row.failure["reason"] == FailureReason.DEPENDENCY_FAILED
+            if could_not_run and row.id not in self._rows and (whole or row.author_id == self._tx.principal.user_id):
                 yield row
 
 
@@ -145,7 +148,8 @@ class _Family:
 def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_ins: Mapping[str, str]) -> Submission:
     """Return the submission that retries a job under the id `new`.
 
-    `stand_ins` maps each dependency of the job to the retry of this dependency, on which the new job depends instead.
+    `stand_ins` maps each dependency of the old job to the job on which the new job depends instead: its newest retry.
+    Raises `ConflictProblem` if the kind is unknown now, the script has changed, or an input was purged.
     """
     try:
         kind = find_kind(row.kind)
@@ -179,10 +183,9 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
 
 
 def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
-    """Return the inputs for the retry of a job that ended before outputs of other jobs were pinned as its inputs.
+    """Return the inputs for the retry of a job that ended while some inputs were still outputs of unfinished jobs.
 
-    Inputs that refer to the results of another job then refer to the results of the retry of that job. `stand_ins` maps
-    the ids of jobs to the ids of their retries.
+    In these inputs, each unfinished job is replaced by its retry; `stand_ins` maps the ids of jobs to those of retries.
     """
     return {
         name: [{"job": stand_ins[entry["job"]]} if "job" in entry else entry for entry in entries]
@@ -224,9 +227,9 @@ def _states(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 
 
 def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str, str]]:
-    """Return, for each job, its dependencies, each mapped to its newest retry.
+    """Return, for each job, its dependencies, each mapped to its newest retry or, without a retry, to itself.
 
-    A job on which another depends only to share its result is left out.
+    The job whose result a job only waited to share is left out.
     """
     needs: dict[str, dict[str, str]] = {one: {} for one in rows}
     statement = select(job_dependency).order_by(job_dependency.c.on_job_id)
@@ -252,9 +255,9 @@ def _latest_tries(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 def _select_in(
     tx: Transaction, statement: Select[*tuple[Any, ...]], column: ColumnElement[str], values: Iterable[str]
 ) -> Iterator[Row[Any]]:
-    """Select the rows whose `column` is among `values`, page by page, in the order of the statement.
+    """Yield the rows whose `column` is among `values`, with several statements, because `values` may be a million.
 
-    A thousand jobs may each depend on a thousand others, and databases limit the parameters of a statement.
+    Each statement has its own order: the rows of all statements together are not sorted.
     """
     wanted = sorted(set(values))
     for some in in_lists(wanted):

@@ -24,7 +24,7 @@ from marey_server.store.folder_roles.rights import rights_of_author
 from marey_server.store.items.drafts import Draft, StoredDocument
 from marey_server.store.items.facets import StoredFacets, publish_facets, stored_facets, with_revisions
 from marey_server.store.items.publishing import publish
-from marey_server.store.jobs.fencing import hold, require_attempt
+from marey_server.store.jobs.fencing import lock_held_job, require_attempt
 from marey_server.store.jobs.inputs import PinnedInputs
 from marey_server.store.projects import find_by_id
 from marey_server.store.tables import document, job, staged_output
@@ -33,10 +33,10 @@ from marey_server.store.transaction import Transaction, in_lists
 MOST_STAGED = 20_000
 
 StagedDraft = dict[str, Any]
-"""Stored draft: an object with kind, name, collection below `into`, tags, reuse, sources, and digests of the parts."""
+"""Draft as an attempt stages it: kind, name, collection below `into`, tags, `reuse`, sources, digests of the parts."""
 
 _FACETS = ""
-"""Name of the staged draft that contains the facets of an attempt (numbers about its inputs), and no result."""
+"""Name of the entry in the table of staged drafts that contains the facets of an attempt (numbers about inputs)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,10 @@ class PreparedOutput:
 
 
 def prepare_output(output: StagedOutput) -> PreparedOutput:
-    """Check and encode the documents of an output. Raises `InvalidProblem`."""
+    """Check and encode the documents of an output.
+
+    Raises `InvalidProblem` if the kind has no such part, or a document is not valid.
+    """
     specs = PARTS[output.kind]
     unknown = [part for part in output.parts if part not in specs]
     if unknown:
@@ -70,7 +73,7 @@ def stage(
     `stored_facets`, too.
     """
     require_attempt(tx.principal, job_id, fence)
-    held = hold(tx, job_id, fence, job.c.inputs, job.c.kind, job.c.project_id)
+    held = lock_held_job(tx, job_id, fence, job.c.inputs, job.c.kind, job.c.project_id)
     if facets:
         _stage_facets(tx, job_id, fence, stored_facets(tx, held, facets))
     return _stage_outputs(tx, job_id, fence, outputs, held.inputs)
@@ -89,7 +92,10 @@ def _stage_outputs(
     names = [one.output.name for one in outputs]
     if len(set(names)) != len(names):
         twice = Counter(names).most_common(1)[0][0]
-        raise InvalidProblem(f"Two results in the request have the name {twice!r}.", code="duplicate-output")
+        raise InvalidProblem(
+            f"Two results in the request have the name {twice!r}; give each result another name.",
+            code="duplicate-output",
+        )
     of_attempt = (staged_output.c.job_id == job_id) & (staged_output.c.fence == fence)
     last = tx.execute(select(func.max(staged_output.c.position)).where(of_attempt)).scalar()
     replaced = tx.execute(
@@ -137,7 +143,11 @@ def _staged_draft(prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
 
 
 def _pinned_sources(output: StagedOutput, pins: PinnedInputs) -> dict[str, list[list[Any]]]:
-    """Return the inputs that an output names as sources, as pairs of item and revision; by default, all inputs."""
+    """Return the inputs from which an output was made, by name of the input, as pairs of item and revision.
+
+    These are the inputs that the output names as its sources; if it names none, they are all inputs. Raises
+    `InvalidProblem` for a source that is no input.
+    """
     if not output.sources:
         return {role: [[pin["item"], pin["revision"]] for pin in many] for role, many in pins.items()}
     return {role: [_pinned_source(role, source, pins) for source in named] for role, named in output.sources.items()}
@@ -181,7 +191,7 @@ def staged_drafts(
     return drafts
 
 
-def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
+def renew_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
     """Reset the age of documents that an earlier job staged, so that garbage collection keeps them.
 
     Returns whether all of them are still stored.
@@ -209,7 +219,7 @@ def drop_staged_facets(tx: Transaction, job_ids: Sequence[str]) -> None:
 
 
 def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
-    """Return the parameters with which `_BY_ATTEMPTS` selects the outputs of attempts.
+    """Return the parameters of the condition `_BY_ATTEMPTS`, which selects the staged drafts of attempts.
 
     An attempt is given by the id of its job and its fence (number of the claim).
     """
@@ -299,7 +309,7 @@ def _draft(name: str, draft: StagedDraft, row: Any) -> Draft:
 
 
 def named_blobs(tree: Any) -> Iterator[str]:
-    """Yield the digest in each member named `blob`, at any depth of parameters or of a result."""
+    """Yield the digests in all members named `blob`, at any depth of `tree`: parameters, or a result."""
     if isinstance(tree, Mapping):
         for name, value in tree.items():
             if name == "blob" and isinstance(value, str) and is_digest(value):
@@ -312,7 +322,7 @@ def named_blobs(tree: Any) -> Iterator[str]:
 
 
 def keep_named_blobs(tx: Transaction, job_id: str, digests: set[str]) -> None:
-    """Keep garbage collection from deleting the blobs that a job names.
+    """Keep the blobs that a job names, and let readers of the project read them; garbage collection spares them.
 
     Raises `ConflictProblem` (`missing-blobs`) for blobs that the caller has not sent and may not read.
     """

@@ -86,10 +86,10 @@ def submit_at(
     requests: Mapping[str, JobCreate],
     ids: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Job]:
-    """Submit the jobs of a request, as `submit` does.
+    """Submit the jobs of a request, as `submit` does; `requests` has the JSON Pointers to them as keys.
 
-    `ids` maps positions in the request to ids that are reserved for these jobs, because later jobs of the request
-    depend on them.
+    `ids` maps JSON Pointers to ids that are reserved for these jobs, because later jobs of the request depend on them.
+    The caller must have called `hold_off_purges` and `rights_of_caller`.
     """
     known = find_items(tx, project, requests.values())
     made = {ids[at]: Upstream(one.kind, JobState.WAITING) for at, one in requests.items() if at in ids}
@@ -103,7 +103,7 @@ def submit_at(
 
 
 def check_request(tx: Transaction, project: ProjectRow, request: JobCreate, at: str) -> None:
-    """Check that a job could be submitted now, without submitting it; `at` is the place of the job in the request.
+    """Check that a job could be submitted now, without submitting it; `at` is the JSON Pointer to it in the request.
 
     Raises `InvalidProblem` with a pointer to the fault, and `ForbiddenProblem` if the caller may not write to the
     folder of the results.
@@ -122,10 +122,12 @@ def submit_checked(
 ) -> list[Job]:
     """Insert the rows of checked jobs and queue those without unfinished dependencies.
 
-    `upstream` maps the ids of existing jobs, on which the new jobs depend, to their states; these existing jobs must be
-    locked. If a new job depends on another new job, this dependency counts as unfinished. Raises `ForbiddenProblem` if
-    the role of the caller is too low for an export, or if the caller may not write to the folder of the results. Raises
-    `QuotaExceededProblem` for too many unfinished jobs, or too many inputs in a day.
+    `upstream` maps the ids of the jobs on which the new jobs depend to their states. Jobs in `upstream` that exist must
+    be locked; those that are themselves new have the state `waiting`.
+
+    Raises `ForbiddenProblem` if the role of the caller is too low for an export without consent, or if the caller may
+    not write to the folder of the results. Raises `QuotaExceededProblem` for too many unfinished jobs, or too many
+    inputs in a day.
     """
     rights = rights_of_caller(tx, project)
     for submitted in submissions:
@@ -202,7 +204,7 @@ def _check(
 
 
 def _with_script(params: ScriptParams, request: JobCreate) -> tuple[KindDeclaration, JobCreate]:
-    """Return the kind of a job with the inputs of its script, and the request with the limits of the script."""
+    """Return the job kind with the inputs that a script declares, and the request with the script's resource limits."""
     assert params.declaration is not None
     limits = {"resources": params.declaration.limits.resources}
     return script_kind(params.declaration), request.model_copy(update=limits)
@@ -232,10 +234,11 @@ def _invalid(pointer: str, code: str, detail: str, unnamed: str | None = None) -
 def _lock_upstream(
     tx: Transaction, project: ProjectRow, requests: Mapping[str, JobCreate], to_be: Collection[str]
 ) -> dict[str, Upstream]:
-    """Return the dependencies that exist, locked so that none ends before the dependent jobs are inserted.
+    """Return the existing jobs on which the requested jobs depend, by id, and lock them.
 
-    `to_be` are the ids reserved for jobs of the same request, which do not exist yet. A job can depend only on existing
-    jobs, and on jobs that come earlier in the same request, so no cycle is possible.
+    So none of them ends before the dependent jobs are inserted. `to_be` are the ids reserved for jobs of the same
+    request, which do not exist yet. A job can depend only on existing jobs and on earlier jobs of the same request, so
+    no cycle is possible. Raises `InvalidProblem` for a job that is neither.
     """
     places = {
         place: one
@@ -249,12 +252,15 @@ def _lock_upstream(
     found = lock_jobs(tx, project, places.values())
     for place, one in places.items():
         if one not in found:
-            raise _invalid(place, "unknown-job", f"An input names the job {one!r}, which is not in the project.")
+            raise _invalid(place, "unknown-job", f"The request names the job {one!r}, which is not in the project.")
     return found
 
 
 def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[str, Upstream]:
-    """Lock the given jobs that exist in the project, so that none ends during this transaction, and return them."""
+    """Return, by id, those of the given jobs that exist in the project; lock them, so that none ends meanwhile.
+
+    The lock lasts until the transaction ends.
+    """
     wanted = sorted(set(ids))
     found: dict[str, Upstream] = {}
     for some in in_lists(wanted):
@@ -269,9 +275,9 @@ def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[
 
 
 def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], to_be: Collection[str], at: str) -> None:
-    """Check that each source job of an input creates items of the input's kind.
+    """Raise `InvalidProblem` if an input takes outputs of a job that creates no items of the input's kind.
 
-    If the source job belongs to the same request, the JSON Pointer of an error ends in `step`, otherwise in `job`.
+    If this job belongs to the same request, the JSON Pointer of the error ends in `step`, otherwise in `job`.
     """
     for place, name, maker in late_inputs(submission.request, at):
         wanted = submission.kind.inputs[name].kind

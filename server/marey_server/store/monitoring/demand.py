@@ -22,10 +22,10 @@ from marey_server.store.transaction import Transaction, in_lists
 
 @dataclass(frozen=True)
 class Demand:
-    """Demand for workers at one moment.
+    """Demand for the workers of a pool at one moment.
 
-    `queued` is the number of jobs that could run now, at most the given limit. `running` is the number of jobs that
-    each of the given workers runs; workers without jobs are missing.
+    `queued` is the number of queued jobs that could run now; the count stops at a limit. `running` maps the names of
+    the pool's workers to the numbers of jobs that they run; workers without jobs are missing.
     """
 
     queued: int = 0
@@ -34,7 +34,11 @@ class Demand:
 
 @dataclass(frozen=True)
 class JobReach:
-    """Jobs that the workers of a pool can run: those that require a subset of `labels`, of the `kinds` (empty: any)."""
+    """Jobs that the workers of a pool can run.
+
+    These are the jobs that require no other labels than `labels`, of one of the `kinds` or, if it is empty, of any
+    kind.
+    """
 
     labels: Mapping[str, str]
     kinds: Sequence[str] = ()
@@ -50,13 +54,17 @@ def read_demand(
     reach : jobs that the workers can run
     workers : names of the workers that exist already
     limit : number of queued jobs at which counting stops
-    others : reaches of the other pools; a job counts only for the pools with the fewest labels that can run it
+    others : jobs that the workers of the other pools can run; if several pools can run a job, it counts only for the
+        pool with the fewest labels
     """
     return Demand(_count_queued(tx, _wanted(reach, others), limit), _count_running(tx, workers))
 
 
 def _wanted(reach: JobReach, others: Sequence[JobReach]) -> ColumnElement[bool]:
-    """Return the SQL condition on labels and kinds for the jobs that count as demand for workers with this reach."""
+    """Return the SQL condition for the jobs that count as demand for a pool with this `reach`.
+
+    The pool can run these jobs, and none of the `others` with fewer labels can.
+    """
     keys: dict[tuple[str, ...], list[str]] = {}
     for key in keys_within(reach.labels):
         simpler = [one for one in others if len(one.labels) < len(reach.labels) and key in keys_within(one.labels)]
@@ -98,7 +106,7 @@ def _count_rows(tx: Transaction, rows: Select[*tuple[Any, ...]], most: int) -> i
 def _keys(project_id: str, startable: ColumnElement[bool]) -> Select[*tuple[Any, ...]]:
     """Return a query for the concurrency keys of a project for which a job could start now.
 
-    Each step looks up the next key in the index, so the cost depends on the number of keys, not of jobs.
+    Each step looks up the next key in an index, so the cost grows with the number of keys, not of jobs.
     """
     first, later, rival = job.alias("first"), job.alias("later"), job.alias("rival")
 
@@ -117,7 +125,10 @@ def _keys(project_id: str, startable: ColumnElement[bool]) -> Select[*tuple[Any,
 
 
 def _count_running(tx: Transaction, workers: Sequence[str]) -> dict[str, int]:
-    """Return the number of jobs of each worker whose leases have not expired."""
+    """Return, by name of the worker, the number of jobs that it runs with a valid lease.
+
+    Workers without jobs are missing.
+    """
     by_job = job.c.id.concat("")  # so that SQLite looks up the attempts of running jobs, not the jobs of all attempts
     current = and_(attempt.c.job_id == by_job, attempt.c.fence == job.c.fence)
     counted: dict[str, int] = {}

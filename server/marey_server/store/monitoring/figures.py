@@ -33,7 +33,7 @@ _POSTGRES_BYTES = text("SELECT pg_database_size(current_database())")
 
 @dataclass(frozen=True)
 class QueuedJobs:
-    """Number of queued jobs, and the longest time in seconds for which one of them could have run."""
+    """Number of queued jobs, and the longest time in seconds for which one of them has been ready to run."""
 
     count: int
     oldest_age_s: float
@@ -51,13 +51,16 @@ class Figures:
     """Number of workers that are alive, by version: the version of the server, `other`, or `unknown`."""
     uploads: int = 0
     stored_bytes: int = 0
-    """Bytes of the items of all projects, as the quotas count them."""
+    """Total size in bytes of the items of all projects, as the quotas count it."""
     database_bytes: int = 0
     """Size of the database in bytes."""
 
 
 def read_figures(tx: Transaction, heard: Sequence[HeardWorker], version: str) -> Figures:
-    """Return the numbers; `heard` are workers that claimed jobs from this process, `version` is that of the server."""
+    """Return the present numbers about the queue and stored data.
+
+    `heard` are the workers that claimed jobs from this process, and `version` is the version of the server.
+    """
     alive = [worker for worker in list_workers(tx, heard) if worker.alive]
     unfinished = select(func.count()).where(upload.c.finished_digest.is_(None), upload.c.dropped.is_(False))
     stored = select(func.coalesce(func.sum(holding.c.stored_bytes), 0)).join(
@@ -74,7 +77,10 @@ def read_figures(tx: Transaction, heard: Sequence[HeardWorker], version: str) ->
 
 
 def _shown_version(worker: Worker, version: str) -> str:
-    """Return `version` if the worker has this version, `unknown` if its version is unknown, else `other`."""
+    """Return the value of the metric's label for the version of a worker.
+
+    It is `version` if the worker has the version of the server, `unknown` if the version is unknown, else `other`.
+    """
     if worker.kinds is None:
         return UNKNOWN
     return version if worker.version == version else OTHER
@@ -105,5 +111,5 @@ def _running(tx: Transaction) -> dict[str, int]:
 
 
 def _known(kind: str) -> str:
-    """Return the kind, or `other` if it belongs to a package that is no longer installed."""
+    """Return `kind`, or `other` if no installed package declares this job kind any more."""
     return kind if kind in job_kinds.job_kinds() else OTHER

@@ -32,13 +32,13 @@ from marey_server.store.transaction import Transaction
 MOST_REMEMBERED = 5000
 MOST_BYTES = 16 * MIB
 LARGEST_CLAIM_BYTES = 64 * KIB
-"""Greatest number and total size of the claims that a process remembers, and greatest size of one such claim.
+"""Limits of the claims that a process remembers: their number, their total size in bytes, and the size of one claim.
 
-Beyond the first two limits, the oldest claim of the user with the most workers is forgotten. A larger claim is not
-remembered.
+If there are too many claims, or they are too large together, the oldest claim of the user with the most workers is
+forgotten. A single claim that is too large is not remembered.
 """
 MOST_OF_USER = 2000
-"""Default of the greatest number of workers of one user that are alive, in one server process."""
+"""Greatest number of workers of one user that may be alive in one server process, unless the settings change it."""
 FORGOTTEN_AFTER_S = 24 * 3600.0
 ALIVE_S = 60.0
 """Seconds after a claim in which a worker counts as alive. Workers claim again at least every 30 seconds, or every 15
@@ -77,10 +77,10 @@ class _Remembered(NamedTuple):
 class WorkerMemory:
     """Last claim of each worker that claimed jobs from this process. It is thread-safe.
 
-    A worker chooses its name, so one user could send claims with any number of names. So the number of workers of each
-    user that are alive is limited, and if there are too many claims, workers of the user with the most workers are
-    forgotten first. A worker that has sent no claim for `ALIVE_S` does not count, so workers may be replaced by workers
-    with new names.
+    A worker chooses its name, so one user could send claims with any number of names. So the number of live workers of
+    each user is limited. If there are too many claims, workers of the user with the most workers are forgotten first. A
+    worker that has sent no claim for `ALIVE_S` seconds does not count, so workers may be replaced by workers with new
+    names.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def _document(tx: Transaction, key: WorkerKey, heard: HeardWorker | None, runnin
 
 
 def _running_workers(tx: Transaction, policy: QueuePolicy) -> dict[WorkerKey, _Running]:
-    """Return the workers whose leases have not expired."""
+    """Return the workers that run jobs with a valid lease, each with the number of these jobs."""
     rows = tx.execute(
         select(
             attempt.c.claimed_by,

@@ -25,11 +25,11 @@ T = TypeVar("T")
 AT_ONCE = 4
 """Number of objects that are moved at the same time for one call."""
 MOST_TRANSFERS = 3
-"""Greatest number of transfers of one blob in a call; another one is needed if the row is written too late."""
+"""Greatest number of times that one call stores a blob; it is stored again if its row is written too late."""
 
 
 class WantedBytes(NamedTuple):
-    """Bytes `start` to `stop` of the blob with a digest; `is_whole` if these are all bytes of the blob."""
+    """Range of bytes of a blob, from `start` to `stop - 1`; `is_whole` says that these are all of its bytes."""
 
     digest: str
     start: int
@@ -39,7 +39,7 @@ class WantedBytes(NamedTuple):
 
 @dataclass
 class Carried:
-    """Bytes that were moved for one call of a function, which may need several transactions."""
+    """Bytes that were moved so far for one call of a function; the function runs again after each move."""
 
     stored: dict[str, StoredObject] = field(default_factory=dict)
     """Objects that were stored, by the digest of their bytes."""
@@ -48,7 +48,7 @@ class Carried:
     absent: set[StoredObject] = field(default_factory=set)
     """Objects that were to be read, but do not exist."""
     fault: str | None = None
-    """Reason why no object can be stored, set by `ProbeAwaited`; None before this check, and if there is none."""
+    """Reason why no object can be stored, found by the check `ProbeAwaited`; None if one can, or before the check."""
     probed: bool = False
     looked_again: bool = False
     transfers: Counter[str] = field(default_factory=Counter)
@@ -66,15 +66,15 @@ class BytesAwaited(BaseException):
 
 
 class LookAgain(BytesAwaited):
-    """Signal that bytes are not where the snapshot of the transaction says; perhaps another process has moved them."""
+    """Signal that bytes are not where the transaction has looked for them; perhaps another process has moved them."""
 
     def move(self, carried: Carried) -> None:
-        """Record that the transaction was repeated for this reason, so that it is repeated only once."""
+        """Record that the transaction is repeated because of `LookAgain`, which is done only once; move nothing."""
         carried.looked_again = True
 
 
 class ProbeAwaited(BytesAwaited):
-    """Signal that the server must check whether the bucket accepts objects, before the transaction runs again."""
+    """Signal that the transaction must know whether the bucket accepts objects; the check is made outside of it."""
 
     def __init__(self, storage: ObjectStorage) -> None:
         super().__init__()
@@ -95,7 +95,10 @@ class ObjectsToStore(BytesAwaited):
         self._now_us = now_us
 
     def move(self, carried: Carried) -> None:
-        """Store each blob under a name that was never used."""
+        """Store each blob as an object with a new name.
+
+        Raises `ObjectStorageProblem` if a blob was stored `MOST_TRANSFERS` times already, always too late.
+        """
         carried.transfers.update(self._contents.keys())
         if any(carried.transfers[digest] > MOST_TRANSFERS for digest in self._contents):
             raise ObjectStorageProblem(
@@ -121,7 +124,10 @@ class ObjectsToRead(BytesAwaited):
         self._wanted = wanted
 
     def move(self, carried: Carried) -> None:
-        """Read the ranges. Raises `DamagedProblem` if a whole object was read and does not have its digest."""
+        """Read the ranges; record missing objects as `absent`.
+
+        Raises `DamagedProblem` if all bytes of a blob were read and do not have its digest.
+        """
         for (wanted, one), data in zip(self._wanted, _in_parallel(self._read, self._wanted), strict=True):
             if data is None:
                 carried.absent.add(one)
@@ -132,7 +138,9 @@ class ObjectsToRead(BytesAwaited):
         data = self._storage.read(one.name, wanted.start, wanted.stop)
         if data is not None and wanted.is_whole and digest_of_chunks([data])[0] != wanted.digest:
             raise DamagedProblem(
-                f"The bytes of the blob {wanted.digest} were changed in the object storage.", code="blob-damaged"
+                f"The bytes of the blob {wanted.digest} were changed in the object storage. "
+                "Ask the operator to run `marey db fsck`.",
+                code="blob-damaged",
             )
         return data
 

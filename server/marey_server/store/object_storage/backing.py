@@ -26,10 +26,10 @@ from marey_server.store.object_storage.client import ObjectStorage, StoredObject
 from marey_server.store.tables import blob
 
 COMMIT_WITHIN_US = 12 * 3600 * 1_000_000
-"""Time after the beginning of a transfer within which the row of the blob must name the object.
+"""Time in microseconds from the beginning of a transfer, in which the row of the blob must name the object.
 
-Garbage collection deletes objects that no row names a day after their transfer began. So it never deletes an object
-that a row is going to name.
+Objects that no row names are deleted a day after their transfer began, or later. So no object is deleted that a row
+could still name.
 """
 
 _PLACES = select(blob.c.digest, blob.c.object_id, blob.c.size_bytes).where(
@@ -39,9 +39,9 @@ _PLACES = select(blob.c.digest, blob.c.object_id, blob.c.size_bytes).where(
 
 @dataclass(frozen=True)
 class ObjectBlobs:
-    """Blobs in object storage. Blobs whose rows name no object are in `local`.
+    """Backing whose blobs are objects in `storage`; blobs whose rows name no object are in `local`.
 
-    If `stores_objects` is false, new blobs are stored in `local`, and only existing objects are read.
+    If `stores_objects` is false, new blobs are stored in `local`, and objects are only read.
     """
 
     storage: ObjectStorage
@@ -58,7 +58,7 @@ class ObjectBlobs:
     def new_copy(self) -> Path | None:
         """Return a new file for the copy of an upload; None if `local` needs no copy, or if new blobs become objects.
 
-        In the latter case, uploads stay in the database until they are moved.
+        If new blobs become objects, uploads stay in the database until they are moved.
         """
         return None if self.stores_objects else self.local.new_copy()
 
@@ -76,9 +76,9 @@ class _InTransaction:
     now_us: Callable[[], int]
 
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
-        """Record the objects of new blobs. Raises `ObjectsToStore` if they are not stored yet, or not stored in time.
+        """Record in the rows of new blobs which objects contain their bytes.
 
-        The rows of the blobs exist already.
+        The rows must exist. Raises `ObjectsToStore` if the objects are not stored yet, or were stored too long ago.
         """
         if not self.backing.stores_objects:
             self.backing.local.write(connection, contents)
@@ -91,7 +91,10 @@ class _InTransaction:
             name_object(connection, stored[digest])
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """Yield bytes of a blob. Raises `ObjectsToRead` if they are in an object and were not read yet."""
+        """Yield the bytes `start` to `stop - 1` of a blob, fewer if the object is missing.
+
+        Raises `ObjectsToRead` if the bytes are in an object and were not read yet.
+        """
         places = self._places(connection, {digest: (start, stop)})
         wanted, one = places[0] if places else (None, None)
         if wanted is None or one is None:
@@ -111,7 +114,7 @@ class _InTransaction:
             raise LookAgain
 
     def expect(self, connection: Connection, digests: Iterable[str]) -> None:
-        """Read all of these blobs together. Raises `ObjectsToRead` if some of them were not read yet."""
+        """Prepare to read all bytes of several blobs: raise `ObjectsToRead` once for all that were not read yet."""
         places = self._places(connection, dict.fromkeys(digests))
         lacking = [
             (wanted, one)
@@ -124,7 +127,10 @@ class _InTransaction:
     def _places(
         self, connection: Connection, ranges: Mapping[str, tuple[int, int] | None]
     ) -> list[tuple[WantedBytes, StoredObject | None]]:
-        """Return the ranges, by default whole blobs, each with the object that contains it, or None if it is local."""
+        """Return the wanted ranges of blobs, each with the object that contains it, or None if the bytes are local.
+
+        `ranges` maps digests to start and stop; None stands for the whole blob. Blobs without a row are left out.
+        """
         places = []
         for row in connection.execute(_PLACES, {"digests": list(ranges)}).all() if ranges else ():
             start, stop = ranges[row.digest] or (0, row.size_bytes)

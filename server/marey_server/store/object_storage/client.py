@@ -88,7 +88,7 @@ class StoredObject:
 
     @classmethod
     def parse(cls, name: str) -> Self | None:
-        """Return the object with this name in the bucket; None if the name is not that of a blob's object."""
+        """Return the `StoredObject` with the name `name`; None if no blob's object has such a name."""
         parts = name.split("/")
         if len(parts) != 4 or parts[0] != BLOBS or len(parts[3]) != 33:
             return None
@@ -96,13 +96,13 @@ class StoredObject:
 
     @property
     def name(self) -> str:
-        """The name of the object in the bucket, after the prefix of the bucket."""
+        """Name of the object in the bucket, without the prefix that the settings give."""
         digits = self.digest.removeprefix("sha256:")
         return f"{BLOBS}/{digits[:2]}/{digits[2:]}/{self.id}"
 
     @property
     def began_us(self) -> int:
-        """The time of the database's clock at which the transfer of the object began."""
+        """Time at which the transfer of the object began, in microseconds since 1970, by the clock of the database."""
         return int(self.id.partition("-")[0], 16)
 
 
@@ -149,7 +149,7 @@ class ObjectStorage:
             obstore.put(self._store, name, data, use_multipart=False)
 
     def read(self, name: str, start: int, stop: int) -> bytes | None:
-        """Return bytes `start` to `stop` of an object, fewer if the object is shorter; None if there is no object."""
+        """Return the bytes `start` to `stop - 1` of an object, fewer if it is shorter; None if there is no object."""
         import obstore
         from obstore.exceptions import BaseError
 
@@ -203,7 +203,10 @@ class ObjectStorage:
             return obstore.sign(self._store, "GET", name, timedelta(seconds=valid_s))
 
     def fault(self) -> str | None:
-        """Return why no object can be stored in the bucket, or None; the answer may be `PROBE_VALID_S` old."""
+        """Store a small object as a check; return the reason why no object can be stored, or None if one can.
+
+        The result of the check is used for `PROBE_VALID_S` seconds.
+        """
         import obstore
         from obstore.exceptions import BaseError
 

@@ -30,7 +30,10 @@ class StoreDefect:
 
 
 def check_blob(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a defect if the bytes of a blob are damaged; blobs in object storage are left to `check_objects`."""
+    """Return a defect if the bytes of a blob are damaged; return none for blobs in object storage.
+
+    `check_objects` checks those.
+    """
     if row.object_id is not None:
         return []
     return _compare(row, tx.blobs.read(tx.connection, row.digest, 0, row.size_bytes))
@@ -41,11 +44,12 @@ def _compare(row: Row[Any], pieces: Iterable[bytes]) -> list[StoreDefect]:
     digest, size = digest_of_chunks(pieces)
     if size != row.size_bytes:
         return [StoreDefect("blob-incomplete", row.digest, f"only {size} of {row.size_bytes} bytes are stored")]
-    return [] if digest == row.digest else [StoreDefect("blob-corrupt", row.digest, "the bytes have another digest")]
+    intact = digest == row.digest
+    return [] if intact else [StoreDefect("blob-corrupt", row.digest, "the bytes do not have this digest")]
 
 
 def check_objects(database: Database) -> Iterator[list[StoreDefect]]:
-    """Read the objects of all blobs without a transaction; yield the faults of each blob."""
+    """Read the objects of all blobs, outside of transactions; yield the defects of each blob, often an empty list."""
     behind = ""
     while rows := database.read(SYSTEM, _in_objects, behind):
         for row in rows:

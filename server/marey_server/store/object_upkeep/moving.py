@@ -47,14 +47,15 @@ class Moved:
 
 
 class CannotMove(Exception):
-    """Error of blobs that cannot be moved to the storage of the settings; the text says what is possible."""
+    """Error for a storage, given by the settings, to which blobs cannot be moved; its text says what is possible."""
 
 
 def move_blobs(database: Database, moved: Moved, *, progress: Callable[[Moved], None] = lambda _moved: None) -> None:
     """Move all blobs to the storage in which the database stores new blobs.
 
-    The numbers in `moved` grow with each blob, and `progress` is called with them. Blobs can be moved to object storage
-    and to files. Damaged blobs stay where they are. Raises `CannotMove`.
+    After each blob, the numbers in `moved` are updated, and `progress` is called with `moved`. Damaged blobs stay where
+    they are. Raises `CannotMove` if new blobs are stored in the database: blobs can only be moved to object storage and
+    to files.
     """
     _move_all(database, _elsewhere(database), moved, progress)
 
@@ -90,7 +91,10 @@ def _elsewhere(database: Database) -> ColumnElement[bool]:
 
 
 def _target(database: Database) -> DirectoryBlobs | None:
-    """Return the files in which new blobs are stored; None if they are stored as objects."""
+    """Return the folder of files in which new blobs are stored; None if new blobs are stored as objects.
+
+    Raises `CannotMove` if new blobs are stored in the database.
+    """
     backing = database.blobs
     if isinstance(backing, ObjectBlobs):
         if backing.stores_objects:
@@ -144,7 +148,7 @@ def _to_file(database: Database, target: DirectoryBlobs, row: Row[Any]) -> bool:
 
 
 def _hashed(chunks: Iterator[bytes], found: list[tuple[str, int]]) -> Iterator[bytes]:
-    """Yield chunks; at the end, append their digest and their number of bytes to `found`."""
+    """Yield the chunks unchanged; after the last, append the digest and the size in bytes of all bytes to `found`."""
     hashed, size_bytes = hashlib.sha256(), 0
     for chunk in chunks:
         hashed.update(chunk)
@@ -177,7 +181,7 @@ def _same_place(row: Row[Any]) -> ColumnElement[bool]:
 
 
 def _name_object(tx: Transaction, row: Row[Any], one: StoredObject) -> bool:
-    """Use an object as the bytes of a blob, unless the blob was deleted or moved; return whether this was done.
+    """Make an object the place of a blob's bytes; return false if the blob was deleted or moved since `row` was read.
 
     Raises `ObjectStorageProblem` if the transfer of the object took too long.
     """
@@ -193,7 +197,7 @@ def _name_object(tx: Transaction, row: Row[Any], one: StoredObject) -> bool:
 
 
 def _name_file(tx: Transaction, row: Row[Any], target: DirectoryBlobs, copy: Path) -> bool:
-    """Use a file as the bytes of a blob, unless the blob was deleted or moved; return whether this was done."""
+    """Make the file `copy` the place of a blob's bytes; return false if the blob was deleted or moved meanwhile."""
     if not _take(tx, row):
         return False
     target.adopt(copy, row.digest)

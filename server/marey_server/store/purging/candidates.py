@@ -28,17 +28,17 @@ _ORDER = (
     Kind.RECORD, Kind.INDEX, Kind.STUDY, Kind.METRIC, Kind.CHARACTER, Kind.EVALUATION, Kind.GRAPH, Kind.EDIT,
     Kind.ANNOTATION, Kind.MODEL, Kind.PROCESSED, Kind.CLIP, Kind.SKELETON,
 )  # fmt: skip
-"""Kinds in the order of a purge.
+"""Kinds of items in the order of a purge.
 
-Documents of an item refer to items of later kinds in this order. So an item is purged before the items to which its
-documents refer, and does not prevent their purge.
+The documents of an item refer only to items of kinds that are later in this order. So an item is purged before the
+items to which it refers, and does not prevent their purge.
 """
 assert set(_ORDER) == set(Kind), "every kind needs a place in the order of a purge"
 
 
 @dataclass(frozen=True)
 class PreparedPurge:
-    """Items that a request may purge, and the results of the searches that were made for them before the purge."""
+    """Items that a request may purge, with a search for dataset versions and one for indexes that contain them."""
 
     ids: tuple[str, ...]
     search: VersionSearch
@@ -71,7 +71,7 @@ def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> Prepa
 
 
 def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest) -> list[Row[Any]]:
-    """Return the next deleted items that a request selects, and one more if any remain; an index finds each kind."""
+    """Return the next deleted items that a request selects: at most `MOST_PURGED`, and one more if any remain."""
     filters = ItemFilters(collection=request.collection or None, path=request.path, query=request.query, deleted=True)
     last = None if request.after is None else _kind_of(request.after)
     rows: list[Row[Any]] = []
@@ -92,7 +92,10 @@ def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest)
 
 
 def _kind_of(last: str) -> Kind:
-    """Return the kind of the item at which the previous request ended, from its id `last`."""
+    """Return the kind of the item with the id `last`, which the previous request returned as `next`.
+
+    Raises `BadRequestProblem` if `last` does not begin with a kind.
+    """
     try:
         return Kind(last.partition("_")[0])
     except ValueError:

@@ -26,7 +26,10 @@ from marey_server.store.transaction import Transaction, in_lists
 
 
 def find_citations(tx: Transaction, project: str, name: str, ref: str) -> frozenset[str]:
-    """Return the jobs that have read the version of a tag; none for a branch. This reads all jobs of the project."""
+    """Return the ids of the jobs that have read the version of a tag; none for a branch.
+
+    The function takes long, because it reads all jobs of the project.
+    """
     project_row = projects.require(tx, project)
     found = find_ref(tx, find_dataset(tx, project_row, name).id, ref)
     if found is None or found.kind != RefKind.TAG:
@@ -40,8 +43,8 @@ def delete_uncited_ref(
     """Delete a branch or a tag; `citing` are the jobs that `find_citations` has found.
 
     A job that is submitted meanwhile is not affected, because it names its version by digest. Raises the errors of
-    `delete_ref`. Also raises `ConflictProblem` if a job that has not ended, or an item that a job made, cites the
-    version of the tag, and no other tag names this version.
+    `delete_ref`. Also raises `ConflictProblem` for a cited version that no other tag names: a job that has not ended,
+    or an item that a job made, cites it.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -63,14 +66,14 @@ def delete_uncited_ref(
 
 
 def _has_tag(tx: Transaction, ref: Row[Any]) -> bool:
-    """Return whether a tag still names the version of `ref`, a branch or tag that this transaction has deleted."""
+    """Return whether another tag names the version of `ref`, a branch or tag that this transaction has deleted."""
     same = (dataset_ref.c.dataset_id == ref.dataset_id, dataset_ref.c.digest == ref.digest)
     named = select(dataset_ref.c.name).where(*same, dataset_ref.c.kind == RefKind.TAG.value)
     return tx.execute(named.limit(1)).first() is not None
 
 
 def jobs_citing(tx: Transaction, project_id: str, commits: frozenset[str]) -> frozenset[str]:
-    """Return the jobs of the project whose inputs were taken from `commits`."""
+    """Return the ids of the jobs of the project whose inputs were taken from one of `commits`."""
     if not commits:
         return frozenset()
     jobs = select(job.c.id, job.c.inputs).where(job.c.project_id == project_id).execution_options(yield_per=10)
@@ -92,10 +95,10 @@ def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
 
 
 def holders_of(tx: Transaction, citing: Collection[str]) -> FoundHolders:
-    """Return the holders of versions that jobs have read: those jobs that have not ended, and items that the jobs made.
+    """Return the holders of the versions that the jobs `citing` have read; they prevent the deletion of the versions.
 
-    Holders prevent the deletion of the versions. `citing` are the ids of the jobs; their retries and tasks are
-    included. Purged items are no holders.
+    Two kinds of objects are holders: jobs that have not ended, and items that the jobs have made, except purged items.
+    The retries and the tasks of the jobs are included.
     """
     held = FoundHolders()
     ordered = sorted(_with_retries(tx, citing))

@@ -61,9 +61,9 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
 
 
 def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]) -> None:
-    """Erase deleted folders that no longer contain items, and remove their names from events.
+    """Erase those deleted folders at and above `paths` that contain no items any more, and their names in events.
 
-    Examined are the folders at `paths`, and the folders above these. Folders that contain a dataset remain.
+    The folder of a dataset remains.
     """
     deleted = (collection.c.project_id == project_id, collection.c.deleted_us.is_not(None))
     used = exists().where(dataset.c.collection_id == collection.c.id)
@@ -99,10 +99,10 @@ def _is_within(ordered: Sequence[str], folder: str) -> bool:
 
 
 def freed_by(tx: Transaction, project_id: str, items: Collection[str], jobs: Collection[str]) -> int:
-    """Return the total bytes of the documents, arrays and files of `items` that nothing else in the project refers to.
+    """Return how many bytes a purge of `items` frees: those of documents, arrays and files that nothing else needs.
 
-    References of `jobs` do not count. References of documents that no revision contains, such as staged documents of a
-    running job, do not count either. The same holds for other projects, whose content is not shown to the caller.
+    Only references from the same project count: from revisions of other items, and from jobs that are not in `jobs`.
+    The content of other projects does not count, because the caller may not know about it.
     """
     if not items:
         return 0

@@ -41,10 +41,10 @@ def find_holders(
 ) -> dict[str, FoundHolders]:
     """Return, by the id of an item, the holders that prevent its purge; items without holders are left out.
 
-    `rows` are the items that are to be purged together. If an item in `rows` refers to another item in `rows`, the
-    reference prevents the purge of the other item only if the first item has a holder. `versions` are the holders that
-    a `VersionSearch` has found. `copies` maps the ids of indexes of motions to the ids of the clips whose poses they
-    contain; an index in `rows` refers to these clips.
+    `rows` are the items that are to be purged together. An item in `rows` that refers to another item in `rows` is a
+    holder of the other item only if it has a holder itself. `versions` are the holders that a `VersionSearch` has
+    found. `copies` maps the ids of indexes of motions to the ids of the clips whose poses they contain; an index in
+    `rows` counts as referring to these clips.
     """
     held: dict[str, FoundHolders] = {}
     for item_id, found in versions.items():
@@ -62,7 +62,10 @@ def find_holders(
 
 
 def _unfinished_jobs(tx: Transaction, project_id: str, items: Collection[str]) -> dict[str, dict[str, JobHolder]]:
-    """Return the unfinished jobs that name items, by the ids of item and job; a task is replaced by its parent job."""
+    """Return the unfinished jobs that name items, by the id of the item, then by the id of the job.
+
+    The parent job takes the place of its tasks.
+    """
     found: dict[str, dict[str, JobHolder]] = {}
     for one in jobs_naming(tx, project_id, items, unfinished=True):
         whole = one.parent or one.id
@@ -72,7 +75,10 @@ def _unfinished_jobs(tx: Transaction, project_id: str, items: Collection[str]) -
 
 
 def _references(items: Collection[str]) -> Select[*tuple[Any, ...]]:
-    """Return a query for pairs of ids: an item of `items` (`held`), and another item that refers to it (`by`)."""
+    """Return a query for the references to `items` from other items.
+
+    The column `held` is the id of an item in `items`, and the column `by` the id of an item that refers to it.
+    """
     return (
         select(document_item.c.item_id.label("held"), revision_part.c.item_id.label("by"))
         .join(revision_part, revision_part.c.document_digest == document_item.c.document_digest)
@@ -82,7 +88,7 @@ def _references(items: Collection[str]) -> Select[*tuple[Any, ...]]:
 
 
 def _add_referring(tx: Transaction, project_id: str, items: Collection[str], held: dict[str, FoundHolders]) -> None:
-    """Add, as holders, the other items of the project whose documents refer to one of `items`."""
+    """Add holders to `held`: the items of the project that are not in `items` and whose documents refer to `items`."""
     referring = (
         _references(items)
         .join(item, item.c.id == revision_part.c.item_id)
@@ -116,7 +122,10 @@ def _references_among(tx: Transaction, items: Collection[str]) -> dict[str, list
 
 
 def _spread(refers: Mapping[str, Iterable[str]], rows: Mapping[str, Row[Any]], held: dict[str, FoundHolders]) -> None:
-    """Add to `held` the items to which the items in `held` refer according to `refers`, directly or indirectly."""
+    """Make each item in `held` a holder of the items to which it refers (`refers`), and so on.
+
+    An item that has a holder is not purged, so the items to which it refers cannot be purged either.
+    """
     waiting = sorted(held)
     spread = set(waiting)
     while waiting:

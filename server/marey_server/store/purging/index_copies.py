@@ -20,9 +20,10 @@ _MOST_LIST_BYTES = 64 * MIB
 
 
 class IndexSearch:
-    """Search for clips in all revisions of the indexes of a project, also in shards of which only some clips are used.
+    """Search for clips in all revisions of the indexes of motions of a project.
 
-    Each list of clips is read once, although many revisions share it. A second `update`, in a later transaction, reads
+    An index consists of shards, each with a list of its clips; a clip that the index no longer uses may still be in a
+    shard. Each list is read once, although many revisions share it. A second `update`, in a later transaction, reads
     only the lists that were added in the meantime.
     """
 
@@ -36,7 +37,8 @@ class IndexSearch:
     def update(self, tx: Transaction) -> dict[str, frozenset[str]]:
         """Return, by the id of each index, those of the wanted clips whose poses a revision of the index contains.
 
-        Somebody may have written an index by hand. If a list of clips cannot be read, its shard may contain all clips.
+        A list of clips that cannot be read, for example in an index that somebody has written by hand, is assumed to
+        contain all wanted clips.
         """
         if not self._clips:
             return {}

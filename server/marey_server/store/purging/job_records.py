@@ -14,9 +14,9 @@ from marey_server.store.transaction import Transaction, in_lists
 
 
 def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) -> None:
-    """Remove the names of items from the records of `jobs`, and the files, facets and results of the items.
+    """Remove what the records of `jobs` contain of `items`: names, files, staged facets and cached results.
 
-    The items must still have their documents.
+    Call this before the documents of the items are deleted.
     """
     makers: list[str] = []
     touched: set[str] = set()
@@ -42,7 +42,7 @@ def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) 
 
 
 def _release_files(tx: Transaction, jobs: Sequence[str]) -> None:
-    """Let garbage collection delete the files in the results of jobs, such as an archive of exported clips."""
+    """Let garbage collection delete the files that jobs have made, such as an archive of exported clips."""
     for some in in_lists(jobs):
         results = select(job.c.id, job.c.params, job.c.result).where(job.c.id.in_(some))
         for row in tx.execute(results).all():

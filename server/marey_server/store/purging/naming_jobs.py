@@ -14,7 +14,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True, slots=True)
 class JobNaming:
-    """Job that names items."""
+    """Job that names items in its inputs, parameters or results."""
 
     id: str
     parent: str | None
@@ -22,7 +22,7 @@ class JobNaming:
     state: str
     """State of the job, or of its parent job if it is a task."""
     named: set[str] = field(default_factory=set)
-    """Ids of items in the inputs, parameters and results of the job."""
+    """Ids of those of the wanted items that the job names."""
 
 
 def jobs_naming(

@@ -34,7 +34,7 @@ STILL_HELD = "still-held"
 
 
 def preview_purge(tx: Transaction, project: str, request: PurgeRequest) -> PurgeAnswer:
-    """Return what a purge would delete and what it would refuse to delete; a preview only reads.
+    """Return what a purge would delete and what it would refuse to delete; change nothing.
 
     Raises the errors of `prepare_purge`. For a single item, also raises the errors of `record_purge`, except the error
     for an item that is still needed.
@@ -71,9 +71,9 @@ def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared:
 
 @dataclass(frozen=True)
 class _Examined:
-    """Prepared items that are still deleted: items that can be purged, and items that have holders.
+    """Those of the prepared items that are still deleted: `free` can be purged, and `refused` have holders.
 
-    The items that can be purged include indexes with poses of the others, whether or not they are deleted.
+    `free` also contains the indexes of motions with poses of items in `free`, even if the indexes are not deleted.
     """
 
     free: Sequence[Row[Any]]
@@ -102,7 +102,10 @@ def _examine(tx: Transaction, project_row: ProjectRow, request: PurgeRequest, pr
 def _answer(
     tx: Transaction, project_row: ProjectRow, request: PurgeRequest, prepared: PreparedPurge, found: _Examined
 ) -> PurgeAnswer:
-    """Return the answer to a purge, with purged and refused items and freed bytes; call this before the deletion."""
+    """Return the answer to a purge: the purged and the refused items, and the freed bytes.
+
+    Must be called before the items are erased.
+    """
     return PurgeAnswer(
         preview=request.preview,
         purged=tuple(_purged(row, named=request.preview) for row in found.free),
@@ -113,13 +116,13 @@ def _answer(
 
 
 def _lock(tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge, *, preview: bool) -> dict[str, Row[Any]]:
-    """Return the rows of the prepared items that were not restored, in their order; except for a preview, lock them."""
+    """Return the rows of the prepared items that are still deleted, in their order; lock them, except for a preview."""
     found = _lock_rows(tx, project_row, prepared.ids, preview=preview)
     return {item_id: found[item_id] for item_id in prepared.ids if item_id in found and found[item_id].deleted_us}
 
 
 def _lock_rows(tx: Transaction, project_row: ProjectRow, ids: Collection[str], *, preview: bool) -> dict[str, Row[Any]]:
-    """Return the rows of the items that were not purged, by id; except for a preview, lock them."""
+    """Return the rows of those items that are not purged, by id; lock them, except for a preview."""
     if not ids:
         return {}
     mine = (item.c.id.in_(ids), item.c.project_id == project_row.id, item.c.purged_us.is_(None))
@@ -128,7 +131,7 @@ def _lock_rows(tx: Transaction, project_row: ProjectRow, ids: Collection[str], *
 
 
 def _not_deleted(tx: Transaction, project_row: ProjectRow, item_id: str) -> ApiProblem:
-    """Return the error for an item that is not among the deleted items of the project."""
+    """Return the error for a request to purge an item that is missing, purged already, or not deleted."""
     row = tx.execute(select(item).where(item.c.id == item_id, item.c.project_id == project_row.id)).first()
     if row is None:
         return NotFoundProblem(f"There is no item {item_id!r} in this project.", code="no-item")
@@ -144,9 +147,10 @@ def _not_deleted(tx: Transaction, project_row: ProjectRow, item_id: str) -> ApiP
 def _versions(
     tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge, rows: Mapping[str, Row[Any]]
 ) -> dict[str, list[Any]]:
-    """Return the datasets whose versions contain the items; search the commits that were added since the preparation.
+    """Return, by the id of an item, the datasets of which a version contains the item.
 
-    If a revision has received a content digest since the preparation, all versions are searched again.
+    The preparation has searched the versions already, so only commits that were added since are searched. If a revision
+    has received a content digest since the preparation, all versions are searched again.
     """
     contents, parts = contents_of(tx, tuple(rows))
     search = prepared.search

@@ -44,7 +44,7 @@ class VersionSearch:
         """Digests of the wanted contents in a chunk and all chunks below it, by the digest of the chunk."""
 
     def update(self, tx: Transaction) -> None:
-        """Search the commits that were not searched yet, and forget those that were purged since."""
+        """Search the commits that were not searched yet, and forget commits that no longer exist."""
         if not self.wanted:
             return
         statement = select(dataset_commit.c.dataset_id, dataset_commit.c.digest, dataset_commit.c.tree)
@@ -54,7 +54,10 @@ class VersionSearch:
         self._search(StoredChunks(tx), set(self._roots.values()) - self._below.keys())
 
     def _search(self, store: StoredChunks, roots: Collection[str]) -> None:
-        """Search the chunks below `roots`, level by level, then gather what was found from the leaves upwards."""
+        """Search the chunks below `roots` level by level, then collect the found contents from the leaves to the roots.
+
+        Raises `DamagedChunk` if a chunk is missing.
+        """
         children: dict[str, tuple[str, ...]] = {}
         waiting = set(roots)
         while waiting:
@@ -86,7 +89,10 @@ class VersionSearch:
         return frozenset(entry_of(*one).content for one in near) & self.wanted.keys() if near else _NOTHING
 
     def holders(self, tx: Transaction, contents: Mapping[str, Collection[str]]) -> dict[str, list[DatasetHolder]]:
-        """Return the datasets whose versions contain items; `contents` maps ids of items to contents of revisions."""
+        """Return, by the id of an item, the datasets of which a version contains the item.
+
+        `contents` maps the ids of items to the content digests of their revisions.
+        """
         containing: dict[str, dict[str, set[str]]] = {}
         items_of: dict[str, set[str]] = {}
         for item_id, digests in contents.items():
@@ -114,7 +120,7 @@ class _Names:
         self._proposals = tx.execute(_PROPOSALS.where(proposal.c.dataset_id.in_(chosen))).all() if ids else []
 
     def holder(self, dataset_id: str, commits: Collection[str]) -> DatasetHolder:
-        """Return the dataset as a holder of an item; `commits` are the commits of the dataset that contain the item."""
+        """Return a dataset as a holder of an item, with what refers to `commits`, the commits that contain the item."""
         refs = [row for row in self._refs if row.dataset_id == dataset_id and row.digest in commits]
         proposals = [row for row in self._proposals if row.dataset_id == dataset_id and row.head_now in commits]
         return DatasetHolder(

@@ -53,11 +53,12 @@ class PreparedDatasetPurge:
     commits: frozenset[str]
     """Commits that no other dataset of the project has."""
     citing: frozenset[str]
-    """Jobs that read one of `commits`; while the dataset is deleted, no new jobs can read these, except retries."""
+    """Ids of the jobs that read one of `commits`. As the dataset is deleted, only retries of these jobs can follow."""
     chunks: Mapping[str, int]
-    """Digests of the chunks that no other dataset needs, with the times at which they were stored last.
+    """Digests of the chunks that no other dataset of the server needs, with the times at which they were last stored.
 
-    Apart from the chunks of this dataset, these are chunks of former selections, of which no dataset has a record."""
+    Besides the chunks of this dataset, they include chunks of earlier partial checkouts that no dataset uses any more.
+    """
     freed_bytes: int
 
 
@@ -201,9 +202,9 @@ def _below(store: StoredChunks, roots: Collection[str]) -> set[str]:
 def _delete_chunks(tx: Transaction, chunks: Mapping[str, int]) -> None:
     """Delete chunks, apart from those that another write has stored again since the purge was prepared.
 
-    A write that makes a tree stores its new chunks, even if they exist already. Storing a chunk again changes its time,
-    so the chunk is not deleted. All other chunks of the new tree belong to an older tree, too, so they are not deleted
-    either.
+    `chunks` maps digests to the times at which the chunks were last stored. A write that makes a tree stores its new
+    chunks even if they exist already, which changes this time. All other chunks of the new tree also belong to an older
+    tree of another dataset, so they are not in `chunks`.
     """
     digests = sorted(chunks)
     for some in in_lists(digests):

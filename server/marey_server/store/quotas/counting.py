@@ -19,7 +19,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """Text for errors about a quota: the things that are counted, and what the user can do."""
+    """Parts of the error text for an exceeded quota: the noun for what is counted, and what the user can do."""
 
     noun: str
     remedy: str
@@ -42,11 +42,10 @@ _RULES = {
 
 
 def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
-    """Check that the caller can add `more` things of the kind that a quota limits, without exceeding this quota.
+    """Raise `QuotaExceededProblem` if the caller would exceed a quota by adding `more` of what the quota counts.
 
     `quota` is a field of `Quotas`, such as "user_uploads"; for quotas of bytes, `more` is a number of bytes. The server
-    and attempts of jobs have no quotas. Concurrent checks of one user run one after another. Raises
-    `QuotaExceededProblem`.
+    and attempts of jobs have no quotas. Concurrent checks of one user run one after another.
     """
     user_id = tx.principal.user_id
     if user_id is None or tx.principal.kind != "user":
@@ -67,7 +66,7 @@ def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
 
 
 def room_of(tx: Transaction, quota: str, user_id: str) -> int:
-    """Return how many things of a kind a user may still add without exceeding a quota.
+    """Return how many things a user may still add without exceeding a quota; negative if there are too many already.
 
     Unlike `require_room`, this function is for a user who is not the caller, and locks nothing. So concurrent writes
     may together exceed the quota.
@@ -88,7 +87,7 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[*tuple[Any, ...]]
     if quota == "user_uploads":
         return select(func.count()).select_from(upload).where(*_open(user_id))
     if quota == "user_upload_bytes":
-        taking_space = or_(and_(*_open(user_id)), and_(*_useless(user_id)))
+        taking_space = or_(and_(*_open(user_id)), and_(*_stored_twice(user_id)))
         return select(func.coalesce(func.sum(upload.c.length), 0)).where(taking_space)
     if quota == "user_tokens":
         valid = or_(token.c.expires_us.is_(None), token.c.expires_us > tx.now_us)
@@ -106,10 +105,11 @@ def _open(user_id: str) -> tuple[Any, ...]:
     return upload.c.user_id == user_id, upload.c.finished_digest.is_(None), upload.c.dropped.is_(False)
 
 
-def _useless(user_id: str) -> tuple[Any, ...]:
-    """Return the conditions for finished uploads whose pieces no blob needs, and which are not deleted yet.
+def _stored_twice(user_id: str) -> tuple[Any, ...]:
+    """Return the SQL conditions for finished uploads of a user whose bytes are stored twice.
 
-    Their bytes were stored already, so they do not count towards `user_daily_bytes`.
+    Their bytes were a blob already, so no blob uses the pieces of the upload, and they do not count towards
+    `user_daily_bytes`. The pieces take space until they are deleted.
     """
     has_pieces = exists().where(upload_chunk.c.upload_id == upload.c.id)
     has_blob = exists().where(blob.c.upload_id == upload.c.id)
@@ -117,10 +117,10 @@ def _useless(user_id: str) -> tuple[Any, ...]:
 
 
 def require_place(tx: Transaction, project_id: str, table: Table) -> None:
-    """Check that a project may have one more row of a table, which has the column `project_id`.
+    """Raise `QuotaExceededProblem` if a project may not have another row of a table.
 
-    The quota is `project_<table>s`, such as `project_webhooks`. Concurrent checks of one project run one after another.
-    Raises `QuotaExceededProblem`.
+    The table has the column `project_id`. The quota is `project_<table>s`, such as `project_webhooks`. Concurrent
+    checks of one project run one after another.
     """
     noun, quota = f"{table.name}s", f"project_{table.name}s"
     tx.lock(f"{noun} {project_id}")

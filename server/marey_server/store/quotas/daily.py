@@ -20,9 +20,9 @@ _SENTENCES = {
 
 
 def require_sendable(tx: Transaction, size_bytes: int) -> None:
-    """Check that the caller may send new bytes at present, but do not count them; use `count_sent` as well.
+    """Raise `QuotaExceededProblem` if the caller may not send `size_bytes` new bytes at present.
 
-    Raises `QuotaExceededProblem`.
+    The bytes are not counted; call `count_sent` as well.
     """
     if (limit := _part_of_day(tx, _BYTES, _caller(tx), size_bytes)) is not None:
         _require(tx, _BYTES, size_bytes, rate_limits.wait_s(tx, limit))
@@ -37,16 +37,16 @@ def count_sent(tx: Transaction, size_bytes: int) -> None:
     _count(tx, _BYTES, _caller(tx), size_bytes)
 
 
-def take_back_sent(tx: Transaction, size_bytes: int) -> None:
-    """Undo the count of bytes that were announced, but never received."""
+def uncount_sent(tx: Transaction, size_bytes: int) -> None:
+    """Undo the count of bytes that the caller has announced, but never sent."""
     if (limit := _part_of_day(tx, _BYTES, _caller(tx), size_bytes)) is not None:
-        rate_limits.take_back(tx, limit)
+        rate_limits.uncount(tx, limit)
 
 
 def require_submittable(tx: Transaction, inputs: int) -> None:
     """Raise `QuotaExceededProblem` if jobs have more inputs than the caller may submit in a whole day.
 
-    Use `count_submitted` as well; this function spares the work for jobs that can never be submitted.
+    Call `count_submitted` as well. This early check avoids work for jobs that can never be submitted.
     """
     if _caller(tx) is not None:
         _require(tx, _INPUTS, inputs, 0)
@@ -68,7 +68,7 @@ def count_late(tx: Transaction, author_id: str, inputs: int) -> None:
 
 
 def _caller(tx: Transaction) -> str | None:
-    """Return the id of the user to whom quotas apply in this transaction, or None."""
+    """Return the id of the caller if quotas apply: of a user, but not of the server or an attempt; otherwise None."""
     return tx.principal.user_id if tx.principal.kind == "user" else None
 
 
@@ -79,7 +79,7 @@ def _count(tx: Transaction, quota: str, user_id: str | None, amount: int) -> Non
 
 
 def _require(tx: Transaction, quota: str, amount: int, wait_s: int) -> None:
-    """Raise `QuotaExceededProblem` if the user must wait before adding an amount, or has a quota that is too small."""
+    """Raise `QuotaExceededProblem` if the user must wait (`wait_s`), or the amount is larger than the whole quota."""
     most = getattr(tx.quotas, quota)
     never = amount > most
     if wait_s == 0 and not never:

@@ -20,8 +20,8 @@ from marey_server.store.transaction import Transaction
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
-    """Number of items, and number of bytes of their revisions."""
+class ItemTotals:
+    """Numbers that the quotas count: of items, and of the bytes of their revisions."""
 
     items: int = 0
     stored_bytes: int = 0
@@ -29,8 +29,8 @@ class Held:
     def __str__(self) -> str:
         return f"{self.items:,} items of {self.stored_bytes:,} bytes"
 
-    def __add__(self, more: Held) -> Held:
-        return Held(self.items + more.items, self.stored_bytes + more.stored_bytes)
+    def __add__(self, more: ItemTotals) -> ItemTotals:
+        return ItemTotals(self.items + more.items, self.stored_bytes + more.stored_bytes)
 
 
 COUNTED = ("items", "stored_bytes")
@@ -47,29 +47,29 @@ _ADD = Prepared(
 )
 
 
-def by_creator(rows: Iterable[Row[Any]]) -> dict[str | None, Held]:
+def by_creator(rows: Iterable[Row[Any]]) -> dict[str | None, ItemTotals]:
     """Return the number of items and bytes of each creator, from rows of items with `creator_id` and `stored_bytes`."""
-    held: dict[str | None, Held] = {}
+    held: dict[str | None, ItemTotals] = {}
     for row in rows:
-        held[row.creator_id] = held.get(row.creator_id, Held()) + Held(1, row.stored_bytes)
+        held[row.creator_id] = held.get(row.creator_id, ItemTotals()) + ItemTotals(1, row.stored_bytes)
     return held
 
 
-def hold(tx: Transaction, project_id: str, more: Mapping[str | None, Held]) -> None:
+def count_added(tx: Transaction, project_id: str, more: Mapping[str | None, ItemTotals]) -> None:
     """Add items and bytes to the counters of a project and of the creators of these items.
 
     The counters are locked until the transaction ends, so that no concurrent writes exceed a quota together. Raises
     `QuotaExceededProblem`; the caller must then roll back.
     """
-    total = sum(more.values(), Held())
-    if total == Held():
+    total = sum(more.values(), ItemTotals())
+    if total == ItemTotals():
         return
-    _hold(tx, "project", project_id, total)
+    _count_added(tx, "project", project_id, total)
     for creator_id in sorted(filter(None, more)):
-        _hold(tx, "user", creator_id, more[creator_id])
+        _count_added(tx, "user", creator_id, more[creator_id])
 
 
-def _hold(tx: Transaction, of: str, owner_id: str, more: Held) -> None:
+def _count_added(tx: Transaction, of: str, owner_id: str, more: ItemTotals) -> None:
     row = _add(tx, owner_id, more)
     for name in COUNTED:
         used, added, limit = getattr(row, name), getattr(more, name), limit_of(tx, of, name, row.limits)
@@ -88,15 +88,15 @@ def limit_of(tx: Transaction, of: str, name: str, limits: Mapping[str, int]) -> 
     return limits.get(name, getattr(tx.quotas, f"{of}_{name}"))
 
 
-def release(tx: Transaction, project_id: str, less: Mapping[str | None, Held]) -> None:
+def count_removed(tx: Transaction, project_id: str, less: Mapping[str | None, ItemTotals]) -> None:
     """Subtract items and bytes from the counters of a project and of the creators of these items."""
-    total = sum(less.values(), Held())
+    total = sum(less.values(), ItemTotals())
     for owner_id, held in ((project_id, total), *sorted((one, less[one]) for one in less if one is not None)):
-        if held != Held():
-            _add(tx, owner_id, Held(-held.items, -held.stored_bytes))
+        if held != ItemTotals():
+            _add(tx, owner_id, ItemTotals(-held.items, -held.stored_bytes))
 
 
-def _add(tx: Transaction, owner_id: str, more: Held) -> Any:
+def _add(tx: Transaction, owner_id: str, more: ItemTotals) -> Any:
     given = {"owner": owner_id, "more_items": more.items, "more_stored_bytes": more.stored_bytes}
     row = tx.first(_ADD, given)
     if row is None:
@@ -121,8 +121,8 @@ def show_quotas(tx: Transaction, of: Literal["project", "user"], owner_id: str) 
 
 
 def change_limits(tx: Transaction, owner_id: str, change: QuotaChange) -> dict[str, int]:
-    """Change the limits of items and bytes, and return those that differ from the settings."""
-    changed = _add(tx, owner_id, Held()).limits | change.model_dump(exclude_unset=True, include=set(COUNTED))
+    """Change the limits of items and bytes of a project or user; return all limits that an administrator has set."""
+    changed = _add(tx, owner_id, ItemTotals()).limits | change.model_dump(exclude_unset=True, include=set(COUNTED))
     limits = {name: limit for name, limit in changed.items() if limit is not None}
     tx.execute(update(holding).where(holding.c.owner_id == owner_id).values(limits=limits))
     return limits
@@ -144,25 +144,25 @@ BYTES_OF_ITEM = (
     .correlate(item)
     .scalar_subquery()
 )
-"""Bytes of all revisions of an item; a part counts in each revision that changed it."""
+"""SQL expression for the bytes of all revisions of an item; a part counts in each revision that changed it."""
 
 
 _SUMS = (func.count().label("items"), func.coalesce(func.sum(item.c.stored_bytes), 0).label("stored_bytes"))
 
 
-def count_held(tx: Transaction, owner: Column[str], owner_id: str) -> Held:
+def count_held(tx: Transaction, owner: Column[str], owner_id: str) -> ItemTotals:
     """Return the numbers of items and bytes of a project or a user, counted item by item.
 
     `owner` is the column of `item` that names the project or user.
     """
     row = tx.execute(select(*_SUMS).where(owner == owner_id, item.c.deleted_us.is_(None))).one()
-    return Held(row.items, int(row.stored_bytes))
+    return ItemTotals(row.items, int(row.stored_bytes))
 
 
-def read_held(tx: Transaction, owner_id: str) -> Held:
+def read_held(tx: Transaction, owner_id: str) -> ItemTotals:
     """Return the number of items and bytes of a project or a user from the counters."""
     row = tx.execute(select(holding.c["items"], holding.c.stored_bytes).where(holding.c.owner_id == owner_id)).first()
-    return Held() if row is None else Held(row.items, row.stored_bytes)
+    return ItemTotals() if row is None else ItemTotals(row.items, row.stored_bytes)
 
 
 def recount(tx: Transaction) -> None:
@@ -174,4 +174,4 @@ def recount(tx: Transaction) -> None:
     for owner in (item.c.project_id, item.c.creator_id):
         sums = select(owner.label("owner_id"), *_SUMS).where(item.c.deleted_us.is_(None), owner.is_not(None))
         for row in tx.execute(sums.group_by(owner)).all():
-            _add(tx, row.owner_id, Held(row.items, int(row.stored_bytes)))
+            _add(tx, row.owner_id, ItemTotals(row.items, int(row.stored_bytes)))

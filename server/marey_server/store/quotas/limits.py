@@ -12,7 +12,7 @@ from marey_server.store.transaction import Transaction
 
 
 def show_project_quotas(tx: Transaction, project_id: str) -> ProjectQuotasInUse:
-    """Return the use and the limits of the quotas of a project, with that of running jobs."""
+    """Return the use and the limits of the quotas of a project: items, bytes and running jobs."""
     running, limit = read_limit(tx, project_id)
     shown = show_quotas(tx, "project", project_id)
     jobs = RunningJobs(used=running, allowed=limit)

@@ -15,12 +15,12 @@ def count_leased(project_id: ColumnElement[str]) -> ColumnElement[int]:
 
 
 def name_of_lock(project_id: str) -> str:
-    """Return the name of the lock that claims of jobs of a project with a limit, and changes of the limit, hold."""
+    """Return the name of the lock on a project's limit of running jobs; claims and changes of the limit hold it."""
     return f"running jobs {project_id}"
 
 
 def key_of_lock(project_id: str) -> ColumnElement[int]:
-    """Return the SQL expression for the number of this lock (`name_of_lock`) in Postgres."""
+    """Return the SQL expression for the number by which Postgres identifies the lock `name_of_lock`."""
     return func.hashtextextended(name_of_lock(project_id), 0)
 
 

@@ -33,17 +33,20 @@ DUE_AT_ONCE = 100
 """Greatest number of due schedules that one call of `submit_due` handles."""
 MAX_PROBLEM_LENGTH = 500
 SKIPPED = "Skipped, because the previous job"
-"""Beginning of the field `problem` of a schedule that skipped a time; the submission of its job was not refused."""
+"""Beginning of the field `problem` of a schedule that skipped a time because its previous job had not ended.
+
+Such a problem does not count as a refusal.
+"""
 
 _SUBMITS = RequiredRole(Role.CONTRIBUTOR, "jobs", guests=False, in_folders=True)
 """Role and scope that the author of a schedule needs whenever a job is submitted."""
 
 
 def submit_due(database: Database) -> int:
-    """Submit the jobs of the schedules that are due, each in its own transaction; return the number of these schedules.
+    """Submit the jobs of the schedules that are due, each in its own transaction; return how many were handled.
 
-    An unexpected error of one schedule does not keep the others from submitting their jobs: the schedule records that
-    it has failed, and goes on at its next time.
+    After an unexpected error, the other schedules are still handled; the failed schedule records that it has failed,
+    and continues at its next time. While the database is unavailable, a schedule stays due and is not counted.
     """
     due = database.read(SYSTEM, _find_due)
     done = len(due)
@@ -60,7 +63,7 @@ def submit_due(database: Database) -> int:
 
 
 def _find_due(tx: Transaction) -> list[str]:
-    """Return the ids of due schedules, those that are due longest first."""
+    """Return the ids of at most `DUE_AT_ONCE` due schedules, the longest due first."""
     statement = (
         select(schedule.c.id)
         .join(project, project.c.id == schedule.c.project_id)
@@ -94,7 +97,10 @@ def submit_if_due(tx: Transaction, schedule_id: str) -> None:
 
 
 def _skip_after_fault(tx: Transaction, schedule_id: str) -> None:
-    """Move the due time of a schedule, so that a fault of the server is not repeated every few seconds."""
+    """Record that a fault of the server prevented the submission, and move the due time of the schedule.
+
+    Otherwise the server would repeat the fault every few seconds.
+    """
     row = tx.execute(select(schedule).where(schedule.c.id == schedule_id).with_for_update()).first()
     if row is not None and row.due_us is not None:
         values = _next_time(tx, row) | {"fired_us": tx.now_us, "rev": schedule.c.rev + 1}
@@ -103,7 +109,7 @@ def _skip_after_fault(tx: Transaction, schedule_id: str) -> None:
 
 
 def _next_time(tx: Transaction, row: Row[Any]) -> dict[str, Any]:
-    """Return the new due time of a schedule; the schedule is paused if it has no time in the future."""
+    """Return the columns that set the next due time of a schedule, or pause it if it has no time in the future."""
     try:
         return {"due_us": next_time_us(row.cron, row.timezone, tx.now_us)}
     except InvalidProblem as problem:

@@ -40,7 +40,7 @@ def list_schedules(tx: Transaction, project: str, *, cursor: str | None, limit: 
 
 
 def read_schedule(tx: Transaction, project: str, name: str) -> Schedule:
-    """Return a schedule. Raises `NotFoundProblem`."""
+    """Return a schedule. Raises `NotFoundProblem` if it does not exist."""
     return _shown(project, _find(tx, projects.require(tx, project), name))
 
 
@@ -112,7 +112,7 @@ def delete_schedule(tx: Transaction, project: str, name: str, *, expected_rev: E
 
 
 def _author(tx: Transaction) -> dict[str, Any]:
-    """Return the columns that contain the user and the scopes with which the jobs are submitted."""
+    """Return the columns of a schedule that make the caller its author: the user and the scopes of the token."""
     return {"author_id": tx.principal.user_id, "scopes": sorted(tx.principal.scopes)}
 
 
@@ -125,7 +125,10 @@ def _check_job(tx: Transaction, row: ProjectRow, job: JobCreate) -> None:
 
 
 def _require_rights(tx: Transaction, row: ProjectRow, name: str) -> Row[Any]:
-    """Return the locked row of a schedule. Raises `ForbiddenProblem` if the caller may not change it."""
+    """Lock a schedule and return its row.
+
+    Raises `ForbiddenProblem` if the caller is neither its author nor a maintainer of the project.
+    """
     found = _find(tx, row, name, lock=True)
     if found.author_id != tx.principal.user_id and not roles.includes(row.role, Role.MAINTAINER):
         raise ForbiddenProblem(

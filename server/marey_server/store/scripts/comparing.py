@@ -1,4 +1,4 @@
-"""Runs of a script as they are read to be compared: settings, numbers, and the curves of logged fields."""
+"""Reading of the runs of a script for a comparison: their settings, numbers, and the curves of logged fields."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ROWS_AT_ONCE = 10
 
 
 class RunToCompare(NamedTuple):
-    """Succeeded run of a script. Runs with the same `setting` differ only by their seeds."""
+    """Succeeded run of a script; `setting` is equal for all runs that differ only in their seeds."""
 
     job: str
     commit: str
@@ -43,7 +43,7 @@ class RunToCompare(NamedTuple):
 def find_runs(
     tx: Transaction, project: str, name: str, *, sort: str, limit: int = MOST_COMPARED
 ) -> tuple[list[RunToCompare], bool]:
-    """Return the first succeeded runs of a script in the given order, and whether these are all succeeded runs.
+    """Return the first `limit` succeeded runs of a script in the given order, and whether there are no others.
 
     Raises `BadRequestProblem` for an unknown order.
     """
@@ -61,9 +61,10 @@ def find_runs(
 
 
 def read_curves(tx: Transaction, digests: Iterable[str]) -> dict[str, dict[str, Curve]]:
-    """Return the curves in each of the given blobs that is stored and contains curves.
+    """Return the curves in blobs, by the digest of the blob.
 
-    The blobs come from the results of jobs, in which a worker can name any blob of the project.
+    Blobs that are missing, too large, or contain no curves are left out: a worker can name any blob of the project in
+    the result of a job.
     """
     readable = blobs.sizes_of(tx, blobs.readable(tx, set(digests)))
     small = {digest: size for digest, size in readable.items() if size <= MOST_CURVE_BYTES}
@@ -102,7 +103,7 @@ def _listed(given: Any) -> list[Mapping[str, Any]]:
 
 
 def _words_of(pins: list[Mapping[str, Any]]) -> str:
-    """Return path and revision of an input with one item, otherwise the number of items and a hash of their list."""
+    """Return a short text for an input: path and revision of a single item, or the number of items and their hash."""
     if len(pins) != 1:
         revisions = canonical_json([(pin["item"], pin["revision"]) for pin in pins])
         return f"{counted(len(pins), 'item')} #{hashlib.sha256(revisions).hexdigest()[:6]}"
@@ -112,6 +113,6 @@ def _words_of(pins: list[Mapping[str, Any]]) -> str:
 
 
 def _is_short(field: tuple[str, Value]) -> bool:
-    """Return whether name and text of a field have an accepted length: a worker can write any JSON into a result."""
+    """Return whether the name and the text of a logged field are short enough; workers can write any JSON."""
     name, value = field
     return len(name) <= LONGEST_NAME and not (isinstance(value, str) and len(value) > LONGEST_TEXT)

@@ -30,14 +30,14 @@ def list_scripts(tx: Transaction, project: str, *, cursor: str | None, limit: in
 
 
 def read_script(tx: Transaction, project: str, name: str) -> Script:
-    """Return a script. Raises `NotFoundProblem`."""
+    """Return a script. Raises `NotFoundProblem` if it does not exist."""
     return _shown(project, find_script(tx, projects.require(tx, project), name))
 
 
 def register_script(tx: Transaction, project: str, request: ScriptCreate, allowed: Sequence[str]) -> Script:
     """Register a script. `allowed` are the repositories that the server allows.
 
-    Raises `ForbiddenProblem` if no scripts are allowed, `InvalidProblem` if repository or image is not allowed,
+    Raises `ForbiddenProblem` if no scripts are allowed, `InvalidProblem` if the repository or the image is not allowed,
     `ConflictProblem` if the name is taken, and `QuotaExceededProblem` if the project has too many scripts.
     """
     row = projects.require(tx, project)
@@ -79,10 +79,10 @@ def delete_script(tx: Transaction, project: str, name: str) -> None:
 
 
 def resolve_params(tx: Transaction, project: ProjectRow, params: ScriptParams, at: str) -> ScriptParams:
-    """Return the parameters of a job with the declaration of its script; `at` is the place of the job in the request.
+    """Return the parameters of a job with the registered declaration of its script, and with default values.
 
-    Raises `InvalidProblem` with a pointer to each fault: an unknown script, another declaration than the registered
-    one, a missing or wrong value.
+    `at` is the JSON Pointer to the job in the request. Raises `InvalidProblem` with a pointer to each fault: an unknown
+    script, another declaration than the registered one, or a missing or wrong value.
     """
     try:
         found = find_script(tx, project, params.script)
@@ -104,7 +104,7 @@ def resolve_params(tx: Transaction, project: ProjectRow, params: ScriptParams, a
 
 
 def require_unchanged(tx: Transaction, project: ProjectRow, params: Mapping[str, Any]) -> None:
-    """Raise `ConflictProblem` if the script of an earlier job is not registered any more in the same form."""
+    """Raise `ConflictProblem` if the script of an earlier job was deleted, or registered again in another form."""
     earlier = ScriptParams.model_validate(params)
     try:
         resolve_params(tx, project, earlier, "")
@@ -127,7 +127,7 @@ def record_runs(tx: Transaction, project_id: str, jobs: Iterable[tuple[str, str,
 
 
 def find_script(tx: Transaction, row: ProjectRow, name: str) -> Row[Any]:
-    """Return the row of a script. Raises `NotFoundProblem`."""
+    """Return the row of a script. Raises `NotFoundProblem` if it does not exist."""
     found = tx.execute(_rows(row).where(script.c.name == name)).first()
     if found is None:
         raise NotFoundProblem(f"The project has no script {name!r}.", code="no-script")

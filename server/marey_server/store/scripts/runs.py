@@ -25,7 +25,10 @@ _SORT = re.compile(r"(-?)(created_at|(?:(fields|values)\.([A-Za-z][A-Za-z0-9_]{0
 
 
 def run_script(tx: Transaction, project: str, name: str, request: ScriptRunCreate) -> Job:
-    """Submit a job that runs a script. Raises `NotFoundProblem`, and the errors of `submission.submit`."""
+    """Submit a job that runs a script, and return the job.
+
+    Raises `NotFoundProblem` if there is no such script, and the errors of `submission.submit`.
+    """
     find_script(tx, projects.require(tx, project), name)
     params = request.model_dump(mode="json", include={"values", "allow_expired_consent", "consent_reason"})
     wanted = JobCreate(
@@ -94,15 +97,18 @@ def _shown(row: Row[Any]) -> ScriptRun:
 
 
 def fields_of(result: Any) -> dict[str, Value]:
-    """Return the logged fields in the result of a run; a worker can write anything else there, which is left out."""
+    """Return the logged fields in the result of a run.
+
+    A worker can write any JSON into a result; values that are no logged fields are left out.
+    """
     fields = result.get("fields") if isinstance(result, dict) else None
     return sound_values(fields) if isinstance(fields, dict) else {}
 
 
 def sound_values(values: Mapping[str, Any]) -> dict[str, Value]:
-    """Return the texts, truth values and finite numbers of a document.
+    """Return those of the values that are texts, truth values or finite numbers, by name.
 
-    Postgres returns a large float such as 1e20 as an integer; it becomes a float again, as integers are 64 bits wide.
+    An integer of more than 64 bits becomes a float, because Postgres returns a large float such as 1e20 as an integer.
     """
     found: dict[str, Value] = {}
     for name, value in values.items():

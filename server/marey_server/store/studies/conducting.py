@@ -31,12 +31,12 @@ from marey_server.store.tables import item, study_participant
 from marey_server.store.transaction import Transaction
 
 Plan = list[list[int]]
-"""Motions of each trial of a participant."""
+"""Trials of a participant: for each trial, the indices of its motions in the design of the study."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedDraw:
-    """Basis for the draw of trials for new participants: the design, and the trials of all earlier participants."""
+    """Values from which trials for new participants are drawn: the design, and the trials of earlier participants."""
 
     revision: int
     design: StudyDocument
@@ -49,9 +49,10 @@ def pseudonym(number: int) -> str:
 
 
 def plan_links(tx: Transaction, project: str, kind: Kind, item_id: str, request: StudyLinksCreate) -> PlannedDraw:
-    """Return the basis for the draw of trials for new links; the draw itself runs outside of transactions.
+    """Return the values from which trials for new links are drawn; the draw itself runs outside of transactions.
 
-    Raises `NotFoundProblem`, or `QuotaExceededProblem` if the project has too many participants.
+    Raises `NotFoundProblem` if there is no such study, `QuotaExceededProblem` if the project has too many participants,
+    and `ConflictProblem` if the consent for a motion has ended.
     """
     project_row, row = require_study(tx, project, kind, item_id)
     _require_room(tx, project_row.id, request.count)
@@ -176,7 +177,7 @@ def withdraw_participant(tx: Transaction, project: str, kind: Kind, item_id: str
 
 
 def read_progress(tx: Transaction, project: str, kind: Kind, item_id: str) -> StudyProgress:
-    """Return numbers of participants and trials of a study; they show nothing of single participants."""
+    """Return how many participants and trials of a study have reached which state, without single participants."""
     _, row = require_study(tx, project, kind, item_id)
     t = study_participant.c
     alive, begun = t.withdrawn_us.is_(None), t.token_hash.is_not(None)

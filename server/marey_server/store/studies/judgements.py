@@ -27,7 +27,7 @@ def list_judgements(
 ) -> Page:
     """Return a page of the participants who have begun a revision of a study, each with all trials, without dates.
 
-    Raises `NotFoundProblem` or `ForbiddenProblem`.
+    Raises `NotFoundProblem` if there is no such study, and `ForbiddenProblem` if the caller's role is too low.
     """
     _, row = require_study(tx, project, kind, item_id)
     return _page(tx, row.id, revision, cursor, limit)
@@ -36,10 +36,10 @@ def list_judgements(
 def list_for_attempt(
     tx: Transaction, job_id: str, fence: int, item_id: str, *, revision: int, cursor: str | None, limit: int
 ) -> Page:
-    """Return the same page as `list_judgements` to an attempt of a job.
+    """Return the same page as `list_judgements`, to an attempt of a job.
 
-    The revision of the study must be an input of the job, and the author of the job must be a maintainer. Raises
-    `NotFoundProblem` or `ForbiddenProblem`.
+    Raises `NotFoundProblem` unless the revision of the study is an input of the job, and `ForbiddenProblem` unless the
+    author of the job is a maintainer of the project.
     """
     require_attempt(tx.principal, job_id, fence)
     is_study = select(item.c.id).where(item.c.id == item_id, item.c.kind == Kind.STUDY)
@@ -51,16 +51,22 @@ def list_for_attempt(
 
 @dataclass(frozen=True, slots=True)
 class CollectedAnswers:
-    """Answered trials of one revision of a study, without anything else about the participants."""
+    """Answers to the trials of one revision of a study; they contain nothing else about the participants."""
 
     revision: int
     motion_count: int
     answers: list[tuple[int, list[int], tuple[int, int]]]
-    """For each trial: number of the participant (from 0), the shown motions by place, and the chosen places."""
+    """For each trial: the number of the participant, from 0; the indices of the shown motions; the two chosen places.
+
+    A place is an index into the list of the shown motions.
+    """
 
 
 def collect_answers(tx: Transaction, project: str, kind: Kind, item_id: str, *, revision: int) -> CollectedAnswers:
-    """Return all answered trials of a revision of a study. Raises `NotFoundProblem` or `ForbiddenProblem`."""
+    """Return all answered trials of a revision of a study.
+
+    Raises `NotFoundProblem` if there is no such revision, and `ForbiddenProblem` if the caller's role is too low.
+    """
     _, row = require_study(tx, project, kind, item_id)
     design = load_design(tx, row.id, revision)
     answered = (
@@ -109,7 +115,7 @@ def _shown(trial: Row[Any], seed: int) -> JudgedTrial:
 
 
 def _require_maintainer(tx: Transaction, job_id: str) -> None:
-    """Raise `ForbiddenProblem` for an attempt of a job whose author is not a maintainer of the project at present."""
+    """Raise `ForbiddenProblem` unless the author of a job is a maintainer of its project now."""
     role = (
         select(user.c.administrator, member.c.role)
         .select_from(job)

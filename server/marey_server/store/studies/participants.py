@@ -38,7 +38,7 @@ _NO_HASH = hash_secret("")  # of no code, because secrets are not empty
 
 
 def _rows() -> Select[*tuple[Any, ...]]:
-    """Return a query for participants with the name and project of their study, and whether the study still exists."""
+    """Return a query for participants, each with the name and the project of the study, and `study_exists`."""
     alive = item.c.deleted_us.is_(None) & project.c.deleted_us.is_(None)
     return (
         select(study_participant, item.c.name, item.c.project_id, alive.label("study_exists"))
@@ -69,13 +69,16 @@ def link_invalid() -> NotFoundProblem:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try to use the code of a link, which must be counted for rate limits before the code is checked."""
+    """Return the sign-in try for the code of a link; the caller must count the try before checking the code."""
     prefix, _ = split_study_link(code) or ("", "")
     return SignInTry(f"study {prefix}", address, per_minute)
 
 
 def _find_link(tx: Transaction, code: str) -> Row[Any]:
-    """Lock and return the participant of a link, who may have begun the study already. Raises `NotFoundProblem`."""
+    """Lock and return the row of the participant who has a link and may have begun the study already.
+
+    Raises `NotFoundProblem` if the link is wrong or expired, the participant has withdrawn, or the study was deleted.
+    """
     prefix, secret = split_study_link(code) or ("", "")
     locked = _rows().where(study_participant.c.link_prefix == prefix).with_for_update(of=study_participant)
     row = tx.execute(locked).first()
@@ -90,7 +93,7 @@ def _find_link(tx: Transaction, code: str) -> Row[Any]:
 def welcome(tx: Transaction, code: str, attempt: SignInTry) -> StudyWelcome:
     """Return what a person with a link sees before consenting. Raises `NotFoundProblem` if the link is not valid."""
     row = _find_link(tx, code)
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     design = load_design(tx, row.item_id, row.revision)
     return StudyWelcome(
         title=design.title, consent_text=design.consent_text, clips=len(design.motions), trials=design.trials,
@@ -113,7 +116,7 @@ def begin(tx: Transaction, request: ParticipationCreate, attempt: SignInTry) -> 
         tx.execute(update(study_participant).where(study_participant.c.id == row.id).values(**begun))
     elif issued.secret_hash != row.token_hash:
         raise link_invalid()
-    sign_ins.take_back(tx, attempt)
+    sign_ins.uncount(tx, attempt)
     return NewParticipation(token=issued.text, participation=_shown(row, load_design(tx, row.item_id, row.revision)))
 
 

@@ -20,16 +20,16 @@ from marey_server.store.tables import study_participant, study_trial
 from marey_server.store.transaction import Transaction
 
 GRACE_US = 2_000_000
-"""Time after the deadline in which an answer still counts, because answers need time through the network."""
+"""Time after the deadline of a trial in which an answer still counts, because it may have been sent in time."""
 MOST_TIMEOUTS = 500
 """Greatest number of trials that a participant may leave without an answer."""
 
 
 def open_trial(tx: Transaction) -> TrialStep:
-    """Return the open trial of the caller, or open the next one.
+    """Return the open trial of the caller, or open the next trial; after the last trial, the result contains none.
 
-    If the time of the open trial is over, it is recorded as timed out, and a new random set of motions is shown in
-    place of it. Raises `ConflictProblem` if too many trials timed out.
+    If the time of the open trial is over, the trial is recorded as timed out, and a trial with a new random set of
+    motions replaces it. Raises `ConflictProblem` if too many trials timed out.
     """
     row = find_caller(tx, lock=True)
     design = load_design(tx, row.item_id, row.revision)
@@ -62,7 +62,10 @@ def _open(tx: Transaction, row: Row[Any], design: StudyDocument, last: Row[Any] 
 
 
 def _random_set(design: StudyDocument, participant: int, number: int) -> list[int]:
-    """Return the motions of a trial that replaces one that timed out; the same arguments give the same motions."""
+    """Return the indices of the motions of a trial that replaces a timed-out trial.
+
+    The same arguments always give the same motions.
+    """
     draw = random.Random(f"{design.seed} {participant} {number}")  # noqa: S311 - no secret
     return draw.sample(range(len(design.motions)), design.shown)
 

@@ -35,7 +35,7 @@ def unique_alive(table: str, *columns: str) -> Index:
 
 
 INDEXED_CHARACTERS = 100
-"""Greatest number of characters of a text that an index stores: Postgres refuses much longer index entries."""
+"""Number of characters of a text that an index contains at most, because Postgres refuses long index entries."""
 
 
 class MemberStart(FunctionElement[str]):

@@ -34,7 +34,7 @@ dataset = Table(
 
 
 def _unique_value(name: str, column: str, *within: str) -> Index:
-    """Return a unique index of commits that have a value in `column`; most have none, and do not write to the index."""
+    """Return a unique index that contains only those commits that have a value in `column`, which are few."""
     has_value = text(f"{column} IS NOT NULL")
     columns = (*within, column)
     return Index(f"uq_dataset_commit_{name}", *columns, unique=True, sqlite_where=has_value, postgresql_where=has_value)

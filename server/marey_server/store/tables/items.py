@@ -74,9 +74,9 @@ item = Table(
 )
 
 INDEXED_FACTS = ("subject", "action", "take", "shoot_day", "licence")
-"""Members of summaries with an index.
+"""Names of the members of summaries for which there is an index.
 
-Queries compare other members with `=`, too, but those have too few different values for an index to help.
+The other members have too few different values for an index to make queries faster.
 """
 
 

@@ -20,16 +20,16 @@ from marey_schemas.queue.schedules import MAX_CRON_LENGTH, MAX_TIMEZONE_LENGTH
 from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, Name, metadata
 
 UNFINISHED = text("state IN ('waiting', 'queued', 'running')")
-"""Condition of `ix_job_unfinished`, written in the form in which SQLite uses this index."""
+"""Condition of the index `ix_job_unfinished`; SQLite uses the index only for conditions in this form."""
 
 LEASED = text("state = 'running' AND lease_expires_us IS NOT NULL")
-"""Condition of `ix_job_leased`: a worker runs the job. A parent job whose tasks run has no lease."""
+"""Condition of the index `ix_job_leased`: a worker runs the job. A parent job whose tasks run has no lease."""
 
 HAS_LONG_LOG = text("log_bytes > 43")
-"""Condition of `ix_attempt_log`: the log is longer than the text that replaces a deleted log."""
+"""Condition of the index `ix_attempt_log`: the log is longer than the text that replaces a deleted log."""
 
 NOT_SUCCEEDED = text("job.state <> 'succeeded'")
-"""Condition of `ix_job_list_state`, for queries; SQLite uses the index only if the query contains this condition."""
+"""Condition of the index `ix_job_list_state`; SQLite uses the index only for queries that contain this condition."""
 
 
 def _listing_index(name: str, *columns: str, of: str = "parent_id IS NULL") -> Index:
@@ -41,7 +41,10 @@ def _listing_index(name: str, *columns: str, of: str = "parent_id IS NULL") -> I
 
 
 ONE_RUNS_PER_KEY = "uq_job_concurrency"
-"""Index that refuses a second running job of a concurrency key; a claim that violates it is repeated."""
+"""Name of the index that prevents a second running job with the same concurrency key in a project.
+
+A claim that violates it is repeated.
+"""
 
 job = Table(
     "job",

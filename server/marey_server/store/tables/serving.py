@@ -9,7 +9,7 @@ _AUDITED = text("about IS NOT NULL")
 
 
 def _audit_index(name: str, *columns: str) -> Index:
-    """Return a partial index of events: it contains only entries of the audit log, so other events cost nothing."""
+    """Return an index that contains only those events that are entries of the audit log."""
     return Index(f"ix_event_audit_{name}", *columns, sqlite_where=_AUDITED, postgresql_where=_AUDITED)
 
 

@@ -102,7 +102,11 @@ def redeliver(tx: Transaction, project: str, webhook_id: str, delivery_id: str) 
 
 
 def _require_active(tx: Transaction, project_row: ProjectRow, webhook_id: str) -> None:
-    """Lock a webhook. Raises `ConflictProblem` if it is paused or too many requested deliveries wait."""
+    """Lock a webhook of the project until the transaction ends.
+
+    Raises `NotFoundProblem` if there is no such webhook, and `ConflictProblem` if it is paused or has `MOST_WAITING`
+    requested deliveries that wait.
+    """
     which = (webhook.c.id == webhook_id, webhook.c.project_id == project_row.id)
     row = tx.execute(select(webhook.c.paused).where(*which).with_for_update()).first()
     if row is None:

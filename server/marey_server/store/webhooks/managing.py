@@ -22,11 +22,11 @@ from marey_server.store.tables import user, webhook, webhook_delivery
 from marey_server.store.transaction import Transaction
 
 RETRY_NOW: dict[str, Any] = {"attempts": 0, "failures": 0, "next_us": 0, "failing_since_us": None}
-"""Values of a webhook that make the next attempt immediate."""
+"""Values of the columns of a webhook with which the server makes the next attempt at once."""
 
 _SECRETS = (webhook.c.secret, webhook.c.old_secret)
 _SHOWN = tuple(column for column in webhook.c if column not in frozenset(_SECRETS))
-"""Columns that answers are made from; the secrets are not among them."""
+"""Columns of a webhook that are read to show it: all except the secrets."""
 _DEAD = (
     select(func.count())
     .where(webhook_delivery.c.webhook_id == webhook.c.id, webhook_delivery.c.state == "dead")
@@ -48,7 +48,7 @@ def read_webhook(tx: Transaction, project: str, webhook_id: str) -> Webhook:
 
 
 def find_webhook(tx: Transaction, project_row: ProjectRow, webhook_id: str) -> Row[Any]:
-    """Return the row of a webhook of a project, without its secrets. Raises `NotFoundProblem`."""
+    """Return the row of a webhook of a project, without its secrets. Raises `NotFoundProblem` if it does not exist."""
     row = tx.execute(_rows(project_row).where(webhook.c.id == webhook_id)).first()
     if row is None:
         raise no_webhook(webhook_id)
@@ -131,9 +131,10 @@ def _with_secret(tx: Transaction, project_row: ProjectRow, webhook_id: str, secr
 def change_webhook(
     tx: Transaction, project: str, webhook_id: str, request: WebhookChange, networks: Sequence[Network]
 ) -> Webhook:
-    """Change, pause or resume a webhook. After a new URL or `paused=False`, the next attempt is immediate.
+    """Change, pause or resume a webhook.
 
-    Raises `InvalidProblem` as `create_webhook` does.
+    After a change of the URL, and after `paused=False`, the next attempt is made at once. After a change of `kinds`,
+    the delivery that is being retried is given up. Raises `InvalidProblem` as `create_webhook` does.
     """
     project_row = projects.require(tx, project)
     find_webhook(tx, project_row, webhook_id)
@@ -156,7 +157,7 @@ def change_webhook(
 
 
 def give_up_retries(tx: Transaction, webhook_id: str) -> None:
-    """Give up the failed delivery that the server would send to a webhook again."""
+    """Give up the delivery to a webhook that has failed and that the server would try again."""
     which = (webhook_delivery.c.webhook_id == webhook_id, webhook_delivery.c.state == "retrying")
     tx.execute(update(webhook_delivery).where(*which).values(state="dead", updated_us=tx.now_us))
 
@@ -168,9 +169,9 @@ def _update(tx: Transaction, project_row: ProjectRow, webhook_id: str, values: d
 
 
 def rotate_secret(tx: Transaction, project: str, webhook_id: str, request: WebhookRotation) -> NewWebhook:
-    """Replace the secret, and return the webhook with the new one.
+    """Replace the secret of a webhook, and return the webhook with the new secret.
 
-    For `grace_s`, deliveries have two signatures: one with the new secret and one with the old secret.
+    For the next `grace_s` seconds of the request, deliveries have two signatures: with the new and with the old secret.
     """
     project_row = projects.require(tx, project)
     secret = issue_secret()

@@ -27,18 +27,21 @@ from marey_server.store.webhooks.managing import give_up_retries, host_of
 MOST_ATTEMPTS = 8
 """Number of attempts after which a delivery is given up."""
 RETRY = Backoff(first_s=5.0, longest_s=1800.0)
-"""Wait after failed attempts of a webhook; the first eight attempts take five to eleven minutes."""
+"""Wait after failed attempts of a webhook; all eight attempts of a delivery take five to eleven minutes together."""
 BATCH = 100
 """Greatest number of deliveries that are read at once."""
 SKIPPED_MOST = 10_000
-"""Number of events, none of which concerns a webhook, after which the stored position of the webhook is moved on."""
+"""Number of skipped events, which do not concern a webhook, after which the webhook's new position is stored."""
 MISSED_KIND = "webhook.events_missed"
 
 Outcome = Literal["delivered", "retry", "dead"]
 
 
 class Work(NamedTuple):
-    """Webhooks that may have something to send, the newest event, and the time of the next retry if there is one."""
+    """Webhooks for which there may be something to send, the number of the newest event, and the next retry.
+
+    Times are in microseconds since 1970. `next_us` is the time of the next retry, or None if no retry is waiting.
+    """
 
     any: bool
     """Whether any webhook is not paused."""
@@ -92,10 +95,13 @@ class Delivery:
 
 @dataclass(frozen=True)
 class Batch:
-    """Next deliveries of a webhook in order."""
+    """Next deliveries of a webhook in order, with its position and its number of attempts when they were read."""
 
     sharer: str
-    """Id of the user who created the webhook, or of the webhook if the user is unknown."""
+    """Id of the user who created the webhook, or of the webhook if the user is unknown.
+
+    The number of simultaneous deliveries is limited for all webhooks with the same value together.
+    """
     position: int
     attempts: int
     deliveries: tuple[Delivery, ...]
@@ -173,7 +179,7 @@ def _requested(tx: Transaction, webhook_id: str) -> list[Delivery]:
 
 
 def _missed(row: Row[Any], now_us: int) -> Delivery:
-    """Return the delivery that reports how many events were deleted before they were delivered."""
+    """Return the delivery that reports to a webhook how many events were deleted before they could be delivered."""
     delivery_id = f"{row.id}-missed-{row.position}"
     message = WebhookMessage(
         id=delivery_id, kind=MISSED_KIND, seq=row.position, project=row.project, at=datetime_of(now_us),
@@ -201,7 +207,7 @@ def _of_event(row: Row[Any], found: Row[Any]) -> Delivery:
 
 
 def _subject_link(project_name: str, found: Row[Any]) -> dict[str, str]:
-    """Return the link to the object of an event, if the id of the object is part of its address."""
+    """Return the link (`subject`) to the job or the item that an event concerns; empty for other events."""
     about = found.kind.partition(".")[0]
     if about == "job":
         return {"subject": f"{API}/jobs/{found.subject}"}
@@ -212,7 +218,7 @@ def _subject_link(project_name: str, found: Row[Any]) -> dict[str, str]:
 
 
 def move_on(tx: Transaction, webhook_id: str, position: int, to: int) -> None:
-    """Move the position of a webhook past events that do not concern it."""
+    """Move the position of a webhook forward, past events that do not concern it, unless the position has changed."""
     tx.execute(update(webhook).where(webhook.c.id == webhook_id, webhook.c.position == position).values(position=to))
 
 
@@ -292,7 +298,7 @@ def _fail(tx: Transaction, row: Row[Any], delivery: Delivery, result: DeliveryRe
 
 
 def _note(tx: Transaction, delivery: Delivery, result: DeliveryResult, outcome: Outcome) -> None:
-    """Create or change the row of a delivery."""
+    """Record the result of an attempt in the row of its delivery, which is created at the first attempt."""
     state = "retrying" if outcome == "retry" else outcome
     noted = {
         "state": state, "last_status": result.status, "last_error": result.error, "updated_us": tx.now_us
@@ -310,10 +316,9 @@ def _note(tx: Transaction, delivery: Delivery, result: DeliveryResult, outcome: 
 
 
 def count_missed(tx: Transaction, last: int) -> None:
-    """Count, for each webhook, the undelivered events up to the one numbered `last`, which are about to leave the feed.
+    """Count, for each webhook, the undelivered events with numbers up to `last`, which are about to be deleted.
 
-    If a webhook has missed events, its position moves to `last`, and a later delivery reports the number of missed
-    events.
+    A webhook misses these events: its position moves to `last`, and a later delivery reports how many it has missed.
     """
     for row in tx.execute(select(webhook).where(webhook.c.position < last).with_for_update()).all():
         number = events.number_of(tx)

@@ -63,13 +63,16 @@ class WaitingOutcome(Enum):
 
     MERGED = auto()
     NOT_READY = auto()
-    """No merge is requested, or approvals, checks or rights are missing."""
+    """No automatic merge is requested, an approval or a check is missing, or the user may not move the target."""
     OBSTRUCTED = auto()
-    """A conflict or another obstacle prevents the merge until a branch moves or the rule of the target changes."""
+    """An obstacle, such as a conflict, prevents the merge until a branch moves or the target's rule changes."""
 
 
 class MergeBasis(NamedTuple):
-    """Newest commits of source and target, and rule of the target; the result of a merge depends on nothing else."""
+    """Everything on which the result of a merge depends.
+
+    This is the newest commit of the source (`head`), that of the target branch, and the protection rule of the target.
+    """
 
     head: str
     target: str | None
@@ -213,7 +216,7 @@ def merge_proposal(
 
 
 def _require_current(row: Row[Any], prepared: PreparedAcceptance | None) -> PreparedAcceptance:
-    """Return `prepared`. Raises `ConflictProblem` if a branch has moved since this merge was prepared."""
+    """Return `prepared` if no branch has moved since this merge was prepared; otherwise raise `ConflictProblem`."""
     if prepared is None or prepared.request.version != row.head_now:
         raise branch_moved(row.source, row.head_now)
     if prepared.merge is not None and prepared.merge.answer.ours != row.target_now:

@@ -55,9 +55,9 @@ def add_comment(tx: Transaction, project: str, name: str, number: int, request: 
 
 
 def next_number(tx: Transaction, table: Table, row: Row[Any], things: str) -> int:
-    """Return the number of the next comment or review of a locked proposal.
+    """Return the number of the next comment or review of a locked proposal, whose rows are in `table`.
 
-    `things` is the plural noun in the error text. Raises `ConflictProblem` if there are already `MOST_OF_EACH`.
+    Raises `ConflictProblem` if there are `MOST_OF_EACH` already; its text calls them `things`, such as "comments".
     """
     held = select(func.count()).where(table.c.dataset_id == row.dataset_id, table.c.proposal == row.number)
     count: int = tx.execute(held).scalar_one()

@@ -35,7 +35,8 @@ _AUTHOR, _WAITING, _ENDING = user.alias("author"), user.alias("waiting"), user.a
 def find_proposal(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
     """Return the row of a proposal, with the names of the users to whom the row refers.
 
-    The columns `head_now` and `target_now` are the newest commits of the proposal's source and of its target.
+    The columns `head_now` and `target_now` are the newest commits of the proposal's source and of its target. Raises
+    `NotFoundProblem` if there is no such proposal.
     """
     row = tx.execute(_rows(dataset_id).where(proposal.c.number == number)).first()
     if row is None:
@@ -100,9 +101,9 @@ def _rows(dataset_id: str) -> Select[*tuple[Any, ...]]:
 
 
 def is_waiting(row: Row[Any]) -> bool:
-    """Return whether a proposal is to be merged automatically (`when_green`) when all requirements are met.
+    """Return whether an automatic merge (`when_green`) of the proposal's newest commit is requested.
 
-    A new commit in the source of the proposal cancels the request for an automatic merge.
+    A request for an earlier commit does not count: a new commit in the source cancels it.
     """
     return row.when_green_id is not None and row.when_green_head == row.head_now
 

@@ -34,8 +34,8 @@ from marey_server.store.transaction import Transaction
 
 EXAMINED_AT_ONCE = 100
 """Greatest number of proposals that one call of `WaitingMerges.attempt` examines."""
-IN_VAIN_KEPT = 10_000
-"""Greatest number of proposals for which the last failed merge is remembered."""
+FAILED_MERGES_KEPT = 10_000
+"""Greatest number of proposals whose last failed merge a process remembers."""
 REFUSED_PAUSE_S = 60.0
 """Seconds until a merge that was refused, for example because of a quota, is computed again on the same basis."""
 
@@ -52,10 +52,10 @@ class _PendingMerge(NamedTuple):
     project: str
 
 
-class _InVain(NamedTuple):
-    """Merge that was computed, but could not be performed: the commits and the rule on which its result depends.
+class _FailedMerge(NamedTuple):
+    """Failed merge of a proposal: `basis` is everything on which the result of the merge depends.
 
-    `again_s` is the monotonic time in seconds before which the merge is not tried again.
+    A merge on the same basis is not tried again before `again_s`, a time in seconds of the monotonic clock.
     """
 
     basis: MergeBasis
@@ -63,13 +63,13 @@ class _InVain(NamedTuple):
 
 
 class WaitingMerges:
-    """Merges waiting proposals in repeated rounds; a round takes the proposals in the order of dataset and number."""
+    """Executor of automatic merges, in rounds: a round takes the proposals in the order of dataset and number."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._last = ("", 0)
-        self._in_vain: LruCache[tuple[str, int], _InVain] = LruCache(max_entries=IN_VAIN_KEPT)
-        """Last merge of each proposal that was computed but not performed, by dataset and number of the proposal."""
+        self._failed_merges: LruCache[tuple[str, int], _FailedMerge] = LruCache(max_entries=FAILED_MERGES_KEPT)
+        """Last failed merge of each proposal, by the id of the dataset and the number of the proposal."""
 
     def attempt(self) -> int:
         """Examine the next `EXAMINED_AT_ONCE` waiting proposals, and merge those that are ready.
@@ -87,7 +87,7 @@ class WaitingMerges:
         basis: MergeBasis | None = None
         try:
             basis = self._database.read(SYSTEM, _basis_if_ready, one)
-            if basis is None or self._is_in_vain(key, basis):
+            if basis is None or self._has_failed(key, basis):
                 return False
             prepared = self._database.read(SYSTEM, prepare_waiting, one.project, one.dataset, one.number)
             outcome = self._database.submit_write(SYSTEM, _merge, one, prepared).result()
@@ -104,11 +104,11 @@ class WaitingMerges:
             if outcome is WaitingOutcome.MERGED:
                 return True
         if basis is not None and pause_s:
-            self._in_vain.put(key, _InVain(basis, time.monotonic() + pause_s))
+            self._failed_merges.put(key, _FailedMerge(basis, time.monotonic() + pause_s))
         return False
 
-    def _is_in_vain(self, key: tuple[str, int], basis: MergeBasis) -> bool:
-        last = self._in_vain.get(key)
+    def _has_failed(self, key: tuple[str, int], basis: MergeBasis) -> bool:
+        last = self._failed_merges.get(key)
         return last is not None and last.basis == basis and time.monotonic() < last.again_s
 
 

@@ -22,7 +22,10 @@ from marey_server.store.transaction import Transaction, in_lists
 
 _LABELS = literal(",") + job.c.labels_key
 _OWN_POD = f",{labels_key({OWN_POD_LABEL: ''})}"
-"""Text that `labels_key` contains, after a leading comma, if a job has the label; the comma excludes longer names."""
+"""Text that `_LABELS` contains if a job has the label `OWN_POD_LABEL`.
+
+The leading comma excludes labels whose longer names end with this name.
+"""
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,8 @@ def read_waiting(
     Parameters
     ----------
     served : ids of jobs that have a pod already
-    split : ids of jobs whose tasks have a pod each, with the number of pods that they may have now; tasks that were
-        claimed before are returned nevertheless
+    split : ids of parent jobs whose tasks have a pod each, with the number of these pods that can run at once; of their
+        tasks, only those that were claimed before are returned
     """
     split = split or {}
     rival, parent = job.alias("rival"), job.alias("parent")
@@ -110,9 +113,9 @@ def read_unfinished(tx: Transaction, ids: Collection[str]) -> set[str]:
 
 
 def postpone(tx: Transaction, job_id: str, reason: str, pause_s: float, *, tasks: bool) -> bool:
-    """Delay a queued job by at least `pause_s` seconds, or with `tasks` all its queued tasks.
+    """Delay a queued job, or with `tasks` all queued tasks of a job, so that none starts in the next `pause_s` seconds.
 
-    Returns false if there was no such job or task. Until a worker claims the job, the note of its progress is `reason`.
+    The note of the progress of each delayed job is set to `reason`. Returns false if there was no such job or task.
     """
     note = Progress(done=0, note=reason[:LONGEST_NOTE])
     until_us = tx.now_us + round(pause_s * SECOND_US)
@@ -142,7 +145,7 @@ def _unclaimed(tx: Transaction, served: Collection[str]) -> Iterator[Unclaimed]:
 
 
 def _unclaimed_tasks(tx: Transaction, split: Mapping[str, int]) -> Iterator[Unclaimed]:
-    """Yield one entry for each pod of split jobs that has not claimed its task yet."""
+    """Yield one entry for each pod of the parent jobs in `split` that has not claimed a task yet."""
     task = job.alias("task")
     running = select(func.count()).where(task.c.parent_id == job.c.id, task.c.state == RUNNING).scalar_subquery()
     statement = select(job.c.id, job.c.project_id, running.label("running"))
@@ -152,10 +155,11 @@ def _unclaimed_tasks(tx: Transaction, split: Mapping[str, int]) -> Iterator[Uncl
 
 
 def _one_of_each_key(rows: Collection[Row[Any]], unclaimed: Collection[Unclaimed]) -> list[Row[Any]]:
-    """Return the rows of the jobs that can all run at the same time.
+    """Return the rows of those jobs that can all run at the same time.
 
-    A job is left out if an earlier job has its concurrency key, or if its project would exceed its limit of running
-    jobs. Earlier jobs include those in `unclaimed`; otherwise, pods would start that can only wait.
+    A job is left out if an earlier job has the same concurrency key, or if earlier jobs reach the project's limit of
+    running jobs. The jobs in `unclaimed` count as earlier jobs, because their pods exist already. Otherwise, pods would
+    start that can only wait.
     """
     kept: list[Row[Any]] = []
     keys = {one for one in unclaimed if one[1] is not None}

@@ -79,7 +79,10 @@ def require_worker(caller: Principal, request: ClaimRequest) -> list[str]:
 
 
 def named_job(tx: Transaction, request: ClaimRequest) -> str | None:
-    """Return the id of the job that a claim names; "" for a task that does not exist."""
+    """Return the id of the job, or of the task, that a claim names.
+
+    Returns None if the claim names no job, and "" if the task does not exist.
+    """
     if request.task is None or request.job is None:
         return request.job
     task = select(job.c.id).where(job.c.parent_id == request.job, job.c.position == request.task)
@@ -87,7 +90,10 @@ def named_job(tx: Transaction, request: ClaimRequest) -> str | None:
 
 
 def state_of_named(tx: Transaction, request: ClaimRequest) -> JobState | None:
-    """Return the state of the job that a claim names; None if there is no such job, or the caller may not know it."""
+    """Return the state of the job that a claim names; None if there is no such job.
+
+    Callers other than pods and administrators get None, because they may not know which jobs exist.
+    """
     if tx.principal.kind != "pod" and not tx.principal.administrator:
         return None
     return _read_state(tx, named_job(tx, request))

@@ -36,7 +36,11 @@ from marey_server.store.transaction import Transaction
 
 
 class Restriction(NamedTuple):
-    """Limits of a claim on the number and the projects of jobs; kinds and labels are limited separately."""
+    """Conditions that a claim puts on the jobs, besides kinds and labels.
+
+    `one_job`: only the named job. `named_projects`: only jobs of the named projects. `own_projects`: only jobs of
+    projects in which the caller is a maintainer or an owner.
+    """
 
     one_job: bool
     named_projects: bool
@@ -45,7 +49,7 @@ class Restriction(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Turn:
-    """A project that has jobs which a claim could get, with the numbers on which its turn depends."""
+    """Project that has jobs for a claim, with the numbers that decide when it is its turn."""
 
     project_id: str
     running: int
@@ -68,7 +72,7 @@ class Turn:
 
 
 def is_claimable(candidate: FromClause) -> ColumnElement[bool]:
-    """Return the condition that a job can run now, on the worker that claims."""
+    """Return the SQL condition that a job is queued, due, and suits the kinds and the labels of the claim."""
     return and_(
         candidate.c.state == QUEUED,
         candidate.c.run_at_us <= bindparam("now_us", type_=BigInteger),
@@ -83,7 +87,7 @@ def claim_order(candidate: FromClause) -> tuple[ColumnElement[Any], ...]:
 
 
 def _is_workable(project_id: ColumnElement[str], restriction: Restriction) -> ColumnElement[bool]:
-    """Return the condition that the caller, as a worker, may read and write data of a project."""
+    """Return the SQL condition that the caller, as a worker, may run jobs of a project."""
     conditions = [project.c.id == project_id, project.c.deleted_us.is_(None)]
     if restriction.named_projects:
         conditions.append(project.c.name.in_(bindparam("project_names", expanding=True)))
@@ -95,9 +99,9 @@ def _is_workable(project_id: ColumnElement[str], restriction: Restriction) -> Co
 
 
 def projects_with_queued_jobs() -> CTE:
-    """Return a query for the ids of the projects with queued jobs; the last row is null.
+    """Return a query for the ids of the projects with queued jobs; the last row contains null in place of an id.
 
-    Each step looks up the next id in the index, so the cost depends on the number of projects, not of jobs.
+    Each step looks up the next id in an index, so the cost grows with the number of projects, not of jobs.
     """
     first, later = job.alias("first"), job.alias("later")
     found = (
@@ -154,7 +158,7 @@ def statement_of_turns(restriction: Restriction) -> Prepared:
 
 
 def turns_of(rows: Iterable[Any]) -> list[Turn]:
-    """Return the turns for the rows of a statement of `statement_of_turns`."""
+    """Convert the rows of the statement from `statement_of_turns` to turns."""
     return [Turn(row.project_id, row.running, row.most_running, row.served_us) for row in rows]
 
 
@@ -162,9 +166,9 @@ def turns_of(rows: Iterable[Any]) -> list[Turn]:
 
 
 def next_projects(turns: Sequence[Turn], most: int) -> Iterator[Turn]:
-    """Yield the project of each job of a claim for `most` jobs, as if every project had enough jobs.
+    """Yield, for each of the `most` jobs of a claim, the project whose turn it is, as if each project had enough jobs.
 
-    Projects whose limit is reached are left out.
+    A project is left out as soon as it reaches its limit of running jobs. So fewer than `most` values may be yielded.
     """
     order = [(*turn.rank(), turn) for turn in turns if turn.places != 0]
     heapq.heapify(order)
@@ -194,19 +198,19 @@ _SERVE_UNLESS_LOCKED = Prepared(
     )
     .values(served_us=bindparam("at_us"))
 )
-"""Statement that stores the time of a claim of jobs of a project, unless another claim has locked the project's row.
+"""Statement that stores when a claim served a project, unless another claim has locked the project's row.
 
-The other claim stores its own time, which is nearly the same. So claims of jobs of one project do not wait for each
+The other claim then stores its own time, which is nearly the same. So claims of one project's jobs do not wait for each
 other.
 """
 
 
 def note_served(tx: Transaction, turns: Sequence[Turn], served: Iterable[Turn]) -> None:
-    """Record which projects a claim has served; `turns` are all projects that had jobs, updated by the claim.
+    """Record that a claim has served the projects `served`; `turns` are all projects that had jobs.
 
-    Each project gets another time, in the order of their ranks after the claim. The next claim serves projects with
+    Each project gets a different time, in the order of their ranks after the claim. The next claim serves projects with
     equally many running jobs in this order. If only one project had jobs, nothing is recorded, because no other project
-    has waited.
+    had to wait.
     """
     if len(turns) < 2:
         return
@@ -233,10 +237,10 @@ _NOW = Prepared(
 def take_within_limit(tx: Transaction, turn: Turn, most: int, take: Take, *, may_wait: bool) -> list[Any]:
     """Claim up to `most` jobs of a project, but not more than its limit allows.
 
-    On Postgres, claims of a project with a limit run one after another: each one locks the project, and counts the
-    running jobs again when it has the lock. A claim waits for such a lock only if it holds none (`may_wait`), so no two
-    claims wait for each other. Otherwise, it leaves out a project that another claim has locked. SQLite has only one
-    writer at a time.
+    On Postgres, claims of a project with a limit run one after another: each claim locks the project, and then counts
+    the running jobs again. With `may_wait`, the claim waits for the lock. Without it, nothing is claimed if another
+    claim has the lock. `may_wait` is only allowed for a claim that holds no such lock, so that no two claims wait for
+    each other. On SQLite, there is only one writer at a time.
     """
     if turn.most_running is None:
         return take(most)
