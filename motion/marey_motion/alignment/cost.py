@@ -15,14 +15,17 @@ from marey_schemas.options.alignment import CostOptions
 class CostPoints(NamedTuple):
     """The points of one motion of n frames, prepared for comparison with other motions.
 
-    F is n without a window, and n + W - 1 if costs are averaged over a window of W frames (`CostOptions.window`).
+    F is n without a window, and n + W - 1 if costs are averaged over a window of W frames (`CostOptions.window`). For
+    the cost `turned`, horizontal positions are relative to the weighted centre of the points: that of the frame without
+    a window, and the mean centre of the whole motion with a window. For the cost `plain`, they are not centred, and
+    `energies` and `centres` are not used.
 
     Parameters
     ----------
     rows : (F, P, 3) float64    positions, multiplied by the square root of each point's share of the total weight
     columns : (P, 3, F) float64    the same, transposed
-    energies : (n,) float64    weighted sum of the squared horizontal distances of the points from the centre, over each
-        frame's window
+    energies : (n,) float64    weighted sum of the squared horizontal distances of the points from the weighted centre
+        of each frame's window, over this window
     centres : (n, 2) float64    horizontal weighted centre of each frame's window; zero if there is no window, or if the
         cost is `plain`
     """
@@ -161,7 +164,7 @@ def _shares(weights: ArrayLike | None, count: int) -> Floats:
             where="weights",
         )
     if not (np.isfinite(given).all() and (given >= 0).all() and given.sum() > 0):
-        raise MotionError("weights must be finite and at least 0, and one must be above 0", where="weights")
+        raise MotionError("weights must be finite and at least 0, and at least one must be above 0", where="weights")
     return np.asarray(given / given.sum())
 
 

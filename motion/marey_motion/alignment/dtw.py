@@ -53,7 +53,7 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
     Raises
     ------
-    MotionError    if a cost is not finite, or if no path satisfies `max_run`
+    MotionError    if a cost is not finite, if `max_run` is not 0 to 60, or if no path satisfies `max_run`
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -92,7 +92,7 @@ def align_cyclic(costs: ArrayLike, *, max_run: int) -> tuple[Alignment, int]:
 
 
 def least_total(costs: Floats, *, max_run: int | None = None) -> float:
-    """Compute only the total cost of the path that `align` finds.
+    """Compute the total cost of the cheapest path through a matrix of costs, without the path (see `align`).
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _found(matrix: Floats, max_run: int | None, backwards: NDArray[np.int32], to
     if not np.isfinite(total):
         raise MotionError(
             f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames if one motion may pause for "
-            f"at most {max_run} frames of the other; raise this limit",
+            f"at most {max_run} frames of the other; raise the slope limit",
             code="alignment-impossible",
             where="max_run",
         )
@@ -160,9 +160,10 @@ def distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> Floats:
 
 
 def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: float = np.inf) -> float:
-    """Compute the total of the cheapest path through `distances(a, b)`, divided by the frames of the longer motion.
+    """Compute the distance of two motions after dynamic time warping.
 
-    Memory is O(n + m), not O(n·m).
+    The distance of two frames is the mean distance of their points. These distances are summed along the cheapest path
+    and divided by the number of frames of the longer motion. The memory is O(n + m), not O(n·m).
 
     Parameters
     ----------
@@ -210,7 +211,7 @@ def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_p
 
 
 class RangeBounds:
-    """Lower bounds of the warped distances between one motion and others, from one bounding box per motion and point.
+    """Lower bounds of `warped_distance` between motions, computed from one bounding box per motion and point.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ def time_function(path: NDArray[np.integer]) -> Floats:
 
     Raises
     ------
-    MotionError    if one of the motions is too short
+    MotionError    if one of the motions has fewer than two frames, or if the source is too short for the least slope
     """
     if len(path) < 2 or (path[-1] <= path[0]).any():
         raise MotionError("a time function needs at least two frames in both motions", code="too-few-frames")

@@ -192,7 +192,7 @@ def test_alignment_by_a_metric_needs_no_weights_and_changes_nothing_without_one(
     assert [one.cost for one in seen.clips] != [one.cost for one in plain.clips]
     assert seen.clips[0].cost == 0.0
     assert (np.diff(seen.clips[1].time_function) > 0).all()
-    with pytest.raises(MotionError, match="has weights of its own"):
+    with pytest.raises(MotionError, match="replaces the options cost, window and weights"):
         align_clips(examples, body, AlignOptions(weights={"Hips": 1.0}), metric=METRIC)
 
 
