@@ -13,9 +13,9 @@ from marey_motion.looping import rotated
 from marey_schemas.documents.differences import JointChange, PathChange, PathMove, Range
 
 NOISE_DEG = 0.01
-"""Largest change of a rotation that is attributed to rounding."""
+"""Largest change of a rotation, in degrees, that is attributed to rounding."""
 NOISE_CM = 0.01
-"""Largest change of a position that is attributed to rounding."""
+"""Largest change of a position, in centimetres, that is attributed to rounding."""
 JOINED_S = 0.1
 """Distance, in seconds, below which two ranges of frames are joined into one."""
 POINT_M = 0.01
@@ -77,8 +77,8 @@ def joint_changes(
     names : sequence of str    names of J joints
     changes : (n, J) float    change of each joint in each matched frame, in degrees or centimetres
     course : Course    the matched frames
-    threshold : float    frames in which a joint changes by more than this are listed
-    noise : float    joints whose changes are all at most this large are left out
+    threshold : float    a frame is listed for a joint if the joint's change exceeds this value; unit of `changes`
+    noise : float    a joint is left out if its largest change does not exceed this value; unit of `changes`
 
     Returns
     -------
@@ -104,7 +104,7 @@ def path_change(
     joint : str    joint whose path is compared
     before, after : (n, 3) float64    positions of the joint in matched frames, metres
     course : Course    the matched frames
-    threshold_cm : float    frames whose positions are farther apart than this are listed
+    threshold_cm : float    a frame is listed if its two positions are farther apart than this distance, centimetres
     move : Move or None    movement of the whole path from `before` to `after`
 
     Returns
@@ -123,9 +123,10 @@ def path_change(
 
 
 def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, Any]:
-    """Summarise changes (n,) in matched frames, as fields of a `JointChange` or `PathChange`.
+    """Summarise changes (n,) in matched frames, as the fields that `JointChange` and `PathChange` have in common.
 
-    The fields are mean and maximum of the changes, the frame of the maximum, and the ranges above the threshold.
+    The fields are the mean and the maximum of the changes, the frame of the maximum in the new clip, and the ranges of
+    its frames in which the change exceeds the threshold.
     """
     at = int(np.argmax(changes))
     return {
