@@ -1,4 +1,4 @@
-"""Constraints on ranges of frames, met by inverse kinematics and blended into their surroundings.
+"""Constraints on ranges of frames, which are solved by inverse kinematics and blended into the frames around them.
 
 Two constraints are solved together if one constraint turns a joint, and the other constraint turns or depends on the
 same joint. All other constraints are solved separately.
@@ -34,10 +34,10 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.constraints import Solver
 
-# Rounds in which constraints of different ranges are met in turn, and the metres or radians that they may still be
-# missed by to end them.
 MOST_ROUNDS = 12
+"""Maximum number of rounds in which constraints on different ranges of frames are solved one after another."""
 SETTLED = 1e-3
+"""Error, in metres or radians, below which all constraints must be for the rounds to end early."""
 _PER_FRAME = 40_000
 """Work per frame, in nanoseconds, to prepare the arrays, measure the errors and evaluate closed forms."""
 _LIMIT_PASSES = 4
@@ -177,7 +177,7 @@ def _check_range(constraint: Constraint, number: int, frames: int) -> None:
 
 
 def residuals_of(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> Floats:
-    """Compute the error of a constraint in each of its frames.
+    """Compute the error of a constraint in each of its frames: how far the motion misses the target.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def residuals_of(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> 
 
     Returns
     -------
-    (n,) float64    metres or radians
+    (n,) float64    metres for a position target, radians for an orientation or look-at target
     """
     part = motion.at_frames(np.arange(constraint.start, constraint.stop))
     return measure_residuals(skeleton, part, [constraint.target])[:, 0]
@@ -300,7 +300,11 @@ class _Cluster:
         neighbours: Neighbours,
         solved: Callable[[Motion, Sequence[Target], Neighbours], Motion],
     ) -> Motion:
-        """Use smoother targets in runs of frames in which the limb jumps; `made` is the solution for `targets`."""
+        """Solve runs of frames in which the limb jumps again, for smoother targets.
+
+        `given` is the motion before it is solved, and `made` is the solution for `targets`. Returns `made` if the
+        position target has a pole or an offset.
+        """
         (place,) = (one for one in targets if isinstance(one, PositionTarget))
         if place.pole is not None or np.any(place.offset):
             return made

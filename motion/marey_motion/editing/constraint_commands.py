@@ -1,4 +1,4 @@
-"""The commands of an edit that use inverse kinematics."""
+"""Edit commands that use inverse kinematics: `constrain` and `plant_feet`."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def require_acting(skeleton: Skeleton, constraint: Constraint, *, root_moves: bo
     names = skeleton.joint_names
     turning = ", ".join(names[joint] for joint in constraint.joints)
     raise EditError(
-        f"turning {turning} does not move {names[target.joint]}, so its position cannot be constrained; choose a "
+        f"turning {turning} does not move {names[target.joint]}, so this position constraint has no effect; choose a "
         "higher joint as top, or set root_moves",
         code="constraint-idle",
         where="joint",

@@ -24,12 +24,13 @@ from marey_motion.motion import Motion
 # Values of a cubic B-spline at its control points' frames.
 WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
 BENDING, PULLING = (1.0, -2.0, 1.0), (1.0, -1.0)
-# Tension falls with the square of the frames that swings may take: for the curve that bends least, this share of all.
 SWING_SHARE = 1.0 / 6.0
-# As shares of the frames over which a change is blended: how far the tense curve swings, and what neighbours even out.
+"""Number of frames to which the overshoot of the first curve is limited, as a share of the frames of the window."""
 SINGLE_SWING_SHARE = 1.0 / 60.0
+"""Number of frames to which the overshoot of the second curve is limited, as a share of the blended frames."""
 NEIGHBOURS_SHARE = 0.2
-# Weight of meeting the given frames beside bending; what is then still missed is fitted again, until nothing is.
+"""Number of frames over which given changes are smoothed, as a share of the blended frames."""
+# Weight of the given values relative to the bending energy. The remaining errors are fitted again, until they vanish.
 MEETING = 1e4
 MOST_REFINEMENTS = 40
 MISSED_SHARE = 1e-13

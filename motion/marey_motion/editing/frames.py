@@ -12,7 +12,7 @@ from marey_schemas.editing.commands import Resample, Retime, Split, Trim
 
 
 def trim(take: Take, command: Trim) -> Take:
-    """Keep a range of frames.
+    """Keep a range of frames of a take, and remove all other frames.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def trim(take: Take, command: Trim) -> Take:
 
 
 def split(take: Take, command: Split) -> tuple[Take, ...]:
-    """Cut a take into pieces.
+    """Cut a take into pieces, each of which becomes a take.
 
     Parameters
     ----------

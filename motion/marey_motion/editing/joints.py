@@ -20,7 +20,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.commands import Paste, RotateJoint
 
 SAME_AXES_RAD = 0.02
-"""Largest angle, in radians, between rest rotations that count as equal: those of two subjects differ a little."""
+"""Largest angle, in radians, between the rest rotations of a joint in two skeletons that counts as no difference."""
 
 
 def paste(take: Take, command: Paste) -> Take:

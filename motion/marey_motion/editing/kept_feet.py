@@ -34,7 +34,7 @@ SUNK_M = 1e-4
 MOST_LIFTS = 5
 """Greatest number of times that feet are lifted and their legs solved again."""
 CALM_S = 0.6
-"""Longest time, in seconds, over which the movement of a leg is slowed down if its knee would jump."""
+"""Longest time, in seconds, over which the movement of a leg is smoothed if its knee would jump."""
 _ZONE_RAD = radians(PlantOptions().knee_damping_deg)
 ROUNDING = 1e-9
 """Difference, in metres and in components of quaternions, up to which a foot counts as in place."""
@@ -83,14 +83,14 @@ def feet_as_motion(skeleton: Skeleton, motion: Motion, feet: Sequence[Foot]) -> 
 def with_feet(
     take: Take, motion: Motion, feet: Sequence[Foot], wanted: Motion, floors: Floats, frames: slice
 ) -> Motion:
-    """Move feet to given places in a range of frames; soles that would be below the floor are lifted to the floor.
+    """Solve the legs so that the ankles follow given paths; soles are lifted where they would be below the floor.
 
     Parameters
     ----------
     take : Take    the skeleton
     motion : Motion    F frames
     feet : sequence of Foot    n feet
-    wanted : Motion    ankles in F frames, in the form of `feet_as_motion`
+    wanted : Motion    positions and rotations of the ankles in F frames, as a motion that `feet_as_motion` makes
     floors : (F, n) float64    height below which no sole may be, metres
     frames : slice    the frames to change
 

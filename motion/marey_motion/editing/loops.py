@@ -1,4 +1,4 @@
-"""Conversion of clips to loops."""
+"""Edit commands that make a clip repeat without a visible seam: `close_loop` and `cut_loop`."""
 
 from __future__ import annotations
 

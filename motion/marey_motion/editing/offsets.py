@@ -104,7 +104,7 @@ def offset_to(motion: Motion, frame: int, other: Motion, other_frame: int) -> Po
 
 
 def step_of(motion: Motion, frame: int) -> PoseOffset:
-    """Compute the offset from a frame to the next one; zero at the last frame.
+    """Compute the offset from the pose of a frame to the pose of the next frame; zero at the last frame.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def step_of(motion: Motion, frame: int) -> PoseOffset:
 
     Returns
     -------
-    PoseOffset    of one pose
+    PoseOffset    the offset, without a frame axis
     """
     return offset_to(motion, frame, motion, min(frame + 1, motion.frame_count - 1))
 
@@ -142,7 +142,7 @@ def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
 
 
 def add_offset(motion: Motion, frames: NDArray[np.int64], offset: PoseOffset) -> Motion:
-    """Add offsets to frames.
+    """Add offsets to the poses of some frames.
 
     Parameters
     ----------

@@ -30,12 +30,12 @@ GROUND = np.array([1.0, 0.0, 1.0])
 
 
 def translate(take: Take, command: Translate) -> Take:
-    """Shift the motion.
+    """Shift the whole motion by a constant vector.
 
     Parameters
     ----------
     take : Take    F frames
-    command : Translate    the shift
+    command : Translate    the shift along the axes of the world, metres
 
     Returns
     -------
@@ -141,14 +141,14 @@ def flip_axes(take: Take, command: FlipAxes) -> Take:
 
 
 def carried(motion: Motion, turns: Floats, pivots: Floats, shifts: Floats | None = None) -> Motion:
-    """Rotate a motion about points, then shift it.
+    """Rotate a motion, as a whole or each frame by itself, about points, then shift it.
 
     Parameters
     ----------
     motion : Motion    F frames
     turns : (4,) or (F, 4) float64    rotations in the world
-    pivots : (3,) or (F, 3) float64    metres
-    shifts : (3,) or (F, 3) float64, optional    metres
+    pivots : (3,) or (F, 3) float64    points about which to rotate, metres
+    shifts : (3,) or (F, 3) float64, optional    shifts after the rotation, metres
 
     Returns
     -------
@@ -162,7 +162,7 @@ def carried(motion: Motion, turns: Floats, pivots: Floats, shifts: Floats | None
 
 
 def shifted(motion: Motion, shift: Floats) -> Motion:
-    """Shift a motion.
+    """Shift a whole motion by a constant vector in the world.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def shifted(motion: Motion, shift: Floats) -> Motion:
 
 
 def moved_over(motion: Motion, seam: LoopSeam) -> Motion:
-    """Rotate a motion about the origin and shift it on the ground.
+    """Rotate a motion about the vertical through the origin, then shift it on the ground.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def moved_over(motion: Motion, seam: LoopSeam) -> Motion:
 
 
 def pelvis_track(take: Take, start: int, stop: int) -> Floats:
-    """Compute the positions of the pelvis.
+    """Compute the positions of the pelvis in a range of frames.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def body_at(take: Take, frame: int) -> tuple[Floats, float]:
     Returns
     -------
     position : (3,) float64    metres
-    heading : float    radians
+    heading : float    radians, 0 along +z, positive to the left
 
     Raises
     ------
@@ -233,7 +233,7 @@ def body_at(take: Take, frame: int) -> tuple[Floats, float]:
 
 
 def body_track(take: Take, start: int, stop: int) -> tuple[Floats, Floats]:
-    """Compute the positions of the pelvis and the continuous headings of the body.
+    """Compute the positions of the pelvis and the headings of the body in a range of frames.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def body_track(take: Take, start: int, stop: int) -> tuple[Floats, Floats]:
     Returns
     -------
     positions : (n, 3) float64    metres
-    headings : (n,) float64    radians
+    headings : (n,) float64    radians, 0 along +z, positive to the left, without jumps by full turns
 
     Raises
     ------

@@ -134,7 +134,7 @@ def edit_clip(
 
 
 def apply_edit(clip: Clip, commands: Sequence[AnyCommand], **given: Any) -> Clip:
-    """Apply commands to a clip like `edit_clip`, and return the only result.
+    """Apply commands that make exactly one clip to a clip (see `edit_clip`), and return the edited clip.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The input and output of the commands of an edit."""
+"""Takes, which the commands of an edit receive and return: a motion with its skeleton, findings and limits."""
 
 from __future__ import annotations
 
@@ -249,7 +249,7 @@ class Take:
         return round(seconds * self.frame_rate_hz)
 
     def require_room(self, frames: int) -> None:
-        """Check that a motion with a given number of frames is not too large.
+        """Check that a motion with a given number of frames is not too large, and subtract its work from the budget.
 
         Parameters
         ----------
@@ -257,13 +257,14 @@ class Take:
 
         Raises
         ------
-        EditError    if such a motion would have more values than `most_numbers`
+        EditError    if the motion would have more values than `most_numbers`, or its work exceeds the budget
         """
         width = 3 + 4 * self.skeleton.joint_count + 3 * len(self.motion.translated_joints)
         most = self.most_numbers // width
         if frames > most:
             raise EditError(
-                f"the edited clip would have {frames:,} frames; with this skeleton a clip may have at most {most:,}",
+                f"the edited clip would have {frames:,} frames; with this skeleton a clip may have at most {most:,}; "
+                "choose a shorter clip or a lower frame rate",
                 code="edit-too-large",
             )
         self.budget.spend(PER_NUMBER * width * frames)
@@ -292,9 +293,9 @@ def motion_of(clip: Clip) -> Motion:
 
 
 def settled(motion: Motion) -> Motion:
-    """Bring rotations to unit length and continuous sign.
+    """Normalise rotations to unit length, and choose the signs of quaternions so that they are continuous in time.
 
-    Rotations of unit length in single precision stay unchanged.
+    Rotations whose length is 1 within single precision are not normalised.
 
     Parameters
     ----------

@@ -39,9 +39,9 @@ class Keyframe(NamedTuple):
 
 @dataclass(frozen=True)
 class Layer:
-    """Segments and keyframes of a clip, both sorted by time. The segments do not overlap.
+    """Segments and keyframes of a clip, which are checked, and sorted by time, when the layer is made.
 
-    Two keyframes may share a frame if their labels differ. Segments and keyframes may be given in any order.
+    Segments must not overlap. Two keyframes may share a frame if their labels differ.
 
     Raises
     ------

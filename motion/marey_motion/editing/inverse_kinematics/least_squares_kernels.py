@@ -229,9 +229,9 @@ def _prepare(body, targets, frame, work):
 
 @compiled
 def _try_step(body, damping, local, root, work):
-    """Take a damped step from the pose `local` and `root`; fill `work.trial` and `work.trial_root` with the new pose.
+    """Compute the pose after one damped step from the pose `local` and `root`.
 
-    Joints at a limit slide along this limit.
+    The new pose is `work.trial` and `work.trial_root`. Joints at a limit move only along this limit.
     """
     _fill_softness(body, damping, work)
     work.blocked[:] = 0

@@ -72,8 +72,8 @@ class Targets(NamedTuple):
 class SolverResult(NamedTuple):
     """Results of a solver for F frames and C targets.
 
-    `before` and `after` (F, C) are the errors of the targets; `iterations` (F,) are the numbers of iterations, and
-    `reached` (F,) whether all targets are reached.
+    `before` and `after` (F, C) are the errors of the targets in the given and in the solved poses, in metres or
+    radians. `iterations` (F,) are the numbers of iterations, and `reached` (F,) whether all targets are reached.
     """
 
     before: Floats
@@ -138,6 +138,8 @@ class IkProblem(NamedTuple):
     Parameters
     ----------
     joints : (K,) indices in the skeleton
+    body : parents, offsets, limits and stiffness of these joints
+    targets : the C targets
     roots, rotations : (F, 3) in metres and (F, K, 4) local rotations, copied from the motion
     """
 
@@ -218,7 +220,7 @@ class IkProblem(NamedTuple):
 
 
 def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom) -> IkProblem:
-    """Pack targets for the frames of a motion.
+    """Pack the frames of a motion, the joints that may turn, and the targets into arrays for the kernels.
 
     Parameters
     ----------

@@ -53,8 +53,9 @@ class SolvedPoses:
     Parameters
     ----------
     motion : the frames, with the joints turned
-    residual_before, residual_after : (F, C) error of each target, in metres or radians
-    iterations : (F,) sweeps or steps
+    residual_before, residual_after : (F, C) error of each target before and after, in metres (position) or radians
+        (orientation, look-at)
+    iterations : (F,) number of sweeps (ccd) or steps (least squares) in each frame
     reached : (F,) whether all targets are met within the tolerances
     """
 
@@ -381,7 +382,7 @@ def measure_residuals(skeleton: Skeleton, motion: Motion, targets: Sequence[Targ
 
     Returns
     -------
-    (F, C) float64    metres or radians
+    (F, C) float64    metres for position targets, radians for orientation and look-at targets
     """
     problem = pose_problem(skeleton, motion, targets, _ANYWHERE)
     found = problem.found

@@ -83,10 +83,10 @@ def _restlessness(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Flo
 
 
 def _even_swivels(wished: Floats, jumps: Floats, clear: Floats, reach: float) -> Floats:
-    """Compute swivels (n,) near the wished swivels, with which the change of the limb varies slowly.
+    """Compute swivels (n,) near the desired swivels, with which the change of the limb varies slowly.
 
-    Minimises Σ c (a - w)² + reach² Σ (Δa + jump)² over the swivels a. The wished swivels w are angles on a circle; the
-    weights c, from 0 to 1, are small if a wished swivel is ambiguous. All angles are in radians.
+    Minimises Σ c (a - w)² + reach² Σ (Δa + jump)² over the swivels a. The desired swivels w are angles on a circle; the
+    weights c, from 0 to 1, are small where a desired swivel is ambiguous. All angles are in radians.
     """
     from scipy.linalg import solveh_banded
 

@@ -25,11 +25,12 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
 )
 from marey_motion.kernels import compiled, inverse, product, put_rotation
 
-# Radians: a limb bent by less bends about its hinge, one bent by more about the axis that it is bent about now.
+# Bends in radians: up to the first, a limb bends about its hinge; from the second on, about its present axis.
 HINGED, TOLD = math.radians(15.0), math.radians(30.0)
 # Sine of the inner angle below which the axis of a folded limb is drawn towards its hinge.
 NEARLY_FOLDED = 0.05
-# What of a hinge's unit direction must be across the upper bone for it to say anything.
+# Least length of the part of a hinge's unit direction that is perpendicular to the upper bone. Below it, the hinge is
+# not used.
 SHORTEST_HINGE = 0.1
 # The joint at the limb's end turns with the bones, keeps its rotation in the world, or gets a given rotation.
 CARRIED, HELD, GIVEN = 0, 1, 2
@@ -50,10 +51,9 @@ def bend_at(distance, first, second):
 def damped_bend(angle, wished, zone):
     """Damp the change of the angle between the bones, from `angle` to `wished`, near a straight or folded limb.
 
-    Kovar et al. (2002), section 5.2; all angles are in radians.
-
     In the last `zone` radians before the limb is straight, and in the last `zone` radians before it is folded, the
-    change is weighted by a cubic that falls from 1 to 0.
+    change is weighted by a cubic that falls from 1 to 0 (Kovar et al. 2002, section 5.2). Returns the damped angle; all
+    angles are in radians.
     """
     if wished < angle and wished < zone:
         return math.pi - damped_bend(math.pi - angle, math.pi - wished, zone)
