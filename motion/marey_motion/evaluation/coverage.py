@@ -222,7 +222,7 @@ def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn
 
 @dataclass(frozen=True)
 class Hole:
-    """A cell of the trial grid that lacks data."""
+    """A cell of the trial grid that lacks data: its centre, its seconds of data, and the seconds that are missing."""
 
     speed_m_s: float
     turn_rate_deg_s: float

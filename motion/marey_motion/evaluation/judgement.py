@@ -267,7 +267,7 @@ def _looks_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitChec
 
 
 def exceeded_in_suite(result: EvaluationResult) -> frozenset[str]:
-    """Find the metrics of the suite that exceed the limits for single trials.
+    """Find the metrics whose values for the whole suite exceed the limits for single trials.
 
     Limits that depend on the desired speed of a trial are not checked.
 

@@ -130,7 +130,9 @@ def measure_trial(
     options: EvaluationOptions,
     looks: LooksMeter | None = None,
 ) -> TrialResult:
-    """Compute every metric of one trial (docs/explanation/evaluation.md), and of each regime if there are several.
+    """Compute every metric of one trial (docs/explanation/evaluation.md), also per regime if there are several.
+
+    A regime is all time with the same desired motion: the approach, the base speed, or the speed after switches.
 
     Parameters
     ----------
@@ -138,7 +140,8 @@ def measure_trial(
     reference : Reference    trajectory of the trial
     record : TrialRecord    T ticks
     options : EvaluationOptions    options of the evaluation
-    looks : LooksMeter, optional    measures of looks over the database of the record; left out if None
+    looks : LooksMeter, optional    measurement of feet and smoothness over the database of the record; if None, these
+        metrics are left out
 
     Returns
     -------

@@ -36,7 +36,7 @@ FARTHEST_M = 1e6
 
 PATH_RATE_HZ = 5.0
 AWAY_DECIMALS = 1
-"""Number of decimals to which distances between cells are compared.
+"""Number of decimals to which distances between cells, in widths of a cell, are rounded before they are compared.
 
 Of two equally distant cells, the cell that lacks more seconds comes first.
 """
@@ -97,7 +97,9 @@ class OnlineCoverage:
         shape = len(self.speed_edges_m_s) - 1, len(self.turn_rate_edges_deg_s) - 1
         if shape[0] * shape[1] > MOST_CELLS:
             raise MotionError(
-                f"the grid has {shape[0]} x {shape[1]} cells; at most {MOST_CELLS} are allowed", where="grid"
+                f"the grid has {shape[0]} x {shape[1]} cells; at most {MOST_CELLS} are allowed, so choose fewer "
+                "speeds or turn rates",
+                where="grid",
             )
         self._before = np.zeros(shape) if seconds is None else np.array(seconds, dtype=np.float64)
         if self._before.shape != shape:
@@ -112,7 +114,7 @@ class OnlineCoverage:
     # -- what comes in -------------------------------------------------------------------------------------------------
 
     def add_frames(self, body: MatchingBody, clip: Clip) -> Windows:
-        """Add the next frames.
+        """Add the next frames of the performance.
 
         A take begins with the first frame in which hips and shoulders define a facing direction.
 

@@ -152,7 +152,7 @@ class UsageTally:
         self.entries[:] += np.bincount(entered, minlength=len(clips))
 
     def usage(self, clips: Sequence[DatabaseClip]) -> tuple[ClipUsage, ...]:
-        """Return the use of each clip.
+        """Compute the use of each clip: ticks, share of all ticks, jumps to the clip, and trials.
 
         Parameters
         ----------

@@ -39,7 +39,10 @@ APPROACH_S = 1.0
 
 @dataclass(frozen=True)
 class TrialReplicate:
-    """One run of a trial; `driven` is a copy of the trial with the approach time of this replicate."""
+    """One run of a trial.
+
+    `driven` is a copy of the trial with the approach time of this replicate; `start_ticks` is the delay of the start.
+    """
 
     trial: Trial
     replicate: int
@@ -76,7 +79,7 @@ def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
     Parameters
     ----------
     trial : Trial    the trial
-    database : MatchingDatabase    rate and horizons
+    database : MatchingDatabase    frame rate and look-ahead
 
     Returns
     -------
@@ -100,7 +103,7 @@ def simulate(
 
     Returns
     -------
-    TrialRecord    the ticks
+    TrialRecord    displayed row, position, heading and costs at each tick
     """
     guide = guide_for(run.driven, database)
     own = index_for(database, index, run.trial)
@@ -116,7 +119,7 @@ def measure_run(
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
-    looks : LooksMeter    measures of looks over the database
+    looks : LooksMeter    measurement of feet and smoothness over the database
     run : TrialReplicate    the replicate
     record : TrialRecord    its record
 
@@ -200,7 +203,7 @@ class MeasuredReplicates:
 
 @dataclass(eq=False)
 class _Kept:
-    """Metrics of the replicates that have ended, and the use of clips in them; records are not kept."""
+    """Metrics of the replicates that have ended, and the use of clips in them."""
 
     usage: UsageTally
     runs: dict[tuple[str, int], MeasuredRun] = field(default_factory=dict)
@@ -216,7 +219,9 @@ def run_replicates(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> MeasuredReplicates | None:
-    """Simulate and measure all replicates of the trials except replicate 0, the trial itself; no record is kept.
+    """Simulate and measure all replicates of the trials except replicate 0, which is the trial itself.
+
+    The simulated ticks are discarded after they are measured.
 
     Parameters
     ----------

@@ -1,7 +1,8 @@
 """The trials of an evaluation and their trajectories.
 
-A trial starts at the origin facing +z, goes straight for its approach, and then follows the course of its family. Each
-course is a chain of arcs with constant speed and turn rate; corners and changes of speed are at fixed intervals.
+A trial starts at the origin facing +z, goes straight for its approach, and then follows the course of its family. A
+course is a chain of arcs with constant speed and turn rate; corners and changes of speed are at fixed intervals. The
+course of a trial along a take is the path of the take.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ LOOK_AHEAD_S = 1.0
 TIME_TOLERANCE_S = 1e-9
 STRAIGHT_DEG_S = 1e-6
 KEY_RATE_HZ = 10.0
-"""Keys per second of the path of a take; roots are smoothed over half a second, so more keys would say no more."""
+"""Keys per second of the path of a take; roots are smoothed over half a second, so more keys would add no detail."""
 LEAST_TRAVEL_M_S = 0.05
 """Speed, in metres per second, below which the direction of travel of a step is not defined."""
 
@@ -179,7 +180,8 @@ def require_names(trials: Iterable[Trial]) -> None:
     for trial in trials:
         if trial.name in seen:
             raise MotionError(
-                f"two trials are called {trial.name}; each trial needs a different name",
+                f"two trials are called {trial.name}, because two values of the grid are equal or nearly equal; remove "
+                "one of these values",
                 where="grid",
             )
         seen.add(trial.name)
@@ -236,7 +238,10 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
 
 
 def _along_keys(trial: Trial, times: Floats, rate_hz: float, tick_count: int) -> Reference:
-    """Compute the trajectory along the keys of a take; the approach goes straight, with the first velocity."""
+    """Compute the trajectory of a trial along a take: a cubic spline through the keys `trial.path`.
+
+    The approach is straight, with the velocity at the first key.
+    """
     from scipy.interpolate import CubicSpline
 
     curve = CubicSpline(np.arange(len(trial.path)) / KEY_RATE_HZ, np.array(trial.path))

@@ -95,10 +95,11 @@ def measure_similarity(
     ----------
     database : MatchingDatabase    the clips
     coverage : Coverage    coverage of the clips
-    threshold : float    distance up to which a frame can be blended, usually `accepted_distance`; metres, or the
-        distance of a metric
-    seen : PerceivedRows, optional    the rows under a perceptual metric, which is used instead of metres
-    most_frames : int    frames compared per cell
+    threshold : float    distance up to which a frame can be blended, usually `accepted_distance`; in metres or, with
+        `seen`, in the distance of the metric
+    seen : PerceivedRows, optional    rows of `database`, prepared for a perceptual metric; if None, distances are in
+        metres
+    most_frames : int    greatest number of frames compared per cell
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
 

@@ -1,4 +1,4 @@
-"""Confirmation of suggestions: their effects are measured in replicates from which no suggestion was chosen."""
+"""Confirmation of suggestions: their effects are measured in replicates that were not used to choose them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Confirmed:
-    """Effects of suggestions, measured in replicates from which no suggestion was chosen.
+    """Effects of suggestions, measured in replicates that were not used to choose the suggestions.
 
     The probabilities of each metric are corrected for the total number of these effects; the intervals are not.
 
@@ -67,7 +67,7 @@ def confirm(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> Confirmed | None:
-    """Measure the effects of suggestions in replicates from which no suggestion was chosen.
+    """Measure the effects of suggestions in replicates that were not used to choose the suggestions.
 
     Parameters
     ----------

@@ -33,7 +33,8 @@ class NearDuplicate:
     ----------
     first, second : uids of the source clips
     first_name, second_name : names of the clips
-    distance_cm : distance of the two motions per frame, as in the description of the module, but in centimetres
+    distance_cm : distance of the two motions in centimetres: the mean distance of corresponding points, over the frames
+        that the best alignment in time matches
     same_content : whether both are the same frames of clips with equal content
     mirrored : whether the first motion is nearly the mirror image of the second
     perceived : perceptual distance of the two motions; None without a metric
@@ -51,7 +52,11 @@ class NearDuplicate:
 
 @dataclass(frozen=True)
 class NearDuplicates:
-    """Pairs of clips within the threshold, nearest first; numbers of pairs that were aligned, and of all pairs."""
+    """Near-duplicates of a set of clips.
+
+    `pairs` lists the pairs within `threshold_cm`, the nearest first. `compared` is the number of all pairs, and
+    `aligned` the number of pairs whose distance had to be computed by an alignment.
+    """
 
     pairs: tuple[NearDuplicate, ...]
     threshold_cm: float
@@ -75,8 +80,9 @@ def find_near_duplicates(
     Parameters
     ----------
     database : MatchingDatabase    the clips
-    threshold_cm : float    centimetres per frame
-    seen : PerceivedRows, optional    the rows under a perceptual metric, by which pairs are measured, too
+    threshold_cm : float    greatest distance of near-duplicates (`NearDuplicate.distance_cm`), centimetres
+    seen : PerceivedRows, optional    rows of `database`, prepared for a perceptual metric; if given, the perceptual
+        distance of each pair is computed, too
     threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -160,7 +166,7 @@ class _Families:
 
 
 def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
-    """Compute the pose joints and the root at each horizon as points.
+    """Compute the positions of the pose joints, and of the future root at each horizon, for each row of a database.
 
     Parameters
     ----------

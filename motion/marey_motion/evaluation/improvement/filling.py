@@ -105,9 +105,10 @@ def rank_fillings(
     coverage : Coverage    coverage of the set
     collections : mapping of str to MatchingDatabase    databases by name, of any skeleton, at the set's frame rate
     options : EvaluationOptions    grid and minimum seconds per cell
-    threshold : float    distance up to which a frame can be blended, as in `similarity`
-    seen : PerceivedRows, optional    the rows of the set under a perceptual metric, which is used instead of metres
-    most_frames : int    frames compared per source
+    threshold : float    distance up to which a frame can be blended, in metres or, with `seen`, in the distance of the
+        metric
+    seen : PerceivedRows, optional    rows of the set, prepared for a perceptual metric; None for distances in metres
+    most_frames : int    greatest number of frames compared per source
     progress : callable, optional    called as progress(sources done, total, name)
     cancelled : callable, optional    returns True to stop
 

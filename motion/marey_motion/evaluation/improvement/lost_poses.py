@@ -32,7 +32,7 @@ class LostPoses:
     Parameters
     ----------
     database : MatchingDatabase    the clips
-    seen : PerceivedRows    its rows under the metric
+    seen : PerceivedRows    its rows, prepared for the perceptual metric
     threshold : float    greatest distance of poses that replace each other
     most_poses : int    number of poses to compare, at least one of each clip
     progress : callable, optional    called as progress(poses done, total, name)

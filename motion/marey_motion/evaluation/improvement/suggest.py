@@ -60,7 +60,8 @@ class Suggestions:
     unused : data whose removal changes no trial
     redundant : all clips that were tried, ranked by the harm of their removal per second saved
     plan : a sequence of removals from the set without its unused clips, with confirmed effects
-    confirmed : effects, measured in replicates from which no suggestion was chosen
+    confirmed : effects, measured in replicates that were not used to choose suggestions; None if the options ask for no
+        such replicates
     spared : near-duplicates to remove, each with the pair to which it belongs; the other clip of the pair stays
     fillings, additions : clips of other collections that fill holes. In `fillings`, each is measured alone; `additions`
         is a sequence in which each is measured after all earlier clips were added
@@ -255,7 +256,10 @@ def _redundancy(
 
 def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
     if len(result.records) != len(result.trials):
-        raise MotionError("suggestions need an evaluation with the records of all its trials", code="records-missing")
+        raise MotionError(
+            "the evaluation lacks the records of its trials; read it with its records, or make it again",
+            code="records-missing",
+        )
     own = provenance_of(database, result.options, [trial.trial for trial in result.trials])
     different = [name for name in ("dataset", "normaliser") if getattr(own, name) != getattr(result.provenance, name)]
     if different:
