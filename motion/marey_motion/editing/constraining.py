@@ -15,7 +15,6 @@ import numpy as np
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats, Ints
-from marey_motion.editing.calm_limbs import CalmLimb, largest_steps
 from marey_motion.editing.compute_budget import PER_MEETING, PER_MET_NUMBER, ComputeBudget
 from marey_motion.editing.displacement import displace, windows_around
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_targets
@@ -29,6 +28,7 @@ from marey_motion.editing.inverse_kinematics.targets import (
     SolverOptions,
     Target,
 )
+from marey_motion.editing.limb_smoothing import LimbSmoother, largest_steps
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
@@ -275,7 +275,7 @@ class _Cluster:
         made = solved(given, targets, neighbours)
         if limb is None or self._method(constraints, limb, joints) != "two_bone" or not self.damping_zone_rad:
             return made
-        return self._calmed(given, made, targets, limb, neighbours, solved)
+        return self._smoothed(given, made, targets, limb, neighbours, solved)
 
     def _solver_of(
         self, constraints: Sequence[Constraint], limb: TwoBoneLimb | None, joints: tuple[int, ...]
@@ -291,7 +291,7 @@ class _Cluster:
 
         return solved
 
-    def _calmed(
+    def _smoothed(
         self,
         given: Motion,
         made: Motion,
@@ -314,12 +314,12 @@ class _Cluster:
             run = Neighbours(neighbours.frames[rows], neighbours.reach)
             others = [_rows_of(one, rows) for one in targets if one is not place]
             usual = self.usual[[limb.middle, limb.end]]
-            calm = CalmLimb(
+            smoother = LimbSmoother(
                 self.skeleton, limb, given.sliced(start, stop), usual, run.reach, 0.5 * self.damping_zone_rad
             )
             again = partial(_solved_for, solved, place, others, run)
             path = np.broadcast_to(place.values, (len(neighbours.frames), 3))[rows]
-            rotations[rows] = calm.solved(path, again, made.sliced(start, stop)).rotations
+            rotations[rows] = smoother.solved(path, again, made.sliced(start, stop)).rotations
         return made._replace(rotations=rotations)
 
     def _work(

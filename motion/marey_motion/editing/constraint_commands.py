@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.editing.calm_limbs import largest_steps
 from marey_motion.editing.compute_budget import PER_NUMBER, PER_PLANTED_NUMBER, PER_RIG
 from marey_motion.editing.constraining import Constraint, constrain_motion, current_values, residuals_of
 from marey_motion.editing.constraint_warnings import contradictions, joined, jumps, missed, require_acting
@@ -29,6 +28,7 @@ from marey_motion.editing.inverse_kinematics.targets import (
     Target,
     chain_of,
 )
+from marey_motion.editing.limb_smoothing import largest_steps
 from marey_motion.editing.take import EditFinding, Take
 from marey_motion.errors import MappingError, MotionError
 from marey_motion.rigs import JointAxes, guess_axes

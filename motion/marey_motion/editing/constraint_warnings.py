@@ -11,10 +11,10 @@ from itertools import combinations
 import numpy as np
 
 from marey_motion.arrays import Flags, Floats
-from marey_motion.editing.calm_limbs import allowed_steps, largest_steps
 from marey_motion.editing.constraining import Constraint
 from marey_motion.editing.constraint_windows import JoinedWindows
 from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget, SolverOptions, Target
+from marey_motion.editing.limb_smoothing import allowed_steps, largest_steps
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton

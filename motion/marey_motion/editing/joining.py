@@ -10,10 +10,10 @@ from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.editing.annotations.contacts import contact_labels
 from marey_motion.editing.borders import blended, smooth_step
-from marey_motion.editing.calm_limbs import MOST_STEP, largest_steps
 from marey_motion.editing.foot_plants import Foot
 from marey_motion.editing.ground import heights_of_soles
 from marey_motion.editing.kept_feet import feet_as_motion, feet_of, with_feet
+from marey_motion.editing.limb_smoothing import MOST_STEP, largest_steps
 from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, seam_offset
 from marey_motion.editing.placement import body_track, moved_over
 from marey_motion.editing.take import EditFinding, Take, motion_of

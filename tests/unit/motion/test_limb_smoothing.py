@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from marey_motion.clip import Clip
-from marey_motion.editing.calm_limbs import allowed_steps, largest_steps
+from marey_motion.editing.limb_smoothing import allowed_steps, largest_steps
 from marey_motion.editing.registry import EditedClip, edit_clip
 from marey_motion.errors import EditError
 from marey_motion.formats import read_motion

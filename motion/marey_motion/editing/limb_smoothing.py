@@ -71,8 +71,8 @@ class _Attempt(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class CalmLimb:
-    """A limb in a run of consecutive frames, and the limits of its steps from frame to frame.
+class LimbSmoother:
+    """Solver of a limb in a run of frames, which smooths the path of the limb's end until no joint of the limb jumps.
 
     Parameters
     ----------
@@ -111,8 +111,8 @@ class CalmLimb:
         jumps[:-1] |= best.excess > 0.0
         jumps[1:] |= best.excess > 0.0
         starts = self._places(self.given)[:, 0]
-        for width, calmer in product(_WIDTHS, (self._slowed, self._evened)):
-            path = starts + calmer(targets - starts, jumps, max(1, round(width * self.reach)))
+        for width, smooth in product(_WIDTHS, (self._slowed, self._evened)):
+            path = starts + smooth(targets - starts, jumps, max(1, round(width * self.reach)))
             made = self._judged(solve(self.given, path))
             if made.excess.max() < best.excess.max():
                 best = made
