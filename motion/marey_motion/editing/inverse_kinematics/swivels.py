@@ -59,7 +59,7 @@ def swivel_coherently(
     alone = problem.rotations.copy()
     swivel_kernels.swivel_frames(*posed, angles, lines, problem.rotations, work)
     if pole is None:
-        steps = [_restlessness(limb, problem, rotations) for rotations in (alone, problem.rotations)]
+        steps = [_limb_speeds(limb, problem, rotations) for rotations in (alone, problem.rotations)]
         for start, stop in neighbours.runs:
             part = slice(start, stop - 1)
             worst = [sum(float(one[part].max(initial=0.0)) for one in both) for both in steps]
@@ -67,7 +67,7 @@ def swivel_coherently(
                 problem.rotations[start:stop] = alone[start:stop]
 
 
-def _restlessness(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floats, Floats]:
+def _limb_speeds(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floats, Floats]:
     """Compute two speeds (F - 1,), in radians per frame: of the upper bone in the world, and of its joint in the limb.
 
     The speed of the bone does not include a twist of a straight limb. The speed of the joint, computed from its local
@@ -109,8 +109,8 @@ def _unwrapped(angles: Floats, clear: Floats) -> Floats:
 
     The weights are `clear` (n,). Angles with less weight are not compared.
     """
-    told = np.flatnonzero(clear >= min(0.05, float(clear.max())))
-    turns = np.round(np.diff(angles[told]) / (2.0 * np.pi))
+    weighted = np.flatnonzero(clear >= min(0.05, float(clear.max())))
+    turns = np.round(np.diff(angles[weighted]) / (2.0 * np.pi))
     full = np.zeros(len(angles))
-    full[told[1:]] = turns
+    full[weighted[1:]] = turns
     return angles - 2.0 * np.pi * np.cumsum(full)
