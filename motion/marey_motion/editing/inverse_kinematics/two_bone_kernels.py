@@ -26,7 +26,7 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
 from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 # Bends in radians: up to the first, a limb bends about its hinge; from the second on, about its present axis.
-HINGED, TOLD = math.radians(15.0), math.radians(30.0)
+HINGE_BEND_RAD, CLEAR_BEND_RAD = math.radians(15.0), math.radians(30.0)
 # Sine of the inner angle below which the axis of a folded limb is drawn towards its hinge.
 NEARLY_FOLDED = 0.05
 # Least length of the part of a hinge's unit direction that is perpendicular to the upper bone. Below it, the hinge is
@@ -109,8 +109,8 @@ def _turn_from_hinge(along, across, cosine, wished):
     now = math.atan2(sine, -cosine)
     measured = math.atan2(across, along)
     hinged = math.asin(now * math.sin(measured) / max(now, wished, 1e-12))
-    told = min(1.0, max(0.0, (now - HINGED) / (TOLD - HINGED)))
-    return hinged + told * told * (3.0 - 2.0 * told) * (measured - hinged)
+    share = min(1.0, max(0.0, (now - HINGE_BEND_RAD) / (CLEAR_BEND_RAD - HINGE_BEND_RAD)))
+    return hinged + share * share * (3.0 - 2.0 * share) * (measured - hinged)
 
 
 @compiled
