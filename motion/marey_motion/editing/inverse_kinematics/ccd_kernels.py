@@ -67,14 +67,14 @@ def _pair_up(targets, frame, k, body, place, tips, turns, matrix):
             pairs += 3
             continue
         if targets.kinds[c] == POSITION:
-            wished = vector_at(values, c)
+            goal = vector_at(values, c)
             axes = targets.axes
-            wished = (
-                wished[0] if axes[c, 0] > 0.0 else tip[0],
-                wished[1] if axes[c, 1] > 0.0 else tip[1],
-                wished[2] if axes[c, 2] > 0.0 else tip[2],
+            goal = (
+                goal[0] if axes[c, 0] > 0.0 else tip[0],
+                goal[1] if axes[c, 1] > 0.0 else tip[1],
+                goal[2] if axes[c, 2] > 0.0 else tip[2],
             )
-            a, b = minus(tip, place), minus(wished, place)
+            a, b = minus(tip, place), minus(goal, place)
         else:
             a, b = rotated(turn, vector_at(targets.directions, c)), direction(minus(vector_at(values, c), tip))
         _add_pair(matrix, weight, a, b)
@@ -218,14 +218,14 @@ def _turned_joint(body, k, spin, local, pairs, start, end, work):
     if flexible < 1.0:
         turn = exponential(scaled(logarithm(turn), flexible))
     above = product(spin, inverse(local))
-    wished = unit(product(inverse(above), product(turn, spin)))
+    goal = unit(product(inverse(above), product(turn, spin)))
     if not body.limited[k]:
-        return wished
-    wished = within_limits(limit, wished)
+        return goal
+    goal = within_limits(limit, goal)
     _davenport(work.matrix, work.form)
-    turn = product(product(above, wished), inverse(spin))
+    turn = product(product(above, goal), inverse(spin))
     worse = _form_value(work.form, turn) < work.form[0, 0]
-    return local if worse else wished
+    return local if worse else goal
 
 
 @compiled

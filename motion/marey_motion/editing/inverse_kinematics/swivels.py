@@ -44,16 +44,16 @@ def swivel_coherently(
     lines, jumps, turns = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
     posed = limb, problem.body, problem.roots
     swivel_kernels.measure_swivels(*posed, before, problem.rotations, work, lines, jumps, turns)
-    wished, clear = np.zeros(count), (0.5 + 0.5 * np.cos(turns)) ** 2
+    goal, clear = np.zeros(count), (0.5 + 0.5 * np.cos(turns)) ** 2
     if pole is not None:
-        swivel_kernels.pole_swivels(*posed, problem.rotations, pole, work, wished, clear)
+        swivel_kernels.pole_swivels(*posed, problem.rotations, pole, work, goal, clear)
         reach = POLE_FRAMES
     angles = np.zeros(count)
     for start, stop in neighbours.runs:
         part = slice(start, stop)
         jumps[start] = 0.0
         if pole is not None or np.abs(jumps[part]).max() > COHERENT_RAD:
-            angles[part] = _even_swivels(wished[part], jumps[part], clear[part], reach)
+            angles[part] = _even_swivels(goal[part], jumps[part], clear[part], reach)
     if not angles.any():
         return
     alone = problem.rotations.copy()
@@ -82,7 +82,7 @@ def _limb_speeds(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floa
     return np.asarray(moved), np.asarray(2.0 * np.arccos(np.minimum(np.abs(turns), 1.0)))
 
 
-def _even_swivels(wished: Floats, jumps: Floats, clear: Floats, reach: float) -> Floats:
+def _even_swivels(goal: Floats, jumps: Floats, clear: Floats, reach: float) -> Floats:
     """Compute swivels (n,) near the desired swivels, with which the change of the limb varies slowly.
 
     Minimises Σ c (a - w)² + reach² Σ (Δa + jump)² over the swivels a. The desired swivels w are angles on a circle; the
@@ -91,7 +91,7 @@ def _even_swivels(wished: Floats, jumps: Floats, clear: Floats, reach: float) ->
     from scipy.linalg import solveh_banded
 
     carried = np.cumsum(jumps)  # what the swivels add up to if none is corrected
-    data = _unwrapped(wished + carried, clear)
+    data = _unwrapped(goal + carried, clear)
     weights = np.maximum(clear, LEAST_CLARITY)
     stiff = reach**2
     bands = np.zeros((2, len(data)))
