@@ -14,7 +14,7 @@ from marey_motion.editing.foot_plants import Foot
 from marey_motion.editing.ground import heights_of_soles
 from marey_motion.editing.kept_feet import feet_as_motion, feet_of, with_feet
 from marey_motion.editing.limb_smoothing import MOST_STEP, largest_steps
-from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, seam_offset
+from marey_motion.editing.offsets import VELOCITY_S, add_offset, decayed_offset, seam_offset
 from marey_motion.editing.placement import body_track, moved_over
 from marey_motion.editing.take import EditFinding, Take, motion_of
 from marey_motion.editing.translations import with_equal_joints
@@ -223,7 +223,7 @@ def _inertialised(first: Motion, second: Motion, count: int, frame_rate_hz: floa
     difference, velocity = seam_offset(first, second)
     ages = np.arange(min(count, second.frame_count), dtype=np.float64)
     velocity_life = min(float(count), max(1.0, VELOCITY_S * frame_rate_hz))
-    left = dying_away(difference, velocity, ages, float(count), velocity_life)
+    left = decayed_offset(difference, velocity, ages, float(count), velocity_life)
     return add_offset(second, np.arange(len(ages)), left)
 
 

@@ -163,7 +163,9 @@ def add_offset(motion: Motion, frames: NDArray[np.int64], offset: PoseOffset) ->
     return motion._replace(root_translations=root, rotations=rotations, translations=translations)
 
 
-def dying_away(offset: PoseOffset, velocity: PoseOffset, ages: Floats, life: float, velocity_life: float) -> PoseOffset:
+def decayed_offset(
+    offset: PoseOffset, velocity: PoseOffset, ages: Floats, life: float, velocity_life: float
+) -> PoseOffset:
     """Compute an offset that decays over time, from its initial value and velocity.
 
     Parameters
