@@ -282,7 +282,7 @@ def motion_of(clip: Clip) -> Motion:
     Motion    F frames
     """
     nothing = np.zeros((clip.frame_count, 0, 3))
-    return settled(
+    return with_unit_rotations(
         Motion(
             clip.root_translations.astype(np.float64),
             clip.rotations.astype(np.float64),
@@ -292,7 +292,7 @@ def motion_of(clip: Clip) -> Motion:
     )
 
 
-def settled(motion: Motion) -> Motion:
+def with_unit_rotations(motion: Motion) -> Motion:
     """Normalise rotations to unit length, and choose the signs of quaternions so that they are continuous in time.
 
     Rotations whose length is 1 within single precision are not normalised.
