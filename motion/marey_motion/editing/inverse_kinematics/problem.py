@@ -82,7 +82,7 @@ class SolverResult(NamedTuple):
     reached: Flags
 
 
-class Placing(NamedTuple):
+class DescentScratch(NamedTuple):
     """Scratch arrays of cyclic coordinate descent, for one pose of K joints and C targets.
 
     Parameters
@@ -102,8 +102,8 @@ class Placing(NamedTuple):
     vectors: Floats
 
 
-class Stepping(NamedTuple):
-    """Scratch arrays of least squares: for one pose, as in `Placing`, and for a step with n unknowns and m errors.
+class LeastSquaresScratch(NamedTuple):
+    """Scratch arrays of least squares: for one pose, as in `DescentScratch`, and for a step with n unknowns and m errors.
 
     The unknowns are displacements of the pose from the pose at the start, `first` and `first_root`. `trial` and
     `trial_root` are the pose after a step; the other arrays are terms of the equations of the step.
@@ -158,12 +158,12 @@ class IkProblem(NamedTuple):
         )
 
     @property
-    def placing(self) -> Placing:
+    def descent_scratch(self) -> DescentScratch:
         """Make scratch arrays for cyclic coordinate descent."""
         room = self._pose_room()
-        return Placing(**room, matrix=np.zeros((3, 3)), form=np.zeros((4, 4)), vectors=np.zeros((4, 4)))
+        return DescentScratch(**room, matrix=np.zeros((3, 3)), form=np.zeros((4, 4)), vectors=np.zeros((4, 4)))
 
-    def stepping(self, regularisation_m: float) -> Stepping:
+    def least_squares_scratch(self, regularisation_m: float) -> LeastSquaresScratch:
         """Make scratch arrays for least squares.
 
         Parameters
@@ -178,7 +178,7 @@ class IkProblem(NamedTuple):
         joints, unknowns, errors = len(self.joints), 3 * movable + 3, 3 * len(self.targets.kinds)
         holding = np.full(unknowns, regularisation_m**2)
         holding[:-3] /= np.repeat((1.0 - self.body.stiffness[self.body.movable]) ** 2, 3)
-        return Stepping(
+        return LeastSquaresScratch(
             **self._pose_room(),
             first=np.zeros((joints, 4)),
             first_root=np.zeros(3),

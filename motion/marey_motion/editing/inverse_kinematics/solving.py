@@ -205,7 +205,7 @@ def solve_ccd(
             where="root_moves",
         )
     problem = pose_problem(skeleton, motion, targets, freedom)
-    found, room = problem.found, problem.placing
+    found, room = problem.found, problem.descent_scratch
     solve_in_order(ccd_kernels.descend, problem, options, room, found, neighbours)
     return _solved(motion, problem, found)
 
@@ -244,7 +244,7 @@ def solve_least_squares(
     from marey_motion.editing.inverse_kinematics import least_squares_kernels
 
     problem = pose_problem(skeleton, motion, targets, freedom)
-    found, room = problem.found, problem.stepping(options.regularisation_m)
+    found, room = problem.found, problem.least_squares_scratch(options.regularisation_m)
     solve_in_order(least_squares_kernels.solve_frames, problem, options, room, found, neighbours)
     return _solved(motion, problem, found)
 
@@ -316,7 +316,7 @@ def solve_two_bone(
         _STILL if orientation is None else np.ascontiguousarray(problem.targets.values[:, 1]),
         problem.roots,
         problem.rotations,
-        problem.placing,
+        problem.descent_scratch,
     )
     if neighbours is not None:
         pole = None if position.pole is None else np.asarray(position.pole, dtype=np.float64)
@@ -365,7 +365,7 @@ def _measure(problem: IkProblem, options: SolverOptions, residuals: Floats, foun
         (float(options.tolerance_m), float(options.tolerance_rad)),
         problem.roots,
         problem.rotations,
-        problem.placing,
+        problem.descent_scratch,
         residuals,
         found.reached,
     )

@@ -40,7 +40,7 @@ def swivel_coherently(
     """
     from marey_motion.editing.inverse_kinematics import swivel_kernels
 
-    count, work, reach = len(neighbours.frames), problem.placing, neighbours.reach
+    count, work, reach = len(neighbours.frames), problem.descent_scratch, neighbours.reach
     lines, jumps, turns = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
     posed = limb, problem.body, problem.roots
     swivel_kernels.measure_swivels(*posed, before, problem.rotations, work, lines, jumps, turns)
@@ -76,7 +76,7 @@ def _limb_speeds(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floa
     from marey_motion.editing.inverse_kinematics import swivel_kernels
 
     bones = np.zeros((len(rotations), 3))
-    swivel_kernels.fill_upper_bones(limb, problem.body, problem.roots, rotations, problem.placing, bones)
+    swivel_kernels.fill_upper_bones(limb, problem.body, problem.roots, rotations, problem.descent_scratch, bones)
     turns = np.sum(rotations[1:, limb.start] * rotations[:-1, limb.start], axis=-1)
     moved = np.linalg.norm(np.diff(bones, axis=0), axis=-1)
     return np.asarray(moved), np.asarray(2.0 * np.arccos(np.minimum(np.abs(turns), 1.0)))
