@@ -86,7 +86,7 @@ def constrain(take: Take, command: Constrain) -> Take:
         [residuals_of(take.skeleton, motion, one) for one in wanted] for motion in (take.motion, made.motion)
     )
     found = [_finding(*each) for each in zip(command.constraints, wanted, before, after, strict=True)]
-    edited = take.moved(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
+    edited = take.with_motion(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
     warnings = [*contradictions(wanted), *joined(pairs), *missed(wanted, after)]
     warnings += jumps(take.skeleton, take.motion, made.motion, wanted, blend)
     if blend > take.frame_count:
@@ -123,7 +123,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
         "slide_after_m": made.slide_after_m,
         "lowered_m": made.lowered_m,
     }
-    return take.moved(made.motion).with_finding(EditFinding("plant_feet", values))
+    return take.with_motion(made.motion).with_finding(EditFinding("plant_feet", values))
 
 
 class _Rig:

@@ -63,7 +63,7 @@ def move_to_ground(take: Take, command: MoveToGround) -> Take:
     MappingError    if the feet are not known
     """
     ground = estimate_ground(take, command.sole_m) if command.height_m is None else Ground(command.height_m, 0)
-    moved = take.moved(shifted(take.motion, np.array((0.0, -ground.height_m, 0.0))))
+    moved = take.with_motion(shifted(take.motion, np.array((0.0, -ground.height_m, 0.0))))
     if command.height_m is not None:
         return moved
     return moved.with_finding(EditFinding("move_to_ground", ground._asdict()))

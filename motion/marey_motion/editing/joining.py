@@ -58,7 +58,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     take, source, left_out = _without_rest_poses(take, command.source)
     added = _same_rate(take, source)
     first, second = with_equal_joints(take.motion, added.motion, take.skeleton)
-    before, after = take.moved(first), added.moved(second)
+    before, after = take.with_motion(first), added.with_motion(second)
     count = take.count_frames(command.blend_s)
     overlap = min(count, before.frame_count, after.frame_count) if command.blend == "slerp" else 0
     if left_out:
@@ -66,7 +66,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     if command.blend_s * take.frame_rate_hz > min(before.frame_count, after.frame_count):
         take = take.warned("concatenate", f"the blend of {command.blend_s:g} s is longer than one of the two clips")
     if command.place == "keep" and count == 0:
-        return take.moved(_in_a_row(first, second))
+        return take.with_motion(_in_a_row(first, second))
     seam = _seam(before, after, overlap) if command.place == "seam" else LoopSeam(0.0, np.zeros(2))
     body, carrier = take.skeleton, take.body.carrier
     stays = all(root_stands(motion, body, carrier) for motion in (first, second))
@@ -77,7 +77,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     if command.keep_feet and count:
         joined = _with_kept_feet(take, first, second, joined, overlap, count)
     fast = _fastest(take.skeleton, first, second, joined) if count else None
-    return take.moved(joined) if fast is None else take.moved(joined).warned("concatenate", fast)
+    return take.with_motion(joined) if fast is None else take.with_motion(joined).warned("concatenate", fast)
 
 
 def _fastest(skeleton: Skeleton, first: Motion, second: Motion, joined: Motion) -> str | None:
@@ -116,7 +116,7 @@ def _without_rest_poses(take: Take, name: str) -> tuple[Take, Clip, dict[str, in
     left_out = {}
     if end:
         left_out["rest_pose_frames_before_seam"] = end
-        take = take.moved(take.motion.sliced(0, take.frame_count - end))
+        take = take.with_motion(take.motion.sliced(0, take.frame_count - end))
     if start:
         left_out["rest_pose_frames_after_seam"] = start
         clip = Motion.of(clip).sliced(start, clip.frame_count).as_clip(clip.skeleton, clip.frame_rate_hz)
@@ -127,7 +127,7 @@ def _same_rate(take: Take, clip: Clip) -> Take:
     """Resample a source clip to the rate of the take. Raises `EditError` if the result is too long."""
     count = count_samples(clip.frame_count, clip.frame_rate_hz, take.frame_rate_hz)
     take.require_room(take.frame_count + count)
-    return take.moved(resample_motion(motion_of(clip), clip.frame_rate_hz, take.frame_rate_hz))
+    return take.with_motion(resample_motion(motion_of(clip), clip.frame_rate_hz, take.frame_rate_hz))
 
 
 def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:

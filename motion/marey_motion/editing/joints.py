@@ -57,7 +57,7 @@ def paste(take: Take, command: Paste) -> Take:
             column = own.translated_joints.index(target)
             there = _translations_of(copied, origin, take.skeleton.offsets[target])
             translations[span, column] += shares[:, None] * (there - translations[span, column])
-    return take.moved(own._replace(rotations=rotations, translations=translations))
+    return take.with_motion(own._replace(rotations=rotations, translations=translations))
 
 
 def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> list[int]:
@@ -81,7 +81,7 @@ def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> l
 def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, count: int) -> Motion:
     """Resample the range `frames` of a clip to `count` frames. Raises `EditError` if the clip lacks these frames."""
     try:
-        start, stop = take.moved(motion_of(clip)).frames(frames)
+        start, stop = take.with_motion(motion_of(clip)).frames(frames)
     except EditError as error:
         error.where = "source_frames"
         raise
@@ -129,10 +129,10 @@ def rotate_joint(take: Take, command: RotateJoint) -> Take:
     rotations = take.motion.rotations.copy()
     if command.space == "joint":
         rotations[span, index] = quaternions.multiply(rotations[span, index], turns)
-        return take.moved(take.motion._replace(rotations=rotations))
+        return take.with_motion(take.motion._replace(rotations=rotations))
     parent = int(take.skeleton.parents[index])
     if command.space == "world" and parent >= 0:
         frame = kinematics.as_global_rotations(take.skeleton, rotations[span])[:, parent]
         turns = quaternions.multiply(quaternions.conjugate(frame), quaternions.multiply(turns, frame))
     rotations[span, index] = quaternions.multiply(turns, rotations[span, index])
-    return take.moved(take.motion._replace(rotations=np.ascontiguousarray(rotations)))
+    return take.with_motion(take.motion._replace(rotations=np.ascontiguousarray(rotations)))

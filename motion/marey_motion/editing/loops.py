@@ -61,7 +61,7 @@ def close_loop(take: Take, command: CloseLoop) -> Take:
     if command.blend_s is not None:
         life = min(life, max(1.0, command.blend_s * take.frame_rate_hz))
     closed = _closed(motion, seam, life, min(life, max(1.0, VELOCITY_S * take.frame_rate_hz)))
-    return take.moved(root_first(closed, body, carrier, root_stays=stays))
+    return take.with_motion(root_first(closed, body, carrier, root_stays=stays))
 
 
 def cut_loop(take: Take, command: CutLoop) -> Take:
@@ -93,7 +93,7 @@ def cut_loop(take: Take, command: CutLoop) -> Take:
         "travel_m": float(np.hypot(*seam.shift_m)),
         "metric": command.metric,
     }
-    return take.moved(motion).with_finding(EditFinding("cut_loop", values))
+    return take.with_motion(motion).with_finding(EditFinding("cut_loop", values))
 
 
 def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:

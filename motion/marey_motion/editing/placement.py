@@ -41,7 +41,7 @@ def translate(take: Take, command: Translate) -> Take:
     -------
     Take    F frames
     """
-    return take.moved(shifted(take.motion, np.asarray(command.shift_m)))
+    return take.with_motion(shifted(take.motion, np.asarray(command.shift_m)))
 
 
 def rotate(take: Take, command: Rotate) -> Take:
@@ -58,7 +58,7 @@ def rotate(take: Take, command: Rotate) -> Take:
     """
     turn = np.asarray(quaternions.from_axis_angle(command.axis, radians(command.angle_deg)), dtype=np.float64)
     place = np.zeros(3) if command.pivot == "origin" else body_at(take, 0)[0] * GROUND
-    return take.moved(carried(take.motion, turn, place))
+    return take.with_motion(carried(take.motion, turn, place))
 
 
 def face(take: Take, command: Face) -> Take:
@@ -79,7 +79,7 @@ def face(take: Take, command: Face) -> Take:
     """
     place, heading = body_at(take, command.frame)
     turn = about_vertical(np.asarray(radians(command.heading_deg) - heading))
-    return take.moved(carried(take.motion, turn, place))
+    return take.with_motion(carried(take.motion, turn, place))
 
 
 def move_to_origin(take: Take, command: MoveToOrigin) -> Take:
@@ -95,7 +95,7 @@ def move_to_origin(take: Take, command: MoveToOrigin) -> Take:
     Take    F frames
     """
     frame = command.frame
-    return take.moved(shifted(take.motion, -pelvis_track(take, frame, frame + 1)[0] * GROUND))
+    return take.with_motion(shifted(take.motion, -pelvis_track(take, frame, frame + 1)[0] * GROUND))
 
 
 def scale(take: Take, command: Scale) -> Take:
@@ -118,7 +118,7 @@ def scale(take: Take, command: Scale) -> Take:
     chosen = [command.translations or joint in carriers for joint in motion.translated_joints]
     scaled[:, chosen] *= command.factor
     roots = motion.root_translations * command.factor
-    return take.moved(motion._replace(root_translations=roots, translations=scaled))
+    return take.with_motion(motion._replace(root_translations=roots, translations=scaled))
 
 
 def flip_axes(take: Take, command: FlipAxes) -> Take:
@@ -137,7 +137,7 @@ def flip_axes(take: Take, command: FlipAxes) -> Take:
     """
     y, z = _direction(command.up), _direction(command.forward)
     turn = quaternions.from_matrix(np.stack((np.cross(y, z), y, z)))
-    return take.moved(carried(take.motion, np.asarray(turn, dtype=np.float64), np.zeros(3)))
+    return take.with_motion(carried(take.motion, np.asarray(turn, dtype=np.float64), np.zeros(3)))
 
 
 def carried(motion: Motion, turns: Floats, pivots: Floats, shifts: Floats | None = None) -> Motion:
@@ -276,7 +276,7 @@ def mirror(take: Take, _command: Mirror) -> Take:
     -------
     Take    the mirrored copy
     """
-    return take.moved(mirror_motion(take.skeleton, take.body.partners, take.motion))
+    return take.with_motion(mirror_motion(take.skeleton, take.body.partners, take.motion))
 
 
 def fix_drift(take: Take, command: FixDrift) -> Take:
@@ -310,4 +310,4 @@ def fix_drift(take: Take, command: FixDrift) -> Take:
     pivots = pelvis_track(take, 0, take.frame_count)
     pivots[stop:] = pivots[stop - 1]
     turns = about_vertical(shares * radians(command.turn_deg))
-    return take.moved(carried(take.motion, turns, pivots, shares[:, None] * np.asarray(command.shift_m)))
+    return take.with_motion(carried(take.motion, turns, pivots, shares[:, None] * np.asarray(command.shift_m)))

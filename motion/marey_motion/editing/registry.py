@@ -204,4 +204,4 @@ def _checked(take: Take, before: Motion) -> Take:
         require_finite(motion.root_translations)
     if motion.translations is not before.translations:
         require_finite(motion.translations)
-    return take if motion.rotations is before.rotations else take.moved(with_unit_rotations(motion))
+    return take if motion.rotations is before.rotations else take.with_motion(with_unit_rotations(motion))

@@ -75,7 +75,7 @@ def smooth(take: Take, command: Smooth) -> Take:
     steps = _smooth_positions(translations[:, moved], weights) - translations[:, moved]
     translations[span, moved] += shares[:, None, None] * steps[span]
     made = motion._replace(root_translations=root, rotations=rotations, translations=translations)
-    return take.moved(_with_kept_feet(take, made, weights, span, shares) if command.keep_feet else made)
+    return take.with_motion(_with_kept_feet(take, made, weights, span, shares) if command.keep_feet else made)
 
 
 def _with_kept_feet(take: Take, smoothed: Motion, weights: Floats, span: slice, shares: Floats) -> Motion:

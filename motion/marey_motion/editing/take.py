@@ -128,7 +128,7 @@ class Take:
         motion = self.motion
         return int(motion.root_translations.size + motion.rotations.size + motion.translations.size)
 
-    def moved(self, motion: Motion) -> Take:
+    def with_motion(self, motion: Motion) -> Take:
         """Replace the motion with another one of the same body and frame rate.
 
         Parameters
