@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Literal
 
-from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment, require_segments, wrong
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment, layer_error, require_segments
 from marey_motion.errors import AnnotationError
 
 # Segments
@@ -36,7 +36,7 @@ def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite:
     first, stop = layer.overlapping(start, end)
     covered = layer.segments[first:stop]
     if covered and not overwrite:
-        raise wrong(
+        raise layer_error(
             made,
             "segments-overlap",
             f"the new segment overlaps {covered[0]}; set overwrite, or move the other segment first",
@@ -87,7 +87,7 @@ def split_segment(layer: Layer, at: int, label: str | None) -> Layer:
     index = layer.index_at(at)
     segment = layer.segments[index]
     if at == segment.start:
-        raise wrong(segment, "empty-segment", f"the segment starts at frame {at}; split it at a later frame")
+        raise layer_error(segment, "empty-segment", f"the segment starts at frame {at}; split it at a later frame")
     rest = Segment(segment.label if label is None else label, at, segment.end)
     return layer.with_segments(index, index + 1, segment._replace(end=at), rest)
 
@@ -121,7 +121,7 @@ def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", 
         neighbour = "previous" if previous else "next"
     other = previous if neighbour == "previous" else following
     if other is None:
-        raise wrong(segment, "no-neighbour", f"the segment has no {neighbour} neighbour to merge with")
+        raise layer_error(segment, "no-neighbour", f"the segment has no {neighbour} neighbour to merge with")
     merged = Segment(segment.label, min(segment.start, other.start), max(segment.end, other.end))
     first = index if neighbour == "next" else index - 1
     return layer.with_segments(first, first + 2, merged)
@@ -151,7 +151,7 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
     segment = layer.segments[index]
     moved = segment._replace(start=to) if edge == "start" else segment._replace(end=to)
     if moved.end <= moved.start:
-        raise wrong(
+        raise layer_error(
             segment,
             "empty-segment",
             f"with its {edge} at frame {to}, the segment would have no frames; choose another frame or remove the "
@@ -166,7 +166,7 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
     elif edge == "end" and (other.start == segment.end or other.start < to):
         changed = other._replace(start=to)
     if changed.end <= changed.start:
-        raise wrong(
+        raise layer_error(
             other,
             "neighbour-in-the-way",
             f"moving the {edge} of {segment} to frame {to} would leave its neighbour {other} without frames; choose a "
@@ -321,7 +321,7 @@ def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
     AnnotationError    if the segment is not inside [start, end)
     """
     if not 0 <= start <= segment.start < segment.end <= end <= layer.frame_count:
-        raise wrong(
+        raise layer_error(
             segment,
             "outside-clip",
             f"the segment is not within the frames {start}:{end} that are kept of the clip's "
