@@ -202,7 +202,7 @@ class MeasuredReplicates:
 
 
 @dataclass(eq=False)
-class _Kept:
+class _FinishedReplicates:
     """Metrics of the replicates that have ended, and the use of clips in them."""
 
     usage: UsageTally
@@ -246,7 +246,7 @@ def run_replicates(
     searched = index or index_of(database)
     looks = LooksMeter(database, options.controller)
     runs = [run_of(trial, number, options) for trial in trials for number in range(1, options.replicates)]
-    kept = _Kept(UsageTally.of(database.clips))
+    ended = _FinishedReplicates(UsageTally.of(database.clips))
     report = progress or (lambda _done, _total, _note: None)
 
     def run(one: TrialReplicate) -> tuple[MeasuredRun, TrialRecord]:
@@ -257,11 +257,11 @@ def run_replicates(
 
     def keep(one: TrialReplicate, made: tuple[MeasuredRun, TrialRecord]) -> None:
         measured, record = made
-        kept.usage.add(database.clips, one.trial.name, record)
-        kept.runs[one.trial.name, one.replicate] = measured
-        report(len(kept.runs), len(runs), one.trial.name)
+        ended.usage.add(database.clips, one.trial.name, record)
+        ended.runs[one.trial.name, one.replicate] = measured
+        report(len(ended.runs), len(runs), one.trial.name)
 
     run_each(run, runs, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     numbers = range(1, options.replicates)
-    ordered = {trial.name: tuple(kept.runs[trial.name, number] for number in numbers) for trial in trials}
-    return MeasuredReplicates(ordered, kept.usage)
+    ordered = {trial.name: tuple(ended.runs[trial.name, number] for number in numbers) for trial in trials}
+    return MeasuredReplicates(ordered, ended.usage)
