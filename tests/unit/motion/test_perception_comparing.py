@@ -226,7 +226,7 @@ def test_near_duplicates_that_look_different_are_kept() -> None:
     slow, *_ = gaits()
     shifted = generate_gait(1.12, 0.0, 4.0)
     database = database_of({"a@1": slow, "b@1": slow, "c@1": shifted})
-    seen = find_near_duplicates(database, threshold_cm=30.0, seen=PerceivedRows(database, PAPER))
+    seen = find_near_duplicates(database, threshold_cm=30.0, perceived_rows=PerceivedRows(database, PAPER))
     by_pair = {(pair.first, pair.second): pair.perceived for pair in seen.pairs}
     assert by_pair["a@1", "b@1"] == 0.0
     others = [distance for pair, distance in by_pair.items() if "c@1" in pair]

@@ -68,7 +68,7 @@ def find_near_duplicates(
     database: MatchingDatabase,
     *,
     threshold_cm: float,
-    seen: PerceivedRows | None = None,
+    perceived_rows: PerceivedRows | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
@@ -81,8 +81,8 @@ def find_near_duplicates(
     ----------
     database : MatchingDatabase    the clips
     threshold_cm : float    greatest distance of near-duplicates (`NearDuplicate.distance_cm`), centimetres
-    seen : PerceivedRows, optional    rows of `database`, prepared for a perceptual metric; if given, the perceptual
-        distance of each pair is computed, too
+    perceived_rows : PerceivedRows, optional    rows of `database`, prepared for a perceptual metric; if given, the
+        perceptual distance of each pair is computed, too
     threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -95,7 +95,7 @@ def find_near_duplicates(
     ------
     EvaluationCancelled    if cancelled
     """
-    families = _Families(database, seen)
+    families = _Families(database, perceived_rows)
     found: list[NearDuplicate] = []
     aligned = compared = 0
 
@@ -120,8 +120,8 @@ def find_near_duplicates(
 class _Families:
     """The clips of a database, grouped by source: a clip and its mirrored copy have the same source."""
 
-    def __init__(self, database: MatchingDatabase, seen: PerceivedRows | None) -> None:
-        self._seen = seen
+    def __init__(self, database: MatchingDatabase, perceived_rows: PerceivedRows | None) -> None:
+        self._perceived_rows = perceived_rows
         families = clips_by_source(database.clips).values()
         self._clips = [database.clips[index] for own in families for index in own]
         self._family = np.repeat(np.arange(len(families)), [len(own) for own in families])
@@ -154,7 +154,11 @@ class _Families:
             aligned += 1
             distance = warped_distance(own, theirs, limit=limit_m)
             if distance <= limit_m:
-                perceived = None if self._seen is None else self._seen.distance(self._clips[one], self._clips[place])
+                perceived = (
+                    None
+                    if self._perceived_rows is None
+                    else self._perceived_rows.distance(self._clips[one], self._clips[place])
+                )
                 pair = _pair(self._clips[one], self._clips[place], distance, perceived)
                 near.setdefault(self._family[place], []).append(pair)
         nearest = [min(pairs, key=lambda pair: pair.distance_cm) for pairs in near.values()]

@@ -123,18 +123,30 @@ def suggest(
     _require_same(database, result)
     stages = _SuggestionStages(progress, cancelled)
     simulation = _simulation(database, result, how, threads, cancelled)
-    seen = None if metric is None else PerceivedRows(database, metric)
+    perceived_rows = None if metric is None else PerceivedRows(database, metric)
     unused = _unused(simulation, result)
     duplicates = find_near_duplicates(
-        database, threshold_cm=how.duplicate_cm, seen=seen, threads=threads, **stages.watch("duplicates")
+        database,
+        threshold_cm=how.duplicate_cm,
+        perceived_rows=perceived_rows,
+        threads=threads,
+        **stages.watch("duplicates"),
     )
-    threshold = _threshold(how, result, seen)
-    similarity = measure_similarity(database, result.coverage, threshold, seen=seen, **stages.watch("similarity"))
+    threshold = _threshold(how, result, perceived_rows)
+    similarity = measure_similarity(
+        database, result.coverage, threshold, perceived_rows=perceived_rows, **stages.watch("similarity")
+    )
     fillings = rank_fillings(
-        database, result.coverage, others, result.options, threshold, seen=seen, **stages.watch("filling")
+        database,
+        result.coverage,
+        others,
+        result.options,
+        threshold,
+        perceived_rows=perceived_rows,
+        **stages.watch("filling"),
     )
     gone = frozenset(clip.source for clip in unused.clips)
-    appearance = _appearance(database, how, seen, threshold, stages)
+    appearance = _appearance(database, how, perceived_rows, threshold, stages)
     redundant, plan = _redundancy(simulation, how, gone, appearance, stages)
     additions = plan_fillings(fillings, result.coverage, others, result.options)
     confirmed = confirm(
@@ -203,24 +215,28 @@ def _spared(
     return spared_sources(database, duplicates, ticks, most_perceived=most)
 
 
-def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: PerceivedRows | None) -> float:
+def _threshold(how: SuggestionOptions, result: EvaluationResult, perceived_rows: PerceivedRows | None) -> float:
     """Return the greatest distance of poses that can be blended: in metres or, with a metric, without unit."""
-    if seen is None:
+    if perceived_rows is None:
         return how.blendable_m or accepted_distance(result.records) or USUAL_BLENDABLE_M
-    return how.blendable_distance or seen.transitions(result.switches).median or indistinguishable(seen.document)
+    return (
+        how.blendable_distance
+        or perceived_rows.transitions(result.switches).median
+        or indistinguishable(perceived_rows.document)
+    )
 
 
 def _appearance(
     database: MatchingDatabase,
     how: SuggestionOptions,
-    seen: PerceivedRows | None,
+    perceived_rows: PerceivedRows | None,
     threshold: float,
     stages: _SuggestionStages,
 ) -> Appearance | None:
     """Compare the poses of all clips by the perceptual metric; None if no metric was chosen."""
-    if seen is None:
+    if perceived_rows is None:
         return None
-    return Appearance(LostPoses(database, seen, threshold, **stages.watch("lost poses")), how.lost_pose)
+    return Appearance(LostPoses(database, perceived_rows, threshold, **stages.watch("lost poses")), how.lost_pose)
 
 
 def _redundancy(
