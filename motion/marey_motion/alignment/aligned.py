@@ -110,7 +110,7 @@ class AlignedSet:
 
     @property
     def poses(self) -> Floats:
-        """Root translations (metres) and rotations of all clips, (clips, N, 3 + 4·J) float64."""
+        """Root translations (metres) and rotations (quaternions) of all clips, (clips, N, 3 + 4·J) float64."""
         return np.stack([clip.motion.poses for clip in self.clips])
 
     @property

@@ -47,7 +47,7 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
     ----------
     a : (n, P, 3) float64    points in metres, Y up
     b : (m, P, 3) float64    the same points of the other motion
-    options : CostOptions, optional    options
+    options : CostOptions, optional    kind of cost, and window
     weights : (P,), optional    non-negative weights of the points, with any sum; all equal if None
 
     Returns
@@ -78,7 +78,7 @@ def cost_points(points: Floats, options: CostOptions, weights: ArrayLike | None 
     Parameters
     ----------
     points : (n, P, 3) float64    metres, Y up
-    options : CostOptions    options
+    options : CostOptions    kind of cost, and window
     weights : (P,), optional    as in `frame_costs`
 
     Returns
@@ -116,7 +116,7 @@ def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
     Parameters
     ----------
     a, b : CostPoints    n and m frames, prepared with the same options
-    options : CostOptions    options
+    options : CostOptions    the options with which the points were prepared
 
     Returns
     -------
@@ -143,7 +143,7 @@ def require_same_points(a: NDArray[np.floating], b: NDArray[np.floating]) -> Non
     Parameters
     ----------
     a : (n, P, 3)    points of one motion
-    b : (m, P, 3)    points of the other
+    b : (m, P, 3)    points of the other motion
 
     Raises
     ------

@@ -145,8 +145,8 @@ def distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> Floats:
 
     Parameters
     ----------
-    a : (n, P, 3)    metres
-    b : (m, P, 3)    metres
+    a : (n, P, 3)    points of one motion, metres
+    b : (m, P, 3)    the same points of the other motion, metres
 
     Returns
     -------
@@ -167,8 +167,8 @@ def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: 
 
     Parameters
     ----------
-    a : (n, P, 3)    metres
-    b : (m, P, 3)    metres
+    a : (n, P, 3)    points of one motion, metres
+    b : (m, P, 3)    the same points of the other motion, metres
     limit : float    metres; the computation stops as soon as the result is certain to exceed this limit
 
     Returns
@@ -196,8 +196,8 @@ def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_p
 
     Parameters
     ----------
-    a : (n, P, 3)    metres
-    b : (m, P, 3)    metres
+    a : (n, P, 3)    points of one motion, metres
+    b : (m, P, 3)    the same points of the other motion, metres
     frames_per_box : int    frames in each box
 
     Returns

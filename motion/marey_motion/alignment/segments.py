@@ -198,7 +198,7 @@ def align_sections(
     costs : (N, M) float64    cost of each pair of a reference frame and a source frame
     reference, source : sequence of int    bounds of the sections in each motion, from 0 to N - 1 and from 0 to M - 1;
         the same number in both
-    align : callable    finds the path through the costs of one section
+    align : callable    called as align(costs of one section); returns the path through these costs
 
     Returns
     -------
