@@ -71,7 +71,7 @@ class Timing(NamedTuple):
     Parameters
     ----------
     pace : Pace    sampling of the old clip
-    before : Poses    the old clip, sampled at that pace
+    before : Poses    the samples of the old clip
     matching : Matching    pairs of frames of the sampled clip and of the new clip
     """
 
@@ -170,10 +170,10 @@ def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Ti
 
 
 def _rounded(start: float, step: float, count: int) -> Pace:
-    """Convert a line to a pace: frame n of the new clip is at place `start` + n·`step` of the old clip.
+    """Convert a fitted line to a sampling of the old clip: sample n is at frame `start` + n·`step`.
 
-    The pace is rounded to a simple fraction, and the start to a whole frame, if rounding moves none of the `count`
-    frames by more than `ROUNDED_FRAMES`.
+    The rate is rounded to a simple fraction, and the start to a whole frame, if rounding moves none of the `count`
+    samples by more than `ROUNDED_FRAMES` frames.
     """
     pace = 1.0 / step
     simple = float(Fraction(pace).limit_denominator(1000))
