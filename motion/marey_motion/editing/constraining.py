@@ -300,7 +300,7 @@ class _Cluster:
         neighbours: Neighbours,
         solved: Callable[[Motion, Sequence[Target], Neighbours], Motion],
     ) -> Motion:
-        """Solve runs of frames in which the limb jumps again, for smoother targets.
+        """Replace the solution in runs of frames in which the limb jumps by the solution for smoother targets.
 
         `given` is the motion before it is solved, and `made` is the solution for `targets`. Returns `made` if the
         position target has a pole or an offset.

@@ -37,7 +37,7 @@ def split(take: Take, command: Split) -> tuple[Take, ...]:
     Parameters
     ----------
     take : Take    F frames
-    command : Split    the cuts
+    command : Split    frames at which the take is cut: the first frame of each piece but the first
 
     Returns
     -------

@@ -87,7 +87,7 @@ def with_feet(
 
     Parameters
     ----------
-    take : Take    the skeleton
+    take : Take    take whose skeleton and compute budget are used
     motion : Motion    F frames
     feet : sequence of Foot    n feet
     wanted : Motion    positions and rotations of the ankles in F frames, as a motion that `feet_as_motion` makes

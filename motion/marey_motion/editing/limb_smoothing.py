@@ -153,10 +153,10 @@ class LimbSmoother:
         return np.asarray(np.where(turning[:, None], np.maximum(sizes, least)[:, None] * slowed, vectors))
 
     def _evened(self, vectors: Floats, jumps: Flags, width: int) -> Floats:
-        """Smooth the path of the limb's end near jumps by a moving mean over about `width` frames.
+        """Smooth the path of the limb's end near jumps by a Gaussian filter.
 
-        `vectors` (n, 3) are the positions of the path relative to the limb's first joint; `jumps` (n,) are the frames
-        next to a jump.
+        `vectors` (n, 3) are the positions of the path relative to the limb's first joint, `jumps` (n,) are the frames
+        next to a jump, and `width` is the standard deviation of the filter in frames.
         """
         from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 

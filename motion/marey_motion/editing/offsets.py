@@ -131,7 +131,7 @@ def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
     Returns
     -------
     offset : PoseOffset    offset for the first frame of `after`
-    velocity : PoseOffset    per frame
+    velocity : PoseOffset    initial change of the offset per frame
     """
     arrival, departure = step_of(before, max(0, before.frame_count - 2)), step_of(after, 0)
     velocity = arrival.minus(departure).times(0.5)
@@ -171,7 +171,7 @@ def decayed_offset(
     Parameters
     ----------
     offset : PoseOffset    of one pose
-    velocity : PoseOffset    per frame
+    velocity : PoseOffset    initial change of the offset per frame
     ages : (n,) float64    frames since the start
     life, velocity_life : float    frames after which the contribution of the initial value, or of the velocity, is zero
 

@@ -45,7 +45,7 @@ def translate(take: Take, command: Translate) -> Take:
 
 
 def rotate(take: Take, command: Rotate) -> Take:
-    """Rotate the motion about an axis of the world.
+    """Rotate the whole motion about an axis, which is given in the world and passes through a pivot.
 
     Parameters
     ----------

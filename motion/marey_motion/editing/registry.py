@@ -142,7 +142,7 @@ def edit_clip(
 
 
 def apply_edit(clip: Clip, commands: Sequence[AnyCommand], **given: Any) -> Clip:
-    """Apply commands that make exactly one clip to a clip (see `edit_clip`), and return the edited clip.
+    """Apply commands to a clip, and return the single clip that they make (see `edit_clip`).
 
     Parameters
     ----------

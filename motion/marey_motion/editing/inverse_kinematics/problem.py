@@ -103,7 +103,7 @@ class DescentScratch(NamedTuple):
 
 
 class LeastSquaresScratch(NamedTuple):
-    """Scratch arrays of least squares: for one pose, as in `DescentScratch`, and for a step with n unknowns and m errors.
+    """Scratch arrays of the least-squares solver: for one pose, as in `DescentScratch`, and for one step.
 
     The unknowns are displacements of the pose from the pose at the start, `first` and `first_root`. `trial` and
     `trial_root` are the pose after a step; the other arrays are terms of the equations of the step.
@@ -172,7 +172,7 @@ class IkProblem(NamedTuple):
 
         Returns
         -------
-        named tuple    scratch arrays
+        LeastSquaresScratch    scratch arrays
         """
         movable = int(self.body.movable.sum())
         joints, unknowns, errors = len(self.joints), 3 * movable + 3, 3 * len(self.targets.kinds)

@@ -55,7 +55,7 @@ class SolvedPoses:
     motion : the frames, with the joints turned
     residual_before, residual_after : (F, C) error of each target before and after, in metres (position) or radians
         (orientation, look-at)
-    iterations : (F,) number of sweeps (ccd) or steps (least squares) in each frame
+    iterations : (F,) number of sweeps (ccd) or steps (least squares) in each frame; 0 or 1 for the two-bone solver
     reached : (F,) whether all targets are met within the tolerances
     """
 

@@ -94,8 +94,8 @@ def _bent(upper, fore, goal, hinge):
 def _turn_from_hinge(along, across, cosine, goal):
     """Compute the angle, about the upper bone, from a limb's hinge to the axis about which the limb is to bend.
 
-    `goal` is the bend in radians. A nearly straight limb, even a little overstretched, bends about its hinge and
-    keeps an existing bend to the side. A bent limb continues to bend about the axis of its present bend.
+    `goal` is the desired bend in radians. A nearly straight limb, even a little overstretched, bends about its hinge
+    and keeps an existing bend to the side. A bent limb continues to bend about the axis of its present bend.
 
     Parameters
     ----------
