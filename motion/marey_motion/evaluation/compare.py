@@ -118,7 +118,7 @@ class Comparison:
     Parameters
     ----------
     metrics : changes of the metrics that exist in both evaluations, in alphabetical order
-    changed : the trials whose records differ, in the suite's order
+    changed : the trials whose simulations differ, in the order of the suite
     removed, added : uids of the clips that are only in the first set, or only in the second
     newly_unused : uids of clips that are in both sets, but were used only in the first evaluation
     coverage_change_s : (V, O) float64    seconds of data gained per cell of the coverage map

@@ -136,8 +136,8 @@ class Judgement:
     ----------
     grade : str    one of `GRADES`
     trials : tuple of TrialVerdict    in the order of the suite
-    looks_measured : bool    False for results of versions that did not measure looks; their trials are judged by place,
-        speed and turn rate only
+    looks_measured : bool    False for results of old versions, which did not measure how the motion looks; their trials
+        are judged by place, speed and turn rate only
     """
 
     grade: str

@@ -70,11 +70,11 @@ class LooksMeter:
         self.clips = clip_looks(database)
 
     def measure(self, record: TrialRecord, window: Flags) -> dict[str, float | None]:
-        """Measure the looks of a trial.
+        """Measure how the simulated motion of a trial looks: feet, steps on the spot, and smoothness.
 
         Parameters
         ----------
-        record : TrialRecord    T ticks
+        record : TrialRecord    T simulated ticks
         window : (T - 1,) bool    the steps that count; step k leads from tick k to tick k + 1
 
         Returns

@@ -81,7 +81,7 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
     ----------
     trial : Trial    the trial
     reference : Reference    trajectory of the trial
-    record : TrialRecord    T ticks
+    record : TrialRecord    T simulated ticks
 
     Returns
     -------
@@ -138,7 +138,7 @@ def measure_trial(
     ----------
     trial : Trial    the trial
     reference : Reference    trajectory of the trial
-    record : TrialRecord    T ticks
+    record : TrialRecord    T simulated ticks
     options : EvaluationOptions    options of the evaluation
     looks : LooksMeter, optional    measurement of feet and smoothness over the database of the record; if None, these
         metrics are left out

@@ -46,8 +46,8 @@ Of two equally distant cells, the cell that lacks more seconds comes first.
 class PerformerState:
     """Position of the performer in the newest frame, and mean motion in the newest window.
 
-    `window` is None until a window exists. The position is on the ground, in metres; the heading is in radians; strafe
-    is positive to the left.
+    `window` is None until a window exists. The position is on the ground, in metres. The heading is in radians, 0 along
+    +z and positive to the left; strafe is positive to the left.
     """
 
     x_m: float

@@ -67,7 +67,7 @@ def _drawn(options: EvaluationOptions) -> list[dict[str, int]]:
 def require_comparable(
     before: Provenance, after: Provenance, options: Mapping[str, Sequence[str]] | None = None
 ) -> None:
-    """Check that the cost functions, options and scenarios of two evaluations agree.
+    """Check that the normalisers, options, scenarios and limits of two evaluations agree.
 
     Parameters
     ----------

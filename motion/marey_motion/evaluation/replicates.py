@@ -51,7 +51,7 @@ class TrialReplicate:
 
 
 def run_of(trial: Trial, replicate: int, options: EvaluationOptions) -> TrialReplicate:
-    """Draw one replicate of a trial.
+    """Draw the start and the approach of one replicate of a trial.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
     Parameters
     ----------
     trial : Trial    the trial
-    database : MatchingDatabase    frame rate and look-ahead
+    database : MatchingDatabase    frame rate, and horizons up to which its features look ahead
 
     Returns
     -------
@@ -121,7 +121,7 @@ def measure_run(
     options : EvaluationOptions    options of the evaluation
     looks : LooksMeter    measurement of feet and smoothness over the database
     run : TrialReplicate    the replicate
-    record : TrialRecord    its record
+    record : TrialRecord    simulated ticks of the replicate
 
     Returns
     -------

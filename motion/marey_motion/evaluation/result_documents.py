@@ -209,7 +209,7 @@ def _usage(tree: Mapping[str, Any], clips: Sequence[DatabaseClip]) -> tuple[Clip
 
 
 def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> Tree:
-    """Join the records of all or some trials into a few large arrays.
+    """Join the simulated ticks of all or some trials into a few large arrays.
 
     Record r has the ticks [starts[r], starts[r + 1]). Costs are not defined at every tick. Each cost is stored
     as two arrays: the ticks at which it is defined, counted over all records, and its values at these ticks.
@@ -217,7 +217,7 @@ def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> 
     Parameters
     ----------
     trials : sequence of Trial    R trials
-    records : sequence of TrialRecord    their records
+    records : sequence of TrialRecord    simulated ticks of each trial
 
     Returns
     -------
@@ -247,7 +247,7 @@ def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> 
 
 
 def records_from_tree(tree: Mapping[str, Any]) -> dict[str, TrialRecord]:
-    """Make the records of trials from the content of their document.
+    """Read the simulated ticks of trials from the content of their document.
 
     Parameters
     ----------

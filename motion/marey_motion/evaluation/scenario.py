@@ -40,9 +40,9 @@ class Trial:
     the second speed: 0 in `stopping` trials, ignored in families with one speed. `angle_rad` is the angle of the
     corners, or from the heading to the direction of travel.
 
-    A trial along a take has the members `left_out`, the uid of the take, which is not in the set; `label`, its name;
-    and `path`, keys of x and z in metres and heading in radians, `KEY_RATE_HZ` per second, from (0, 0, 0) on. Its speed
-    is the mean speed of the path.
+    A trial along a take has three more members: `left_out` is the uid of the take, which the trial must not use;
+    `label` is the name of the take; and `path` contains its keys, x and z in metres and heading in radians,
+    `KEY_RATE_HZ` per second, from (0, 0, 0) on. The speed of such a trial is the mean speed of the path.
     """
 
     family: Family
@@ -119,7 +119,8 @@ class Reference:
     headings : (T + L,) float64    facing direction in radians; continuous, except at corners
     speeds_m_s : (T + L,) float64    speed of the step that follows each tick
     turn_rates_rad_s : (T + L,) float64    turn rate of this step; a corner is turned within one step
-    directions : (T + L,) float64    direction of travel in radians; differs from the heading only while strafing
+    directions : (T + L,) float64    direction of travel in radians; differs from the heading while strafing, and along
+        takes
     """
 
     rate_hz: float
@@ -166,7 +167,7 @@ def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
 
 
 def require_names(trials: Iterable[Trial]) -> None:
-    """Check that trials have different names, since records are stored by name.
+    """Check that trials have different names, since their results are stored by name.
 
     Parameters
     ----------
@@ -188,7 +189,7 @@ def require_names(trials: Iterable[Trial]) -> None:
 
 
 def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float = LOOK_AHEAD_S) -> Reference:
-    """Compute a trial's trajectory in closed form, sampled at t = tick / rate_hz.
+    """Compute a trial's trajectory, sampled at the times tick / rate_hz.
 
     Parameters
     ----------

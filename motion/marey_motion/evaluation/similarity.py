@@ -66,7 +66,7 @@ def accepted_distance(records: Sequence[TrialRecord]) -> float | None:
 
     Parameters
     ----------
-    records : sequence of TrialRecord    the trials
+    records : sequence of TrialRecord    simulated ticks of each trial
 
     Returns
     -------
@@ -161,7 +161,7 @@ def every_kth(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
     Returns
     -------
-    (m,) int64    every k-th row, with the smallest possible k
+    (m,) int64    every k-th row, with the smallest k that keeps at most `most` rows
     """
     return rows[:: max(1, -(-len(rows) // most))]
 

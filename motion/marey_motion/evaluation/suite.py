@@ -64,7 +64,7 @@ def run_suite(
     index : SearchIndex, optional    index of the database's normalised features, built if None
     threads : int, optional    number of trials at a time; one per processor if None
     progress : callable, optional    called as progress(trials done, total, name of the last trial)
-    finished : callable, optional    called with each trial and its record as soon as the trial ends
+    finished : callable, optional    called with each trial and its simulated ticks as soon as the trial ends
     cancelled : callable, optional    called before trials are started; returns True to stop
 
     Returns
@@ -277,7 +277,7 @@ def baseline_replicates(options: EvaluationOptions) -> int:
 
     Returns
     -------
-    int    at most as many as an interval needs, since the baseline is not compared by a test
+    int    that of the evaluation, but at most as many as a confidence interval needs
     """
     return min(options.replicates, LEAST_REPLICATES)
 

@@ -33,8 +33,8 @@ class NearDuplicate:
     ----------
     first, second : uids of the source clips
     first_name, second_name : names of the clips
-    distance_cm : distance of the two motions in centimetres: the mean distance of corresponding points, over the frames
-        that the best alignment in time matches
+    distance_cm : distance of the two motions in centimetres: the mean distances of corresponding points, summed along
+        the best alignment in time and divided by the frames of the longer clip
     same_content : whether both are the same frames of clips with equal content
     mirrored : whether the first motion is nearly the mirror image of the second
     perceived : perceptual distance of the two motions; None without a metric

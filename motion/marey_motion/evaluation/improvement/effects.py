@@ -51,7 +51,7 @@ def estimation_replicates(options: ConfirmedEffects) -> range:
 
     Parameters
     ----------
-    options : ConfirmedEffects    how many
+    options : ConfirmedEffects    numbers of replicates
 
     Returns
     -------
@@ -67,7 +67,7 @@ def confirmation_replicates(options: ConfirmedEffects, evaluation: EvaluationOpt
 
     Parameters
     ----------
-    options : ConfirmedEffects    how many
+    options : ConfirmedEffects    numbers of replicates
     evaluation : EvaluationOptions    options of the evaluation whose set is improved
     turn : int    0 for the first confirmation, 1 for a second confirmation in different replicates
 

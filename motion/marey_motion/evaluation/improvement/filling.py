@@ -159,7 +159,7 @@ def plan_fillings(
     ----------
     fillings : sequence of Filling    result of `rank_fillings`
     coverage : Coverage    coverage of the set
-    collections : mapping of str to MatchingDatabase    by name
+    collections : mapping of str to MatchingDatabase    databases by name, as for `rank_fillings`
     options : EvaluationOptions    grid and minimum seconds per cell
 
     Returns

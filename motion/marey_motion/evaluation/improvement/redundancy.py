@@ -88,7 +88,7 @@ def leave_one_out(
     Parameters
     ----------
     simulation : Resimulation    the suite over the set
-    objective : ObjectiveOptions    measure of harm
+    objective : ObjectiveOptions    weights of the objective, whose change is the harm
     removed : collection of str    sources that are removed already
     consider : int, optional    number of sources to try; sources that fewer trials need come first, then the order is
         that of the uids; all if None
@@ -139,7 +139,7 @@ def plan_removals(
     ----------
     simulation : Resimulation    the suite over the set
     count : int    largest number of removals
-    objective : ObjectiveOptions    measure of harm
+    objective : ObjectiveOptions    weights of the objective, whose change is the harm
     removed : collection of str    sources that are removed already
     consider, appearance : optional    as for `leave_one_out`
     progress : callable, optional    called as progress(steps done, total, uid)

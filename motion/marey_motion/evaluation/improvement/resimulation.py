@@ -269,7 +269,7 @@ def needed_rows(
     database : MatchingDatabase    the clips
     index : SearchIndex    the index that the trial was run with
     trial : Trial    the trial
-    record : TrialRecord    record of the trial
+    record : TrialRecord    simulated ticks of the trial
     options : EvaluationOptions    options of the evaluation
 
     Returns

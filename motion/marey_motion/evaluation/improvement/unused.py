@@ -101,7 +101,7 @@ def find_unused(
     ----------
     database : MatchingDatabase    the clips
     trials : sequence of Trial    the trials
-    records : sequence of TrialRecord    their records
+    records : sequence of TrialRecord    simulated ticks of each trial
     options : EvaluationOptions    options of the evaluation
     index : SearchIndex, optional    the index that the trials were run with, built if None
     shown : (N,) bool, optional    rows that were displayed in replicates without a record, and are needed, too
