@@ -67,12 +67,12 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
 
 def align_cyclic(costs: ArrayLike, *, max_run: int) -> tuple[Alignment, int]:
-    """Try every frame of a cyclic second motion as its first, and find the path with the least mean cost.
+    """Find the path with the least mean cost if the second motion is cyclic, so that it may start at any of its frames.
 
     Parameters
     ----------
     costs : (n, m) float    finite costs of each pair of frames
-    max_run : int    as for `align`
+    max_run : int    maximum number of consecutive steps that advance only one motion, as for `align`
 
     Returns
     -------
@@ -81,7 +81,7 @@ def align_cyclic(costs: ArrayLike, *, max_run: int) -> tuple[Alignment, int]:
 
     Raises
     ------
-    MotionError    as `align`
+    MotionError    for the same reasons as in `align`
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
