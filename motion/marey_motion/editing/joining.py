@@ -1,4 +1,4 @@
-"""The command that joins two takes."""
+"""Edit command that appends a clip to a take: `concatenate`."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None 
 
 
 def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
-    """Compute the speed of the slowest point of a foot, without outliers.
+    """Compute the speed of the slowest point of a foot in each frame, and remove outliers by a median filter.
 
     While a foot rolls from heel strike to toe off, first its heel does not move, then its toe. The ankle is close to
     the heel, so the slower of ankle and toe is slow during the whole contact.

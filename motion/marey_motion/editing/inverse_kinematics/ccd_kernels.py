@@ -254,9 +254,9 @@ def _sweep(body, targets, frame, local, work):
 def _descend_frame(body, targets, frame, offsets, ends, carried, local, root, best, work, before, after):
     """Solve one frame: change the pose `local` (K, 4) in place.
 
-    `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `descend`. If `carried`, the
-    solver starts with the pose `best` (K, 4), which is overwritten. Returns the number of sweeps, and whether all
-    targets are reached.
+    `before` and `after` (C,) are filled with the errors of the targets; `ends` are the stopping criteria (see
+    `descend`). If `carried`, the solver starts with the pose `best` (K, 4), which is overwritten. Returns the number of
+    sweeps, and whether all targets are reached.
     """
     most_sweeps, tolerance_m, tolerance_rad = ends
     cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
@@ -290,9 +290,10 @@ def _descend_frame(body, targets, frame, offsets, ends, carried, local, root, be
 def descend(body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found):
     """Solve the frames `order` (n,) in this order; change `rotations` (F, K, 4) and fill the `SolverResult` `found`.
 
-    `given_rotations` and `given_roots` are the poses of all frames before they were solved; `carried` is as in
-    `least_squares_kernels.solve_frames`. `ends` holds the three stopping criteria: the maximum number of sweeps, and
-    the tolerances in metres and in radians.
+    `given_rotations` and `given_roots` are the poses of all frames before they were solved. If `carried[i]` is at least
+    0, frame `order[i]` is solved from its given pose, changed as frame `carried[i]` was changed; otherwise, it is
+    solved from its given pose. `ends` holds the three stopping criteria: the maximum number of sweeps, and the
+    tolerances in metres and in radians.
     """
     best = np.empty(rotations.shape[1:])
     for n in range(order.shape[0]):

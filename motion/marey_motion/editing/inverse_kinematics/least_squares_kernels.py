@@ -245,9 +245,9 @@ def _try_step(body, damping, local, root, work):
 def _solve_frame(body, targets, frame, offsets, ends, carried, local, root, work, before, after):
     """Solve one frame: change the pose `local` (K, 4) and `root` (3,) in place.
 
-    `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `solve_frames`. If `carried`,
-    the solver starts with the pose `work.trial` and `work.trial_root`, and changes it as little as possible. Returns
-    the number of steps tried, and whether all targets are reached.
+    `before` and `after` (C,) are filled with the errors of the targets; `ends` are the stopping criteria (see
+    `solve_frames`). If `carried`, the solver starts with the pose `work.trial` and `work.trial_root`, and changes it as
+    little as possible. Returns the number of steps tried, and whether all targets are reached.
     """
     most_steps, tolerance_m, tolerance_rad = ends
     work.first[:] = local
