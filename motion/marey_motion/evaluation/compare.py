@@ -28,7 +28,7 @@ SAME_CHANGE = 1e-12
 """Relative difference up to which two values count as equal, because rounding can cause a difference of this size."""
 
 OBJECTIVE = "objective"
-"""Name of the objective of an improvement, whose change is reported in metres, in the form of a `MetricChange`."""
+"""Name under which the change of an objective (`improvement.objective`), in metres, is reported as `MetricChange`."""
 
 LESS_IS_BETTER = (
     OBJECTIVE,

@@ -154,7 +154,7 @@ def cell_deficits(seconds: Floats, least_s: float, window_s: float) -> Floats:
 
     Returns
     -------
-    (V, O) float64    seconds
+    (V, O) float64    seconds; a cell that lacks less than half of `window_s` lacks nothing
     """
     deficits = np.maximum(least_s - seconds, 0.0)
     # A whole number of windows is meant, however its seconds are rounded.

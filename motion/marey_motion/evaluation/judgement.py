@@ -293,7 +293,7 @@ def _check(measure: Measure, metrics: Metrics, metric: str, limit: float) -> Lim
 def mean_speed_m_s(trial: Trial) -> float:
     """Compute the mean desired speed of a trial after its approach.
 
-    If the desired speed alternates, the path begins at the base speed.
+    If the desired speed alternates, the first period after the approach has the base speed.
 
     Parameters
     ----------
