@@ -16,7 +16,7 @@ from marey_motion.editing.limb_smoothing import MOST_STEP
 
 @dataclass(frozen=True)
 class JoinedWindows:
-    """Two successive constraints of one joint, whose windows were shortened because the joint would jump between them.
+    """Two successive constraints of one joint, whose ranges of frames (windows) are too close for a smooth change.
 
     Parameters
     ----------
