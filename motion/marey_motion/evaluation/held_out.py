@@ -80,9 +80,10 @@ def _trial(clip: DatabaseClip, path: Floats, options: EvaluationOptions, names: 
 
 
 def _path_of(database: MatchingDatabase, clip: DatabaseClip, longest_s: float) -> Floats | None:
-    """Return the beginning of a clip's path as keys of x, z and heading (K, 3); None if it is too short.
+    """Return the beginning of a clip's path as keys of x, z and heading (K, 3), in metres and radians.
 
-    The path starts at the origin with the heading 0.
+    The path starts at the origin with the heading 0. Returns None if the clip is too short, travels too little, or
+    shows walking in place.
     """
     rate_hz, rows = database.options.rate_hz, slice(clip.start, clip.stop)
     seconds = min(longest_s, (clip.frame_count - 1) / rate_hz - LOOK_AHEAD_S)

@@ -190,7 +190,7 @@ def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
 def spared_sources(
     database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int], *, most_perceived: float = np.inf
 ) -> tuple[tuple[str, NearDuplicate], ...]:
-    """Choose the source clips that can be spared: after their removal, no pair of near-duplicates is left.
+    """Choose the source clips that can be spared: after their removal, no near-duplicates that look alike are left.
 
     Of each pair, the source that is displayed for fewer ticks is removed. If the numbers of ticks are equal, the
     shorter source is removed; if the durations are equal, too, the source with the higher uid is removed.

@@ -145,7 +145,7 @@ class Resimulation:
 
         Returns
         -------
-        tuple of TrialResult    one per run, in the order of `outcomes`
+        tuple of TrialResult    one per run: all trials of the first replicate, in their order, then all of the next
         """
         return tuple(outcome.result for outcome in self.outcomes(removed))
 

@@ -45,7 +45,7 @@ from marey_schemas.options.improvement import SuggestionOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 USUAL_BLENDABLE_M = 0.5
-"""Largest blendable distance that is used if a suite made no transition from which the distance could be measured.
+"""Distance up to which poses count as blendable if the suite made no transition that shows this distance.
 
 The distance is a pose cost, in metres, summed over seven joints.
 """
