@@ -73,7 +73,7 @@ def run_of(trial: Trial, replicate: int, options: EvaluationOptions) -> TrialRep
     return TrialReplicate(trial, replicate, replace(trial, approach_s=approach_s), round(later * START_S * rate_hz))
 
 
-def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
+def trajectory_for(trial: Trial, database: MatchingDatabase) -> Reference:
     """Compute a trial's trajectory, extended beyond the end of the trial by the look-ahead of the database.
 
     Parameters
@@ -105,9 +105,9 @@ def simulate(
     -------
     TrialRecord    displayed row, position, heading and costs at each tick
     """
-    guide = guide_for(run.driven, database)
+    trajectory = trajectory_for(run.driven, database)
     own = index_for(database, index, run.trial)
-    return run_trial(database, own, guide, options.controller, start_ticks=run.start_ticks)
+    return run_trial(database, own, trajectory, options.controller, start_ticks=run.start_ticks)
 
 
 def measure_run(

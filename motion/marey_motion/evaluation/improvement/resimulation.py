@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from marey_motion.evaluation.held_out import index_for
 from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
 from marey_motion.evaluation.looks import LooksMeter
-from marey_motion.evaluation.replicates import TrialReplicate, guide_for, measure_run, run_of, simulate
+from marey_motion.evaluation.replicates import TrialReplicate, measure_run, run_of, simulate, trajectory_for
 from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.running import CancelCallback, ProgressCallback, run_each
 from marey_motion.evaluation.scenario import Trial, require_names, suite_trials
@@ -282,7 +282,7 @@ def needed_rows(
     rows = [record.rows.astype(np.int64), chosen[chosen >= 0]]
     # What the last search chose is not displayed any more when it was made at the last tick.
     if not np.isnan(record.match_cost[-1]):
-        asked, last = guide_for(trial, database), len(record.rows) - 1
+        asked, last = trajectory_for(trial, database), len(record.rows) - 1
         own = index_for(database, index, trial)
         reason = explain_choice(database, own, asked, options.controller, record, last, count=1)
         rows.append(np.array([reason.chosen]))
