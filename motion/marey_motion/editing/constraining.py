@@ -15,7 +15,7 @@ import numpy as np
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats, Ints
-from marey_motion.editing.compute_budget import PER_MEETING, PER_MET_NUMBER, ComputeBudget
+from marey_motion.editing.compute_budget import PER_CONSTRAINED_NUMBER, PER_CONSTRAINT_GROUP, ComputeBudget
 from marey_motion.editing.displacement import displace, windows_around
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_targets
 from marey_motion.editing.inverse_kinematics.solving import measure_residuals, solve
@@ -36,7 +36,7 @@ from marey_schemas.editing.constraints import Solver
 
 MOST_ROUNDS = 12
 """Maximum number of rounds in which constraints on different ranges of frames are solved one after another."""
-SETTLED = 1e-3
+SMALL_ERROR = 1e-3
 """Error, in metres or radians, below which all constraints must be for the rounds to end early."""
 _PER_FRAME = 40_000
 """Work per frame, in nanoseconds, to prepare the arrays, measure the errors and evaluate closed forms."""
@@ -241,12 +241,12 @@ class _Cluster:
         for _ in range(MOST_ROUNDS if len(spans) > 1 else 0):
             for together in spans.values():
                 motion = self._met(motion, together, blend_frames)
-            if max(residuals_of(self.skeleton, motion, one).max() for one in self.constraints) < SETTLED:
+            if max(residuals_of(self.skeleton, motion, one).max() for one in self.constraints) < SMALL_ERROR:
                 break
         return self._met(motion, self.constraints, blend_frames)
 
     def _met(self, motion: Motion, constraints: Sequence[Constraint], blend_frames: int) -> Motion:
-        self.budget.spend(PER_MEETING + PER_MET_NUMBER * motion.rotations.size)
+        self.budget.spend(PER_CONSTRAINT_GROUP + PER_CONSTRAINED_NUMBER * motion.rotations.size)
         frames = np.unique(np.concatenate([np.arange(one.start, one.stop) for one in constraints]))
         active = np.array([(frames >= one.start) & (frames < one.stop) for one in constraints])
         given = motion.at_frames(frames)
