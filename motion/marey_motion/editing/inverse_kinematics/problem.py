@@ -118,13 +118,13 @@ class LeastSquaresScratch(NamedTuple):
     first_root: Floats
     trial: Floats
     trial_root: Floats
-    holding: Floats
+    displacement_weights: Floats
     displacement: Floats
     gradient: Floats
     step: Floats
-    softness: Floats
+    inverse_diagonal: Floats
     jacobian: Floats
-    softened: Floats
+    scaled_rows: Floats
     scaled_errors: Floats
     right: Floats
     matrix: Floats
@@ -176,21 +176,21 @@ class IkProblem(NamedTuple):
         """
         movable = int(self.body.movable.sum())
         joints, unknowns, errors = len(self.joints), 3 * movable + 3, 3 * len(self.targets.kinds)
-        holding = np.full(unknowns, regularisation_m**2)
-        holding[:-3] /= np.repeat((1.0 - self.body.stiffness[self.body.movable]) ** 2, 3)
+        displacement_weights = np.full(unknowns, regularisation_m**2)
+        displacement_weights[:-3] /= np.repeat((1.0 - self.body.stiffness[self.body.movable]) ** 2, 3)
         return LeastSquaresScratch(
             **self._pose_room(),
             first=np.zeros((joints, 4)),
             first_root=np.zeros(3),
             trial=np.zeros((joints, 4)),
             trial_root=np.zeros(3),
-            holding=holding,
+            displacement_weights=displacement_weights,
             displacement=np.zeros(unknowns),
             gradient=np.zeros(unknowns),
             step=np.zeros(unknowns),
-            softness=np.zeros(unknowns),
+            inverse_diagonal=np.zeros(unknowns),
             jacobian=np.zeros((errors, unknowns)),
-            softened=np.zeros((errors, unknowns)),
+            scaled_rows=np.zeros((errors, unknowns)),
             scaled_errors=np.zeros(errors),
             right=np.zeros(errors),
             matrix=np.zeros((errors, errors)),
