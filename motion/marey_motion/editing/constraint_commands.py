@@ -92,7 +92,7 @@ def constrain(take: Take, command: Constrain) -> Take:
     if blend > take.frame_count:
         warnings.append(f"the blend of {command.blend_s:g} s is longer than the clip")
     for warning in warnings:
-        edited = edited.warned("constrain", warning)
+        edited = edited.with_warning("constrain", warning)
     return edited
 
 

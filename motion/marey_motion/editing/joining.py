@@ -64,7 +64,9 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     if left_out:
         take = take.with_finding(EditFinding("concatenate", left_out))
     if command.blend_s * take.frame_rate_hz > min(before.frame_count, after.frame_count):
-        take = take.warned("concatenate", f"the blend of {command.blend_s:g} s is longer than one of the two clips")
+        take = take.with_warning(
+            "concatenate", f"the blend of {command.blend_s:g} s is longer than one of the two clips"
+        )
     if command.place == "keep" and count == 0:
         return take.with_motion(_in_a_row(first, second))
     seam = _seam(before, after, overlap) if command.place == "seam" else LoopSeam(0.0, np.zeros(2))
@@ -77,7 +79,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     if command.keep_feet and count:
         joined = _with_kept_feet(take, first, second, joined, overlap, count)
     fast = _fastest(take.skeleton, first, second, joined) if count else None
-    return take.with_motion(joined) if fast is None else take.with_motion(joined).warned("concatenate", fast)
+    return take.with_motion(joined) if fast is None else take.with_motion(joined).with_warning("concatenate", fast)
 
 
 def _fastest(skeleton: Skeleton, first: Motion, second: Motion, joined: Motion) -> str | None:

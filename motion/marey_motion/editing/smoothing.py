@@ -61,7 +61,7 @@ def smooth(take: Take, command: Smooth) -> Take:
     columns = slice(None) if command.joints is None else chosen
     weights = _weights(take, command)
     if command.window_s * take.frame_rate_hz > 2.0 * take.frame_count:
-        take = take.warned(
+        take = take.with_warning(
             "smooth", f"the window of {command.window_s:g} s is longer than the clip, so it was shortened"
         )
     take.budget.spend(take.size * min(PER_TAP * len(weights), MOST_OF_TAPS))

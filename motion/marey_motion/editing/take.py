@@ -154,7 +154,7 @@ class Take:
         """
         return replace(self, findings=(*self.findings, finding))
 
-    def warned(self, command: str, warning: str) -> Take:
+    def with_warning(self, command: str, warning: str) -> Take:
         """Add a finding that warns of a parameter that does not fit the motion.
 
         Parameters
