@@ -199,7 +199,7 @@ class _Aligning:
             keyframes=reference.sections.keyframes,
         )
 
-    # -- what fits --
+    # -- checks and preparation --
 
     def _require_options(self, clips: Sequence[SourceExample]) -> None:
         repeated = [uid for uid, count in Counter(one.uid for one in clips).items() if count > 1]

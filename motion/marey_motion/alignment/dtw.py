@@ -17,7 +17,7 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 
 FRAMES_PER_BOX = 16
-# A bound is a sum of many terms: lowered by more than its rounding, it stays one.
+# Lower bounds are sums of many terms; they are lowered by more than their rounding errors, so that they remain bounds.
 _ROUNDING_SLACK = 1.0 - 1e-9
 
 
@@ -127,7 +127,7 @@ def _checked(costs: ArrayLike, max_run: int | None) -> Floats:
         raise MotionError(
             f"the costs must be a matrix with at least one row and one column, but have the shape {matrix.shape}"
         )
-    # Least and greatest are found without a matrix of answers, which would take longer than the alignment.
+    # The least and the greatest cost suffice; a matrix of flags would take longer than the alignment.
     if not (np.isfinite(matrix.min()) and np.isfinite(matrix.max())):
         raise MotionError(
             "a cost is infinite or not a number", where=f"cell {np.argwhere(~np.isfinite(matrix))[0].tolist()}"

@@ -6,7 +6,7 @@ import numpy as np
 
 from marey_motion.kernels import compiled
 
-# Steps by which a cell is reached; of equal costs the lowest wins.
+# Steps that lead to a cell; if costs are equal, the lowest number is chosen.
 BOTH, FIRST, SECOND = 0, 1, 2
 LANES = 4
 
@@ -19,7 +19,7 @@ def align(costs, path):
     """
     n, m = costs.shape
     steps = np.empty((n, m), np.uint8)
-    # The row before a block and those of the block, with a border from which no path comes, except into the first cell.
+    # The row before a block and the rows of the block, with an infinite border; only the first cell has a start.
     totals = np.full((LANES + 1, m + 1), np.inf)
     totals[0, 0] = 0.0
     whole = n - n % LANES if m >= LANES else 0
