@@ -132,7 +132,7 @@ def likely_pace(before: Poses, after: Poses) -> float:
     source, target = (
         _features(before)[::stride, :-3],
         _features(after)[::stride, :-3],
-    )  # the root's steps depend on the pace
+    )  # without the displacements of the root, which depend on the rate
     length = max(SHORTEST_WINDOW, min(PACE_WINDOW, len(target) // 2))
     if len(target) < length or len(source) < length:
         return 1.0
