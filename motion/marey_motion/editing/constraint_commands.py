@@ -43,7 +43,7 @@ from marey_schemas.editing.constraints import (
 )
 
 _OPTIONS = SolverOptions()
-# Joints that look with their front; others point along their bone.
+# Standard joints whose forward axis is directed at a look-at target; other joints use the direction of their bone.
 _LOOKING = ("pelvis", "spine", "spine_1", "spine_2", "neck", "head")
 
 

@@ -37,7 +37,7 @@ SHORTEST_CONTACT_S = 0.06
 """Duration, in seconds, below which a contact counts as noise."""
 MOST_SUNK_M = 0.005
 """Greatest permitted depth of a planted sole below the floor, in metres, while the foot rolls."""
-# Less than this is rounding.
+# Metres; smaller values are rounding errors.
 SHORTEST_LOWERING_M = 1e-9
 
 

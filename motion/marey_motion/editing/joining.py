@@ -146,7 +146,7 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
         return LoopSeam(turn, target[[0, 2]] - rotated(start[[0, 2]], turn))
     ends, end_headings = body_track(before, max(0, before.frame_count - 2), before.frame_count)
     starts, start_headings = body_track(after, 0, min(2, after.frame_count))
-    # One frame alone stands still: it is its own neighbour.
+    # A motion of one frame stands still, so its frame is used twice.
     rows = np.stack((starts[0], starts[-1], ends[0], ends[-1]))[:, [0, 2]]
     return loop_seam(rows, np.array([start_headings[0], start_headings[-1], end_headings[0], end_headings[-1]]))
 

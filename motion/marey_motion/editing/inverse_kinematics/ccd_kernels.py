@@ -34,10 +34,10 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
 )
 from marey_motion.kernels import compiled, inverse, product, put_rotation
 
-# A sweep that improves the objective by less than this share, so often in a row, is the last one.
+# The solver ends after this number of successive sweeps that each improve the objective by less than this share.
 STALLED_SHARE = 1e-4
 STALLED_SWEEPS = 4
-# Weight of staying put, relative to that of the targets: decides between rotations that are equally good.
+# Weight of no rotation, relative to the targets, so that the smallest of equally good rotations is chosen.
 STAYING = 1e-9
 
 

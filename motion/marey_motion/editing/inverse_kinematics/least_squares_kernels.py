@@ -192,7 +192,7 @@ def _take_step(body, local, root, work):
             kept = within_limits(body.limits[k], new)
             over = logarithm(product(inverse(kept), new))
             gone = logarithm(product(inverse(rotation_at(local, k)), kept))
-            # A joint that is still on its way to the limit goes up to it; one that is there is blocked.
+            # A joint that has not reached its limit moves up to it; a joint at its limit is blocked.
             if length(over) > LIMIT_REACHED_RAD and dot(gone, direction(over)) < LIMIT_REACHED_RAD:
                 newly_blocked = _block(work, v, direction(over)) or newly_blocked
             new = kept
@@ -286,7 +286,7 @@ def _solve_frame(body, targets, frame, offsets, ends, carried, local, root, work
         trial += _displace(body, work.trial, work.trial_root, work.first, work.first_root, work)
         if not trial < cost:
             damping *= DAMPING_INCREASE
-            # The displacements of the pose that is kept; its Jacobian and gradient still stand.
+            # Restores the displacements of the pose before the step; its Jacobian and gradient are unchanged.
             _displace(body, local, root, work.first, work.first_root, work)
             if damping > MOST_DAMPING:
                 break

@@ -90,7 +90,7 @@ def _even_swivels(goal: Floats, jumps: Floats, clear: Floats, reach: float) -> F
     """
     from scipy.linalg import solveh_banded
 
-    carried = np.cumsum(jumps)  # what the swivels add up to if none is corrected
+    carried = np.cumsum(jumps)  # sum of the swivels if none is corrected
     data = _unwrapped(goal + carried, clear)
     weights = np.maximum(clear, LEAST_CLARITY)
     stiff = reach**2
