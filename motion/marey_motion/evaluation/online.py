@@ -111,7 +111,7 @@ class OnlineCoverage:
         self.counts = np.zeros(shape, dtype=np.int64)
         self.frame_count = 0
 
-    # -- what comes in -------------------------------------------------------------------------------------------------
+    # -- frames --------------------------------------------------------------------------------------------------------
 
     def add_frames(self, body: MatchingBody, clip: Clip) -> Windows:
         """Add the next frames of the performance.
@@ -184,7 +184,7 @@ class OnlineCoverage:
         self.counts += counts.astype(np.int64)
         return windows
 
-    # -- what is known -------------------------------------------------------------------------------------------------
+    # -- coverage ------------------------------------------------------------------------------------------------------
 
     @property
     def delay_s(self) -> float:
@@ -244,7 +244,7 @@ class OnlineCoverage:
             for a, b in zip(v[nearest], w[nearest], strict=True)
         )
 
-    # -- what is kept --------------------------------------------------------------------------------------------------
+    # -- state ---------------------------------------------------------------------------------------------------------
 
     def as_tree(self) -> dict[str, Any]:
         """Save the state for `from_tree`.

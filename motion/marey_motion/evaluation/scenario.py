@@ -20,7 +20,7 @@ from marey_schemas.options.evaluation import EvaluationOptions, Family
 from marey_schemas.options.matching import TICK_RATE_HZ
 
 LOOK_AHEAD_S = 1.0
-# A boundary belongs to the tick that it falls on, however its time in seconds is rounded.
+# Tolerance, so that rounding of times in seconds does not move a boundary to the next tick.
 TIME_TOLERANCE_S = 1e-9
 STRAIGHT_DEG_S = 1e-6
 KEY_RATE_HZ = 10.0
@@ -246,7 +246,7 @@ def _along_keys(trial: Trial, times: Floats, rate_hz: float, tick_count: int) ->
     from scipy.interpolate import CubicSpline
 
     curve = CubicSpline(np.arange(len(trial.path)) / KEY_RATE_HZ, np.array(trial.path))
-    # One row more gives the last step.
+    # One more row, from which the last step is computed.
     since_s = np.append(times, times[-1] + 1.0 / rate_hz) - trial.approach_s
     found = curve(np.clip(since_s, 0.0, (len(trial.path) - 1) / KEY_RATE_HZ))
     positions, headings = found[:, :2] + np.minimum(since_s, 0.0)[:, None] * curve(0.0, 1)[:2], found[:, 2]
@@ -280,7 +280,7 @@ def _pieces(trial: Trial, end_s: float) -> tuple[Floats, Floats, Floats, Floats]
     corners = np.zeros(len(starts))
     if trial.changes_speed:
         speeds[2::2] = trial.switch_speed_m_s
-        # A character that stands does not turn either.
+        # A standing character does not turn.
         turn_rates[2::2] *= trial.switch_speed_m_s > 0.0
     elif trial.family == "eights":
         turn_rates[2::2] *= -1.0

@@ -172,7 +172,7 @@ def _addition_effects(
     states = [outside]
     for step in steps:
         states.append(states[-1] - {step.filling.source})
-    # The set with all additions comes first: what needs none of them is then not simulated again without them.
+    # The set with all additions comes first, so that trials that need none of them are not simulated again.
     for absent in reversed(states[1:]):
         stages.next(confirming.outcomes(absent))
     return [stages.next(effect_of(confirming, how.objective, *pair)) for pair in pairwise(states)]

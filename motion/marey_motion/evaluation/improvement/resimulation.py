@@ -280,7 +280,7 @@ def needed_rows(
 
     chosen = switched_rows(database, record.rows)
     rows = [record.rows.astype(np.int64), chosen[chosen >= 0]]
-    # What the last search chose is not displayed any more when it was made at the last tick.
+    # If the last search is at the last tick, the row that it chose is never displayed.
     if not np.isnan(record.match_cost[-1]):
         asked, last = trajectory_for(trial, database), len(record.rows) - 1
         own = index_for(database, index, trial)
