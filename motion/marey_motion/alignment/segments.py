@@ -63,6 +63,10 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     Returns
     -------
     tuple of Cut    in the order of time
+
+    Raises
+    ------
+    AnnotationError    if a label equals the numbered name of a repeated label
     """
     begins = [(segment.start, segment.label) for segment in layer.segments]
     starts = {start for start, _ in begins} | {layer.frame_count}
