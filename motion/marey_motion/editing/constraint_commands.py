@@ -111,7 +111,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
     Raises
     ------
     MappingError    if the mapping does not define both legs
-    EditError    if the frames do not exist
+    EditError    if the take lacks one of the frames
     """
     take.budget.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
     rig = _Rig(take)

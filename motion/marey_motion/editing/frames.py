@@ -25,7 +25,7 @@ def trim(take: Take, command: Trim) -> Take:
 
     Raises
     ------
-    EditError    if the frames do not exist
+    EditError    if the take lacks one of the frames
     """
     first, last = take.frames((command.start, command.stop))
     return take.with_motion(take.motion.sliced(first, last))

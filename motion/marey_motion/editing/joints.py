@@ -42,7 +42,7 @@ def paste(take: Take, command: Paste) -> Take:
     Raises
     ------
     UnknownJoint    if a joint does not exist; the error names it
-    EditError    if the source or the frames do not exist, or if the axes of a joint differ in the two skeletons
+    EditError    if the source or one of the frames is missing, or if the axes of a joint differ in the two skeletons
     """
     clip = take.source(command.source)
     targets = sorted({take.joint(name) for name in command.joints})
@@ -121,7 +121,7 @@ def rotate_joint(take: Take, command: RotateJoint) -> Take:
     Raises
     ------
     UnknownJoint    if a joint does not exist; the error names it
-    EditError    if the frames do not exist
+    EditError    if the take lacks one of the frames
     """
     index = take.joint(command.joint)
     span, shares = range_weights(take, command.frames, command.border_s)

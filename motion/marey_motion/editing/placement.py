@@ -75,7 +75,8 @@ def face(take: Take, command: Face) -> Take:
 
     Raises
     ------
-    MotionError    if the body has no facing direction in that frame, as when it lies on its side
+    EditError    if the take lacks the frame
+    MotionError    if the body has no facing direction in the frame, as when it lies on its side
     """
     place, heading = body_at(take, command.frame)
     turn = about_vertical(np.asarray(radians(command.heading_deg) - heading))
@@ -93,6 +94,10 @@ def move_to_origin(take: Take, command: MoveToOrigin) -> Take:
     Returns
     -------
     Take    F frames
+
+    Raises
+    ------
+    EditError    if the take lacks the frame
     """
     frame = command.frame
     return take.with_motion(shifted(take.motion, -pelvis_track(take, frame, frame + 1)[0] * GROUND))
@@ -206,7 +211,7 @@ def pelvis_track(take: Take, start: int, stop: int) -> Floats:
 
     Raises
     ------
-    EditError    if the frames do not exist
+    EditError    if the take lacks one of the frames
     """
     return _positions(take, start, stop)[:, take.body.pelvis]
 
@@ -226,6 +231,7 @@ def body_at(take: Take, frame: int) -> tuple[Floats, float]:
 
     Raises
     ------
+    EditError    if the take lacks the frame
     MotionError    if the body has no facing direction
     """
     places, headings = body_track(take, frame, frame + 1)
@@ -247,6 +253,7 @@ def body_track(take: Take, start: int, stop: int) -> tuple[Floats, Floats]:
 
     Raises
     ------
+    EditError    if the take lacks one of the frames
     MotionError    if the body has no facing direction
     """
     positions = _positions(take, start, stop)
@@ -296,7 +303,7 @@ def fix_drift(take: Take, command: FixDrift) -> Take:
 
     Raises
     ------
-    EditError    if the frames do not exist or the range is a single frame
+    EditError    if the take lacks one of the frames, or the range is a single frame
     """
     start, stop = take.frames(command.frames)
     if stop - start < 2:

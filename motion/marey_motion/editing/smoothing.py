@@ -51,7 +51,7 @@ def smooth(take: Take, command: Smooth) -> Take:
     Raises
     ------
     UnknownJoint    if a joint does not exist; the error names it
-    EditError    if the frames do not exist, if the window is too short for the polynomials, or if a joint
+    EditError    if the take lacks one of the frames, if the window is too short for the polynomials, or if a joint
         spins so fast that its rotations have no mean
     """
     motion = take.motion
