@@ -123,30 +123,18 @@ def suggest(
     _require_same(database, result)
     stages = _SuggestionStages(progress, cancelled)
     simulation = _simulation(database, result, how, threads, cancelled)
-    perceived_rows = None if metric is None else PerceivedRows(database, metric)
+    rows = None if metric is None else PerceivedRows(database, metric)
     unused = _unused(simulation, result)
     duplicates = find_near_duplicates(
-        database,
-        threshold_cm=how.duplicate_cm,
-        perceived_rows=perceived_rows,
-        threads=threads,
-        **stages.watch("duplicates"),
+        database, threshold_cm=how.duplicate_cm, perceived_rows=rows, threads=threads, **stages.watch("duplicates")
     )
-    threshold = _threshold(how, result, perceived_rows)
-    similarity = measure_similarity(
-        database, result.coverage, threshold, perceived_rows=perceived_rows, **stages.watch("similarity")
-    )
+    limit = _threshold(how, result, rows)
+    similarity = measure_similarity(database, result.coverage, limit, perceived_rows=rows, **stages.watch("similarity"))
     fillings = rank_fillings(
-        database,
-        result.coverage,
-        others,
-        result.options,
-        threshold,
-        perceived_rows=perceived_rows,
-        **stages.watch("filling"),
+        database, result.coverage, others, result.options, limit, perceived_rows=rows, **stages.watch("filling")
     )
     gone = frozenset(clip.source for clip in unused.clips)
-    appearance = _appearance(database, how, perceived_rows, threshold, stages)
+    appearance = _appearance(database, how, rows, limit, stages)
     redundant, plan = _redundancy(simulation, how, gone, appearance, stages)
     additions = plan_fillings(fillings, result.coverage, others, result.options)
     confirmed = confirm(
