@@ -23,6 +23,6 @@ def constraint_jacobian(
     The last three columns belong to the translation of the root. They are zero if `freedom` does not let the root move.
     """
     problem = pose_problem(skeleton, motion, targets, freedom)
-    room = problem.stepping(0.0)
+    room = problem.least_squares_scratch(0.0)
     least_squares_kernels.residuals_and_jacobian(problem.body, problem.targets, problem.roots, problem.rotations, room)
     return room.scaled_errors, room.jacobian, tuple(problem.joints[problem.body.movable].tolist())

@@ -68,7 +68,8 @@ class AlignedClip:
     time_function : (N,) float64    time warp: for each canonical frame, the fractional frame of the source, which is
         sampled at the set's rate; strictly increasing from 0 to the last frame of the source
     placement : Placement    position and heading of the source's first frame
-    cost : float    mean cost per cell of the alignment path that gave `time_function`, square metres
+    cost : float    mean cost per cell of the alignment path that gave `time_function`: square metres, or without unit
+        if the poses were compared by a perceptual metric
     source_frames : int    number of frames of the source at the set's rate
     recording : Recording    take and performer
     """
@@ -104,12 +105,12 @@ class AlignedSet:
 
     @property
     def frame_count(self) -> int:
-        """Number of canonical frames N."""
+        """Number of canonical frames N, the same in all clips."""
         return self.clips[0].motion.frame_count
 
     @property
     def poses(self) -> Floats:
-        """Root translations (metres) and rotations of all clips, (clips, N, 3 + 4·J) float64."""
+        """Root translations (metres) and rotations (quaternions) of all clips, (clips, N, 3 + 4·J) float64."""
         return np.stack([clip.motion.poses for clip in self.clips])
 
     @property

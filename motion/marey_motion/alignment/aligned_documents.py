@@ -19,7 +19,7 @@ ALIGNMENT_SCHEMA = "marey/alignment@1"
 Tree = dict[str, Any]
 
 SHARED = ("set", "reference", "keyframes")
-"""Fields that have the same value in all examples of a set."""
+"""Fields of the tree of an example that have the same value in all examples of one set."""
 
 
 class StoredExample(NamedTuple):
@@ -113,7 +113,7 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
         repeated; the error names the example
     """
     if not examples:
-        raise MotionError("a set of aligned clips needs at least one clip", code="too-few-clips")
+        raise MotionError("no aligned clips were given; choose at least one", code="too-few-clips")
     clips = sorted((_example(one) for one in examples), key=lambda clip: (clip.name, clip.uid))
     first = examples[0]
     for one in examples[1:]:
@@ -187,7 +187,7 @@ def _example(stored: StoredExample) -> AlignedClip:
 
 
 def _recording(info: Mapping[str, Any]) -> Recording:
-    """Return take and performer; in older documents, the take is the clip itself."""
+    """Read take and performer from the tree of an example; if it names no take, the clip counts as its own take."""
     clip = info.get("clip") or {}
     return Recording(str(info.get("take") or clip.get("item") or ""), str(info.get("subject") or ""))
 

@@ -130,8 +130,8 @@ def align_clips(
     clips : sequence of SourceExample    clips of one skeleton
     body : MatchingBody    body of that skeleton
     options : AlignOptions, optional    options; `options.reference` may be the uid of an example
-    metric : PerceptualMetric, optional    the cost of a pair of poses is their perceptual distance, without unit; by
-        default, the cost is that of `frame_costs`, in square metres
+    metric : PerceptualMetric, optional    metric whose distance, without unit, is the cost of a pair of poses; if None,
+        the cost is that of `frame_costs`, in square metres
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total, note)
     on_refusal : callable, optional    called as on_refusal(example, error) for each example that cannot be aligned and
@@ -148,8 +148,7 @@ def align_clips(
     how = options or AlignOptions()
     if metric is not None and (how.weights or how.window > 1 or how.cost != AlignOptions().cost):
         raise MotionError(
-            "the options cost, window and weights have no effect with a perceptual metric, which has weights of its "
-            "own; leave them out",
+            "a perceptual metric replaces the options cost, window and weights; leave these three options out",
             code="option-invalid",
         )
     run = _Aligning(body, how, metric, threads, progress or (lambda _done, _total, _note: None))
@@ -200,7 +199,7 @@ class _Aligning:
             keyframes=reference.sections.keyframes,
         )
 
-    # -- what fits --
+    # -- checks and preparation --
 
     def _require_options(self, clips: Sequence[SourceExample]) -> None:
         repeated = [uid for uid, count in Counter(one.uid for one in clips).items() if count > 1]
@@ -259,7 +258,9 @@ class _Aligning:
             return rates[self._options.reference]
         counts = Counter(rates.values())
         if not counts:
-            raise MotionError("alignment needs clips, but none were given", code="too-few-clips")
+            raise MotionError(
+                f"no clips were given; choose at least {LEAST_CLIPS} clips to align", code="too-few-clips"
+            )
         return min(counts, key=lambda rate: (-counts[rate], rate))
 
     def _prepare(self, example: SourceExample, rate_hz: float) -> _Prepared:
@@ -387,7 +388,7 @@ def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
 
 
 def restore(clip: AlignedClip, skeleton: Skeleton) -> Motion:
-    """Undo `align_clips` for one clip.
+    """Compute the source motion of an aligned clip, with its original timing and place: the inverse of `align_clips`.
 
     The result is exact if `clip.time_function` is the identity; otherwise the poses are interpolated between canonical
     frames.

@@ -15,14 +15,17 @@ from marey_schemas.options.alignment import CostOptions
 class CostPoints(NamedTuple):
     """The points of one motion of n frames, prepared for comparison with other motions.
 
-    F is n without a window, and n + W - 1 if costs are averaged over a window of W frames (`CostOptions.window`).
+    F is n without a window, and n + W - 1 if costs are averaged over a window of W frames (`CostOptions.window`). For
+    the cost `turned`, horizontal positions are relative to the weighted centre of the points: that of the frame without
+    a window, and the mean centre of the whole motion with a window. For the cost `plain`, they are not centred, and
+    `energies` and `centres` are not used.
 
     Parameters
     ----------
     rows : (F, P, 3) float64    positions, multiplied by the square root of each point's share of the total weight
     columns : (P, 3, F) float64    the same, transposed
-    energies : (n,) float64    weighted sum of the squared horizontal distances of the points from the centre, over each
-        frame's window
+    energies : (n,) float64    weighted sum of the squared horizontal distances of the points from the weighted centre
+        of each frame's window, over this window
     centres : (n, 2) float64    horizontal weighted centre of each frame's window; zero if there is no window, or if the
         cost is `plain`
     """
@@ -44,7 +47,7 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
     ----------
     a : (n, P, 3) float64    points in metres, Y up
     b : (m, P, 3) float64    the same points of the other motion
-    options : CostOptions, optional    options
+    options : CostOptions, optional    kind of cost, and window
     weights : (P,), optional    non-negative weights of the points, with any sum; all equal if None
 
     Returns
@@ -75,7 +78,7 @@ def cost_points(points: Floats, options: CostOptions, weights: ArrayLike | None 
     Parameters
     ----------
     points : (n, P, 3) float64    metres, Y up
-    options : CostOptions    options
+    options : CostOptions    kind of cost, and window
     weights : (P,), optional    as in `frame_costs`
 
     Returns
@@ -113,7 +116,7 @@ def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
     Parameters
     ----------
     a, b : CostPoints    n and m frames, prepared with the same options
-    options : CostOptions    options
+    options : CostOptions    the options with which the points were prepared
 
     Returns
     -------
@@ -140,7 +143,7 @@ def require_same_points(a: NDArray[np.floating], b: NDArray[np.floating]) -> Non
     Parameters
     ----------
     a : (n, P, 3)    points of one motion
-    b : (m, P, 3)    points of the other
+    b : (m, P, 3)    points of the other motion
 
     Raises
     ------
@@ -161,7 +164,7 @@ def _shares(weights: ArrayLike | None, count: int) -> Floats:
             where="weights",
         )
     if not (np.isfinite(given).all() and (given >= 0).all() and given.sum() > 0):
-        raise MotionError("weights must be finite and at least 0, and one must be above 0", where="weights")
+        raise MotionError("weights must be finite and at least 0, and at least one must be above 0", where="weights")
     return np.asarray(given / given.sum())
 
 

@@ -17,7 +17,7 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 
 FRAMES_PER_BOX = 16
-# A bound is a sum of many terms: lowered by more than its rounding, it stays one.
+# Lower bounds are sums of many terms; they are lowered by more than their rounding errors, so that they remain bounds.
 _ROUNDING_SLACK = 1.0 - 1e-9
 
 
@@ -53,7 +53,7 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
     Raises
     ------
-    MotionError    if a cost is not finite, or if no path satisfies `max_run`
+    MotionError    if a cost is not finite, if `max_run` is not 0 to 60, or if no path satisfies `max_run`
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -67,12 +67,12 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
 
 def align_cyclic(costs: ArrayLike, *, max_run: int) -> tuple[Alignment, int]:
-    """Try every frame of a cyclic second motion as its first, and find the path with the least mean cost.
+    """Find the path with the least mean cost if the second motion is cyclic, so that it may start at any of its frames.
 
     Parameters
     ----------
     costs : (n, m) float    finite costs of each pair of frames
-    max_run : int    as for `align`
+    max_run : int    maximum number of consecutive steps that advance only one motion, as for `align`
 
     Returns
     -------
@@ -81,7 +81,7 @@ def align_cyclic(costs: ArrayLike, *, max_run: int) -> tuple[Alignment, int]:
 
     Raises
     ------
-    MotionError    as `align`
+    MotionError    for the same reasons as in `align`
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -92,7 +92,7 @@ def align_cyclic(costs: ArrayLike, *, max_run: int) -> tuple[Alignment, int]:
 
 
 def least_total(costs: Floats, *, max_run: int | None = None) -> float:
-    """Compute only the total cost of the path that `align` finds.
+    """Compute the total cost of the cheapest path through a matrix of costs, without the path (see `align`).
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _found(matrix: Floats, max_run: int | None, backwards: NDArray[np.int32], to
     if not np.isfinite(total):
         raise MotionError(
             f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames if one motion may pause for "
-            f"at most {max_run} frames of the other; raise this limit",
+            f"at most {max_run} frames of the other; raise the slope limit",
             code="alignment-impossible",
             where="max_run",
         )
@@ -127,7 +127,7 @@ def _checked(costs: ArrayLike, max_run: int | None) -> Floats:
         raise MotionError(
             f"the costs must be a matrix with at least one row and one column, but have the shape {matrix.shape}"
         )
-    # Least and greatest are found without a matrix of answers, which would take longer than the alignment.
+    # The least and the greatest cost suffice; a matrix of flags would take longer than the alignment.
     if not (np.isfinite(matrix.min()) and np.isfinite(matrix.max())):
         raise MotionError(
             "a cost is infinite or not a number", where=f"cell {np.argwhere(~np.isfinite(matrix))[0].tolist()}"
@@ -145,8 +145,8 @@ def distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> Floats:
 
     Parameters
     ----------
-    a : (n, P, 3)    metres
-    b : (m, P, 3)    metres
+    a : (n, P, 3)    points of one motion, metres
+    b : (m, P, 3)    the same points of the other motion, metres
 
     Returns
     -------
@@ -160,14 +160,15 @@ def distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> Floats:
 
 
 def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: float = np.inf) -> float:
-    """Compute the total of the cheapest path through `distances(a, b)`, divided by the frames of the longer motion.
+    """Compute the distance of two motions after dynamic time warping.
 
-    Memory is O(n + m), not O(n·m).
+    The distance of two frames is the mean distance of their points. These distances are summed along the cheapest path
+    and divided by the number of frames of the longer motion. The memory is O(n + m), not O(n·m).
 
     Parameters
     ----------
-    a : (n, P, 3)    metres
-    b : (m, P, 3)    metres
+    a : (n, P, 3)    points of one motion, metres
+    b : (m, P, 3)    the same points of the other motion, metres
     limit : float    metres; the computation stops as soon as the result is certain to exceed this limit
 
     Returns
@@ -195,8 +196,8 @@ def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_p
 
     Parameters
     ----------
-    a : (n, P, 3)    metres
-    b : (m, P, 3)    metres
+    a : (n, P, 3)    points of one motion, metres
+    b : (m, P, 3)    the same points of the other motion, metres
     frames_per_box : int    frames in each box
 
     Returns
@@ -210,7 +211,7 @@ def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_p
 
 
 class RangeBounds:
-    """Lower bounds of the warped distances between one motion and others, from one bounding box per motion and point.
+    """Lower bounds of `warped_distance` between motions, computed from one bounding box per motion and point.
 
     Parameters
     ----------

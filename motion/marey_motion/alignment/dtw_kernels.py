@@ -6,7 +6,7 @@ import numpy as np
 
 from marey_motion.kernels import compiled
 
-# Steps by which a cell is reached; of equal costs the lowest wins.
+# Steps that lead to a cell; if costs are equal, the lowest number is chosen.
 BOTH, FIRST, SECOND = 0, 1, 2
 LANES = 4
 
@@ -19,7 +19,7 @@ def align(costs, path):
     """
     n, m = costs.shape
     steps = np.empty((n, m), np.uint8)
-    # The row before a block and those of the block, with a border from which no path comes, except into the first cell.
+    # The row before a block and the rows of the block, with an infinite border; only the first cell has a start.
     totals = np.full((LANES + 1, m + 1), np.inf)
     totals[0, 0] = 0.0
     whole = n - n % LANES if m >= LANES else 0
@@ -153,7 +153,7 @@ def align_limited_cyclic(costs, max_run, path):
 
 @compiled
 def total_limited(costs, max_run):
-    """Compute the total cost of the cheapest path with limited runs in O(max_run·m) memory; infinite if none exists."""
+    """Compute the total cost of the path of `align_limited`, in O(max_run·m) memory; infinite if there is no path."""
     n, m = costs.shape
     not_first, not_second = np.empty((2, m)), np.empty((2, m))
     runs, scratch = np.full((max_run, m), np.inf), np.empty((2, m))
@@ -206,12 +206,12 @@ def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first
 def _walk_back_limited(costs, max_run, not_first, not_second, path):
     """Trace the path back, one run of equal steps at a time; fill `path`, last cell first; return the number of cells.
 
-    `not_first` and `not_second` (n, m) are the totals of `_limited_row` for all rows.
+    `not_first` and `not_second` (n, m) contain the least totals that `_limited_row` computes for each row.
 
     Equally cheap steps are preferred in this order: in both motions, in the first motion alone, in the second alone.
     """
     i, j, length = costs.shape[0] - 1, costs.shape[1] - 1, 0
-    barred = BOTH  # what the step that was taken last, in time, forbids: to go on as another run of its own kind
+    barred = BOTH  # the step that may not come next, so that two runs of the same step do not join to a longer one
     while i > 0 or j > 0:
         best, kind, steps = np.inf, BOTH, 1
         if i > 0 and j > 0:
@@ -263,10 +263,11 @@ def distances(a, b, out):
 
 @compiled
 def total_within(a, b, rest, limit):
-    """Compute the least total of a path through the distances of a (n, P, 3) and b (P, 3, m); infinite above `limit`.
+    """Compute the total cost of the cheapest path for points a (n, P, 3) and b (P, 3, m); infinite if above `limit`.
 
-    rest[i] is a lower bound of the cost that a path adds after row i. Every path crosses every row, so the computation
-    stops as soon as the least total in a row plus its `rest` exceeds the limit.
+    The cost of a cell is the mean distance of the points. `rest[i]` is a lower bound of the cost that a path adds after
+    row i. Every path crosses every row, so the computation stops as soon as the least total in row i plus `rest[i]`
+    exceeds the limit.
     """
     n, m = a.shape[0], b.shape[2]
     costs = np.empty(m)
@@ -288,9 +289,9 @@ def total_within(a, b, rest, limit):
 
 @compiled
 def box_costs(a, low, high, out):
-    """Write to out (n,), for each frame of a (n, P, 3), the mean distance of its points from the nearest of B boxes.
+    """Fill `out` (n,) with the mean distance of the points of each frame of a (n, P, 3) from the nearest of B boxes.
 
-    low and high (P, 3, B) are the corners of the boxes.
+    A box contains one bounding box for each point; `low` and `high` (P, 3, B) are their least and greatest coordinates.
     """
     points, boxes = low.shape[0], low.shape[2]
     costs = np.empty(boxes)
@@ -340,7 +341,10 @@ def _mean_distance(a, b):
 
 @compiled
 def _cost_from_box(points, start, stop, low, high, most):
-    """Sum, over frames, the mean distance of the points from a bounding box; stop when the sum exceeds `most`."""
+    """Sum the mean distances of the points from their bounding boxes over the frames [start, stop).
+
+    The boxes have the corners `low` and `high` (P, 3). The sum is not continued once it exceeds `most`.
+    """
     total = 0.0
     for i in range(start, stop):
         cost = 0.0

@@ -63,6 +63,10 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     Returns
     -------
     tuple of Cut    in the order of time
+
+    Raises
+    ------
+    AnnotationError    if a label equals the numbered name of a repeated label
     """
     begins = [(segment.start, segment.label) for segment in layer.segments]
     starts = {start for start, _ in begins} | {layer.frame_count}
@@ -76,7 +80,8 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     repeated = [label for label, count in Counter(label for cut in cuts for label in cut.labels).items() if count > 1]
     if repeated:
         raise AnnotationError(
-            "this is both the label of one cut and the numbered name of a repeated label; rename one of the two labels",
+            "one cut has this label, and another label that repeats gets the same name when it is numbered; rename one "
+            "of the two labels",
             code="label-repeats",
             where=repeated[0],
         )
@@ -125,7 +130,7 @@ def common_labels(all_labels: Mapping[str, tuple[tuple[str, ...], ...]]) -> tupl
 
     Returns
     -------
-    tuple of tuples of str    labels of each bound; among equally frequent lists, the first
+    tuple of tuples of str    labels of each bound; among equally frequent lists, the first in `all_labels`
     """
     counts = Counter(all_labels.values())
     most = max(counts.values())
@@ -168,9 +173,9 @@ class SectionedAlignment(NamedTuple):
 
     Parameters
     ----------
-    path : (L, 2) int32    matched frames of reference and source, from the first to the last frame of both; contains
-        each pair of bounds once
-    total : float    sum of the costs along the path, square metres
+    path : (L, 2) int32    matched frames of reference and source, from the first to the last frame of both; a pair of
+        bounds at which two sections meet is contained once
+    total : float    sum of the costs along the path, in the unit of the costs
     times : (N,) float64    source frame at each frame of the reference
     """
 
@@ -180,7 +185,7 @@ class SectionedAlignment(NamedTuple):
 
     @property
     def mean_cost(self) -> float:
-        """Cost per cell of the path, in square metres."""
+        """Mean cost per cell of the path, in the unit of the costs."""
         return self.total / len(self.path)
 
 
@@ -197,7 +202,7 @@ def align_sections(
     costs : (N, M) float64    cost of each pair of a reference frame and a source frame
     reference, source : sequence of int    bounds of the sections in each motion, from 0 to N - 1 and from 0 to M - 1;
         the same number in both
-    align : callable    finds the path through the costs of one section
+    align : callable    called as align(costs of one section); returns the path through these costs
 
     Returns
     -------

@@ -22,7 +22,7 @@ def consistent_signs(rotations: Floats, reference: Floats) -> Floats:
 
     Returns
     -------
-    (m, N, J, 4) float64    the same rotations
+    (m, N, J, 4) float64    the same rotations, as quaternions with consistent signs
     """
     smooth = quaternions.unroll(rotations, axis=1)
     agreement = np.einsum("mfjc,fjc->mj", smooth, quaternions.unroll(reference, axis=0))
@@ -30,7 +30,9 @@ def consistent_signs(rotations: Floats, reference: Floats) -> Floats:
 
 
 def consistent_poses(poses: Floats, reference: Floats) -> Floats:
-    """Choose the signs of poses as `consistent_signs` does.
+    """Choose the signs of the quaternions in poses so that the poses of aligned clips can be averaged.
+
+    The signs are those of `consistent_signs`; root translations stay unchanged.
 
     Parameters
     ----------
@@ -39,7 +41,7 @@ def consistent_poses(poses: Floats, reference: Floats) -> Floats:
 
     Returns
     -------
-    (m, N, 3 + 4·J) float64    the same poses
+    (m, N, 3 + 4·J) float64    the same poses, with consistent signs
     """
     clips, frames, _ = poses.shape
     rotations = consistent_signs(poses[..., 3:].reshape(clips, frames, -1, 4), reference[:, 3:].reshape(frames, -1, 4))

@@ -15,7 +15,7 @@ from marey_motion.errors import MotionError
 from marey_motion.motion import Motion
 
 LEAST_SLOPE = 0.01
-# A slope is raised by a little more than needed, so that sums of slopes keep it in spite of rounding.
+# Slopes are raised by a little more than needed, so that rounded sums of slopes do not fall below the least slope.
 _SLACK = 1e-9
 _WHOLE = 1e-9
 
@@ -39,7 +39,7 @@ def time_function(path: NDArray[np.integer]) -> Floats:
 
     Raises
     ------
-    MotionError    if one of the motions is too short
+    MotionError    if one of the motions has fewer than two frames, or if the source is too short for the least slope
     """
     if len(path) < 2 or (path[-1] <= path[0]).any():
         raise MotionError("a time function needs at least two frames in both motions", code="too-few-frames")
@@ -55,7 +55,7 @@ def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
     first and the last point are the ends of the path.
     """
     steps = np.diff(path, axis=0)
-    side = steps[:, 0] - steps[:, 1]  # 0 for a step in both, else which motion steps alone
+    side = steps[:, 0] - steps[:, 1]  # 0 for a step in both motions, 1 or -1 for a step in one
     before = np.concatenate(([0], side[:-1]))
     runs = np.concatenate(([0], np.cumsum((side == 0) | ((before != 0) & (before != side)))))
     lengths = np.bincount(runs)

@@ -13,9 +13,9 @@ from marey_motion.looping import rotated
 from marey_schemas.documents.differences import JointChange, PathChange, PathMove, Range
 
 NOISE_DEG = 0.01
-"""Largest change of a rotation that is attributed to rounding."""
+"""Largest change of a rotation, in degrees, that is attributed to rounding."""
 NOISE_CM = 0.01
-"""Largest change of a position that is attributed to rounding."""
+"""Largest change of a position, in centimetres, that is attributed to rounding."""
 JOINED_S = 0.1
 """Distance, in seconds, below which two ranges of frames are joined into one."""
 POINT_M = 0.01
@@ -29,7 +29,7 @@ MOST_SPANS = 100
 """Maximum number of ranges in a list; if there are more, ranges are joined over the smallest gaps between them."""
 
 
-class Course(NamedTuple):
+class MatchedFrames(NamedTuple):
     """Frames of the new clip that are compared with frames of the old clip, and the rate of the new clip.
 
     Parameters
@@ -42,24 +42,24 @@ class Course(NamedTuple):
     frame_rate_hz: float
 
 
-def spans_where(exceeds: Flags, course: Course) -> tuple[Range, ...]:
+def spans_where(exceeds: Flags, matched: MatchedFrames) -> tuple[Range, ...]:
     """List the ranges of frames of the new clip in which a change exceeds a threshold.
 
     Parameters
     ----------
     exceeds : (n,) bool    whether the change in each matched frame exceeds the threshold
-    course : Course    the matched frames of the new clip
+    matched : MatchedFrames    the matched frames of the new clip
 
     Returns
     -------
     tuple of ranges    frames of the new clip, half open and in order; ranges less than `JOINED_S` seconds apart are
         joined, and wider gaps too if there would be more than `MOST_SPANS` ranges
     """
-    frames = course.frames[exceeds]
+    frames = matched.frames[exceeds]
     if not len(frames):
         return ()
     gaps = np.diff(frames) - 1
-    greatest = JOINED_S * course.frame_rate_hz
+    greatest = JOINED_S * matched.frame_rate_hz
     if np.count_nonzero((gaps >= greatest) & (gaps > 0)) >= MOST_SPANS:
         greatest = float(np.sort(gaps)[-MOST_SPANS]) + 1.0
     breaks = np.flatnonzero((gaps >= greatest) & (gaps > 0))
@@ -68,7 +68,7 @@ def spans_where(exceeds: Flags, course: Course) -> tuple[Range, ...]:
 
 
 def joint_changes(
-    names: Sequence[str], changes: NDArray[np.floating], course: Course, *, threshold: float, noise: float
+    names: Sequence[str], changes: NDArray[np.floating], matched: MatchedFrames, *, threshold: float, noise: float
 ) -> tuple[JointChange, ...]:
     """Describe the changes of each joint whose largest change exceeds the noise.
 
@@ -76,9 +76,9 @@ def joint_changes(
     ----------
     names : sequence of str    names of J joints
     changes : (n, J) float    change of each joint in each matched frame, in degrees or centimetres
-    course : Course    the matched frames
-    threshold : float    frames in which a joint changes by more than this are listed
-    noise : float    joints whose changes are all at most this large are left out
+    matched : MatchedFrames    the matched frames
+    threshold : float    a frame is listed for a joint if the joint's change exceeds this value; unit of `changes`
+    noise : float    a joint is left out if its largest change does not exceed this value; unit of `changes`
 
     Returns
     -------
@@ -89,13 +89,13 @@ def joint_changes(
     largest = changes.max(axis=0)
     order = [joint for joint in np.argsort(-largest, kind="stable").tolist() if largest[joint] > noise]
     return tuple(
-        JointChange(joint=names[joint], **_exceeding(changes[:, joint].astype(np.float64), course, threshold))
+        JointChange(joint=names[joint], **_exceeding(changes[:, joint].astype(np.float64), matched, threshold))
         for joint in order
     )
 
 
 def path_change(
-    joint: str, before: Floats, after: Floats, course: Course, threshold_cm: float, move: Move | None
+    joint: str, before: Floats, after: Floats, matched: MatchedFrames, threshold_cm: float, move: Move | None
 ) -> PathChange | None:
     """Describe the change of a joint's path.
 
@@ -103,8 +103,8 @@ def path_change(
     ----------
     joint : str    joint whose path is compared
     before, after : (n, 3) float64    positions of the joint in matched frames, metres
-    course : Course    the matched frames
-    threshold_cm : float    frames whose positions are farther apart than this are listed
+    matched : MatchedFrames    the matched frames
+    threshold_cm : float    a frame is listed if its two positions are farther apart than this distance, centimetres
     move : Move or None    movement of the whole path from `before` to `after`
 
     Returns
@@ -119,20 +119,21 @@ def path_change(
         remaining = CM_PER_M * np.linalg.norm(move.applied(before) - after, axis=1)
         shift = tuple((CM_PER_M * move.shift_m).tolist())
         moved = PathMove(turn_deg=float(np.degrees(move.turn_rad)), shift_cm=shift, remaining_cm=float(remaining.max()))
-    return PathChange(joint=joint, moved=moved, **_exceeding(distances, course, threshold_cm))
+    return PathChange(joint=joint, moved=moved, **_exceeding(distances, matched, threshold_cm))
 
 
-def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, Any]:
-    """Summarise changes (n,) in matched frames, as fields of a `JointChange` or `PathChange`.
+def _exceeding(changes: Floats, matched: MatchedFrames, threshold: float) -> dict[str, Any]:
+    """Summarise changes (n,) in matched frames, as the fields that `JointChange` and `PathChange` have in common.
 
-    The fields are mean and maximum of the changes, the frame of the maximum, and the ranges above the threshold.
+    The fields are the mean and the maximum of the changes, the frame of the maximum in the new clip, and the ranges of
+    its frames in which the change exceeds the threshold.
     """
     at = int(np.argmax(changes))
     return {
         "mean": float(changes.mean()),
         "largest": float(changes[at]),
-        "largest_at": int(course.frames[at]),
-        "spans": spans_where(changes > threshold, course),
+        "largest_at": int(matched.frames[at]),
+        "spans": spans_where(changes > threshold, matched),
     }
 
 

@@ -11,7 +11,7 @@ from marey_motion.clip import Clip
 from marey_motion.difference.changes import (
     NOISE_CM,
     NOISE_DEG,
-    Course,
+    MatchedFrames,
     Move,
     joint_changes,
     path_change,
@@ -73,10 +73,10 @@ def compare_clips(
     new = _poses(after, pairing.after, pairing.after[carrier])
     timing, move = _compare_moved(old, new, after.frame_rate_hz / before.frame_rate_hz)
     pairs = timing.matching.pairs
-    course = Course(pairs[:, 1], after.frame_rate_hz)
+    matched = MatchedFrames(pairs[:, 1], after.frame_rate_hz)
     names = [after.skeleton.joint_names[joint] for joint in pairing.after]
     rotations = rotation_changes_deg(timing.before, new, pairs)
-    translated = _translation_changes(before, after, pairing, timing, course, options.threshold_cm)
+    translated = _translation_changes(before, after, pairing, timing, matched, options.threshold_cm)
     found = MotionDifference(
         frames=(before.frame_count, after.frame_count),
         frame_rate_hz=(before.frame_rate_hz, after.frame_rate_hz),
@@ -85,8 +85,8 @@ def compare_clips(
         runs=frame_runs(timing, before.frame_count, after.frame_count),
         frames_per_frame=timing.pace.samples_per_frame,
         duration_ratio=_duration_ratio(timing, before, after),
-        rotations=joint_changes(names, rotations, course, threshold=options.threshold_deg, noise=NOISE_DEG),
-        path=path_change(names[carrier], *_paths(timing, new, move), course, options.threshold_cm, move),
+        rotations=joint_changes(names, rotations, matched, threshold=options.threshold_deg, noise=NOISE_DEG),
+        path=path_change(names[carrier], *_paths(timing, new, move), matched, options.threshold_cm, move),
         translations=tuple(one for one in translated if carrier == 0 or one.joint != names[carrier]),
         translated_joints=(_translated(before), _translated(after)),
     )
@@ -154,7 +154,7 @@ def _translated(clip: Clip) -> tuple[str, ...]:
 
 
 def _translation_changes(
-    before: Clip, after: Clip, joints: JointPairs, timing: Timing, course: Course, threshold_cm: float
+    before: Clip, after: Clip, joints: JointPairs, timing: Timing, matched: MatchedFrames, threshold_cm: float
 ) -> tuple[JointChange, ...]:
     """Compare the translations of the joints that at least one of the clips translates.
 
@@ -170,10 +170,10 @@ def _translation_changes(
     places = np.minimum(np.round(timing.pace.places(timing.matching.pairs[:, 0])), before.frame_count - 1).astype(
         np.int64
     )
-    steps = [_translations(after, new)[course.frames] - _translations(before, old)[places] for old, new in moved]
+    steps = [_translations(after, new)[matched.frames] - _translations(before, old)[places] for old, new in moved]
     distances = CM_PER_M * np.linalg.norm(np.stack(steps, axis=1), axis=2)
     names = [after.skeleton.joint_names[new] for _, new in moved]
-    return joint_changes(names, distances, course, threshold=threshold_cm, noise=NOISE_CM)
+    return joint_changes(names, distances, matched, threshold=threshold_cm, noise=NOISE_CM)
 
 
 def _translations(clip: Clip, joint: int) -> NDArray[np.floating]:

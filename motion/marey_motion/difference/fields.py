@@ -121,7 +121,7 @@ def _shown(value: Any) -> Any:
 
 
 def compare_models(before: Mapping[str, Any], after: Mapping[str, Any]) -> ModelDifference:
-    """Describe how the training of two models differs.
+    """Describe how the training of two models differs: in examples and in likelihood.
 
     Parameters
     ----------

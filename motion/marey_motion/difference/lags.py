@@ -16,14 +16,17 @@ WINDOWS = 12
 """Number of windows of the old clip that are searched for in the whole new clip."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
-"""Largest ratio of squared distances, of the second-best and the best place of a window, if both are candidates."""
+"""Greatest ratio at which the second-best place of a window is a candidate, too.
+
+The ratio is that of the squared distances of the window at the second-best and at the best place.
+"""
 NEGLIGIBLE = 1e-3
-"""Squared distance of two frames that is attributed to noise."""
+"""Squared distance of the features of two frames (`_features`) that is attributed to noise."""
 GREATEST_PACE = 4.0
-"""Greatest pace that is tried: frames of the new clip per frame of the old clip. The least is 1 / `GREATEST_PACE`."""
+"""Greatest number of frames of the new clip per frame of the old clip that is tried; the least is its reciprocal."""
 PACES = 97
 DECIMATED = 2048
-"""Approximate number of frames of the longer clip that are used in the search for the pace."""
+"""Approximate number of frames of the longer clip that are used to estimate the resampling rate (`likely_pace`)."""
 PACE_WINDOW = 96
 PACE_WINDOWS = 3
 CHANNELS = 8
@@ -43,8 +46,8 @@ def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
 
     Returns
     -------
-    tuple of int    frame number in `after` minus frame number of the equal frame in `before`; the most frequent lag
-        first
+    tuple of int    frame number in `after` minus frame number of the equal frame in `before`; at most `MOST_LAGS`, the
+        most frequent lag first
     """
     votes: Counter[int] = Counter()
     for hashed in (_hashes, _body_hashes):
@@ -60,7 +63,7 @@ def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
 def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, ...]:
     """Find the lags at which windows of the old clip, `before`, are most similar to the new clip, `after`.
 
-    Each window is compared with all places of the other clip at once, by correlation in the frequency domain.
+    Each window is compared with all places of the new clip at once, by correlation in the frequency domain.
 
     Parameters
     ----------
@@ -113,9 +116,9 @@ def _window_distances(window: Floats, spectrum: Complexes, energy: Floats, size:
 
 
 def likely_pace(before: Poses, after: Poses) -> float:
-    """Estimate the pace at which the new clip was resampled from the old clip, or from a part of it.
+    """Estimate the rate at which the new clip was resampled from the old clip, or from a part of the old clip.
 
-    Windows of the new clip are stretched to many paces, and each is compared with every place of the old clip.
+    Windows of the new clip are stretched by many factors, and each is compared with every place of the old clip.
 
     Parameters
     ----------
@@ -123,13 +126,13 @@ def likely_pace(before: Poses, after: Poses) -> float:
 
     Returns
     -------
-    float    number of frames of the new clip per frame of the old clip, to within about 3 %
+    float    number of frames of the new clip per frame of the old clip, to within about 3 %; 1 if a clip is too short
     """
     stride = max(1, max(before.frame_count, after.frame_count) // DECIMATED)
     source, target = (
         _features(before)[::stride, :-3],
         _features(after)[::stride, :-3],
-    )  # the root's steps depend on the pace
+    )  # without the displacements of the root, which depend on the rate
     length = max(SHORTEST_WINDOW, min(PACE_WINDOW, len(target) // 2))
     if len(target) < length or len(source) < length:
         return 1.0

@@ -13,13 +13,16 @@ from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.differences import AnnotationDifference, KeyframeChange, SegmentChange
 
 ALONE = 0.6
-"""Cost of an added or removed segment."""
+"""Cost of a segment without a match, which counts as added or removed."""
 OTHER_LABEL = 0.7
 """Cost of a pair of segments with different labels; the cost of the two ranges (0 to 1) is added to this cost."""
 SHIFTED = 0.05
 """Cost added to a pair of segments if the ranges are compared after the shift that most segments have in common."""
 MOST_PAIRS = 16_000_000
-"""Maximum of n times m, for n differing segments in the old annotation and m in the new annotation."""
+"""Greatest number of pairs of segments whose costs are computed.
+
+Each of the segments that differ in the old annotation is paired with each of those in the new annotation.
+"""
 
 
 def compare_annotations(before: Annotation, after: Annotation) -> AnnotationDifference:

@@ -20,9 +20,12 @@ from marey_motion.difference.poses import Poses, frame_costs
 UNMATCHED = 0.25
 """Cost of a removed or inserted frame. A pair of different frames costs at most twice as much."""
 NEW_RUN = 1.0
-"""Cost of a change of the lag between two matched frames."""
+"""Cost of a change of the lag between two runs, in addition to the cost of each removed or inserted frame."""
 AT_AN_END = 0.995
-"""Cost of removing or inserting frames at the start or end of the clips: below `NEW_RUN`, to prefer these places."""
+"""Cost of removed or inserted frames at the start or end of the clips, in addition to the cost of each frame.
+
+It is below `NEW_RUN`, so that these places are preferred.
+"""
 WELL_MATCHED = 0.02
 """Cost up to which a frame counts as matched well, so that no further lags are tried for the frame."""
 MOST_ROUNDS = 64
@@ -47,7 +50,7 @@ class Matching(NamedTuple):
 
 
 def match_frames(before: Poses, after: Poses, *, search: bool = True) -> Matching:
-    """Match the frames of two clips in which the motion runs at the same speed per frame.
+    """Match the frames of two clips in which the motion advances equally far from one frame to the next.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from marey_schemas.documents.differences import MappedJoint, MappingDifference, 
 from marey_schemas.documents.skeletons import SkeletonMapping
 
 RENAMED_WITHIN_CM = 0.1
-"""Greatest difference of the offsets of a joint before and after it was renamed."""
+"""Greatest distance, in centimetres, between the offsets of two joints that are paired as one renamed joint."""
 NOISE_CM = 1e-3
 NOISE_DEG = 1e-3
 
@@ -28,7 +28,7 @@ class JointPairs(NamedTuple):
     Parameters
     ----------
     before, after : tuple of int    indices of the same joints in both skeletons
-    renamed : tuple of pairs of str    both names of each renamed joint
+    renamed : tuple of pairs of str    names of each renamed joint, before and after
     """
 
     before: tuple[int, ...]
@@ -37,7 +37,7 @@ class JointPairs(NamedTuple):
 
 
 def pair_joints(before: Skeleton, after: Skeleton) -> JointPairs:
-    """Pair the joints of two skeletons.
+    """Pair the joints that two skeletons have in common.
 
     Joints of the same name are paired. Two of the remaining joints are paired as renamed if they have the same parent
     and nearly the same offset, and if neither of the two has another possible partner.
@@ -148,7 +148,7 @@ def _parent_name(skeleton: Skeleton, joint: int) -> str | None:
 
 
 def compare_mappings(before: SkeletonMapping, after: SkeletonMapping) -> MappingDifference:
-    """Describe the differences between two mappings.
+    """Describe the differences between two joint mappings.
 
     Parameters
     ----------

@@ -15,9 +15,9 @@ from marey_schemas.documents.differences import FrameRun
 
 SAME_PACE = 1e-9
 WELL_EXPLAINED = 0.98
-"""Share of the shorter clip's frames. If this share is matched well, no other pace is tried."""
+"""Share of the shorter clip's frames. If this share is matched well, no other sampling of the old clip is tried."""
 MUCH_BETTER = 0.5
-"""Another pace is chosen only if its matching costs less than this share of the cost at the best pace so far."""
+"""Another sampling of the old clip is chosen only if its cost is less than this share of the least cost so far."""
 SIMILAR_ENOUGH = 0.1
 """Largest accepted cost of a matching, as a share of the cost if all frames differed entirely.
 
@@ -36,11 +36,11 @@ FARTHEST_OFFSET = 2.0
 ROUNDED_FRAMES = 0.02
 """Deviation over the whole clip, in frames, that is attributed to rounding."""
 GREATEST_PACE = 16.0
-"""Greatest pace that is tried: frames of the new clip per frame of the old clip. The least is 1 / `GREATEST_PACE`."""
+"""Greatest number of frames of the new clip per frame of the old clip that is tried; the least is its reciprocal."""
 
 
 class Pace(NamedTuple):
-    """Rate and start at which the old clip is sampled.
+    """Rate and start of the sampling of the old clip, whose samples correspond to the frames of the new clip.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Timing(NamedTuple):
     Parameters
     ----------
     pace : Pace    sampling of the old clip
-    before : Poses    the old clip, sampled at that pace
+    before : Poses    the samples of the old clip
     matching : Matching    pairs of frames of the sampled clip and of the new clip
     """
 
@@ -81,7 +81,7 @@ class Timing(NamedTuple):
 
 
 def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
-    """Find the pace at which the frames of two clips correspond best, and match them.
+    """Sample the old clip so that its samples correspond best to the frames of the new clip, and match them.
 
     Parameters
     ----------
@@ -90,7 +90,8 @@ def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
 
     Returns
     -------
-    Timing    correspondence at the ratio of the frame rates, unless the frames match much better at another pace
+    Timing    the old clip sampled at the frame rate of the new clip, or at another rate if frames then match much
+        better
     """
     first, *others = _paces(before.frame_count, after.frame_count, rate_ratio)
     best = _at_pace(before, after, Pace(first), search=True)
@@ -104,7 +105,10 @@ def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
 
 
 def _paces(count_before: int, count_after: int, rate_ratio: float) -> list[float]:
-    """Return the paces to try: 1, the ratio of the frame rates, and the ratio of the numbers of frames."""
+    """List the sampling rates to try, in samples per frame of the old clip.
+
+    They are the ratio of the frame rates, 1, and the ratio of the durations in frames.
+    """
     paces = [rate_ratio, 1.0]
     if count_before > 1 and count_after > 1:
         paces.append((count_after - 1) / (count_before - 1))
@@ -113,9 +117,9 @@ def _paces(count_before: int, count_after: int, rate_ratio: float) -> list[float
 
 
 def _better(best: Timing, before: Poses, after: Poses, pace: float, *, search: bool = False) -> Timing:
-    """Match the frames at another pace, and refine that pace; return `best` unless the new timing is much better.
+    """Match the frames at another sampling rate, and refine this rate; return `best` unless the result is much better.
 
-    `search` enables a search for similar frames (see `match_frames`) while the pace is refined.
+    `search` enables a search for similar frames (see `match_frames`) while the rate is refined.
     """
     if pace == 1.0:
         tried = _at_pace(before, after, Pace(1.0), search=True)
@@ -127,7 +131,7 @@ def _better(best: Timing, before: Poses, after: Poses, pace: float, *, search: b
 
 
 def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing:
-    """Sample the old clip at a pace, and match the samples with the frames of the new clip.
+    """Sample the old clip at the rate and start `pace`, and match the samples with the frames of the new clip.
 
     `search` enables a search for similar frames (see `match_frames`).
     """
@@ -139,7 +143,7 @@ def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing
 
 
 def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Timing:
-    """Fit pace and phase to the times of the matched frames, and match again, until the matching stops improving.
+    """Fit sampling rate and start to the matched frames, and match again, until the matching stops improving.
 
     The slope of the fit is measured over a short and over a long distance alternately: a short distance gives the right
     slope even if few frames are matched well, a long distance gives a more exact slope.
@@ -166,10 +170,10 @@ def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Ti
 
 
 def _rounded(start: float, step: float, count: int) -> Pace:
-    """Convert a line to a pace: frame n of the new clip is at place `start` + n·`step` of the old clip.
+    """Convert a fitted line to a sampling of the old clip: sample n is at frame `start` + n·`step`.
 
-    The pace is rounded to a simple fraction, and the start to a whole frame, if rounding moves none of the `count`
-    frames by more than `ROUNDED_FRAMES`.
+    The rate is rounded to a simple fraction, and the start to a whole frame, if rounding moves none of the `count`
+    samples by more than `ROUNDED_FRAMES` frames.
     """
     pace = 1.0 / step
     simple = float(Fraction(pace).limit_denominator(1000))

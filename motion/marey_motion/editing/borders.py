@@ -28,7 +28,7 @@ def range_weights(take: Take, frames: tuple[int, int | None] | None, border_s: f
 
     Raises
     ------
-    EditError    if the frames do not exist
+    EditError    if the take lacks one of the frames
     """
     start, stop = take.frames(frames)
     count = stop - start

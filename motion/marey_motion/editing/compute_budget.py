@@ -20,7 +20,7 @@ PER_TAP, MOST_OF_TAPS = 0.35, 200.0
 """Work of a moving mean for each value of the motion, in nanoseconds: per frame of the window, and its upper limit."""
 PER_COMPARED_POSES = 4_000
 """Work, in nanoseconds, to compute the perceptual distance of two poses."""
-PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
+PER_CONSTRAINT_GROUP, PER_CONSTRAINED_NUMBER = 1_000_000, 10
 """Work to apply a group of constraints, in nanoseconds: a fixed part, and a part for each value of the rotations.
 
 The work of the solver is not included.

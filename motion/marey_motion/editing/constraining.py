@@ -1,4 +1,4 @@
-"""Constraints on ranges of frames, met by inverse kinematics and blended into their surroundings.
+"""Constraints on ranges of frames, which are solved by inverse kinematics and blended into the frames around them.
 
 Two constraints are solved together if one constraint turns a joint, and the other constraint turns or depends on the
 same joint. All other constraints are solved separately.
@@ -15,8 +15,7 @@ import numpy as np
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats, Ints
-from marey_motion.editing.calm_limbs import CalmLimb, largest_steps
-from marey_motion.editing.compute_budget import PER_MEETING, PER_MET_NUMBER, ComputeBudget
+from marey_motion.editing.compute_budget import PER_CONSTRAINED_NUMBER, PER_CONSTRAINT_GROUP, ComputeBudget
 from marey_motion.editing.displacement import displace, windows_around
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_targets
 from marey_motion.editing.inverse_kinematics.solving import measure_residuals, solve
@@ -29,15 +28,16 @@ from marey_motion.editing.inverse_kinematics.targets import (
     SolverOptions,
     Target,
 )
+from marey_motion.editing.limb_smoothing import LimbSmoother, largest_steps
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.constraints import Solver
 
-# Rounds in which constraints of different ranges are met in turn, and the metres or radians that they may still be
-# missed by to end them.
 MOST_ROUNDS = 12
-SETTLED = 1e-3
+"""Maximum number of rounds in which constraints on different ranges of frames are solved one after another."""
+SMALL_ERROR = 1e-3
+"""Error, in metres or radians, below which all constraints must be for the rounds to end early."""
 _PER_FRAME = 40_000
 """Work per frame, in nanoseconds, to prepare the arrays, measure the errors and evaluate closed forms."""
 _LIMIT_PASSES = 4
@@ -177,7 +177,7 @@ def _check_range(constraint: Constraint, number: int, frames: int) -> None:
 
 
 def residuals_of(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> Floats:
-    """Compute the error of a constraint in each of its frames.
+    """Compute the error of a constraint in each of its frames: how far the motion misses the target.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def residuals_of(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> 
 
     Returns
     -------
-    (n,) float64    metres or radians
+    (n,) float64    metres for a position target, radians for an orientation or look-at target
     """
     part = motion.at_frames(np.arange(constraint.start, constraint.stop))
     return measure_residuals(skeleton, part, [constraint.target])[:, 0]
@@ -241,12 +241,12 @@ class _Cluster:
         for _ in range(MOST_ROUNDS if len(spans) > 1 else 0):
             for together in spans.values():
                 motion = self._met(motion, together, blend_frames)
-            if max(residuals_of(self.skeleton, motion, one).max() for one in self.constraints) < SETTLED:
+            if max(residuals_of(self.skeleton, motion, one).max() for one in self.constraints) < SMALL_ERROR:
                 break
         return self._met(motion, self.constraints, blend_frames)
 
     def _met(self, motion: Motion, constraints: Sequence[Constraint], blend_frames: int) -> Motion:
-        self.budget.spend(PER_MEETING + PER_MET_NUMBER * motion.rotations.size)
+        self.budget.spend(PER_CONSTRAINT_GROUP + PER_CONSTRAINED_NUMBER * motion.rotations.size)
         frames = np.unique(np.concatenate([np.arange(one.start, one.stop) for one in constraints]))
         active = np.array([(frames >= one.start) & (frames < one.stop) for one in constraints])
         given = motion.at_frames(frames)
@@ -275,7 +275,7 @@ class _Cluster:
         made = solved(given, targets, neighbours)
         if limb is None or self._method(constraints, limb, joints) != "two_bone" or not self.damping_zone_rad:
             return made
-        return self._calmed(given, made, targets, limb, neighbours, solved)
+        return self._smoothed(given, made, targets, limb, neighbours, solved)
 
     def _solver_of(
         self, constraints: Sequence[Constraint], limb: TwoBoneLimb | None, joints: tuple[int, ...]
@@ -291,7 +291,7 @@ class _Cluster:
 
         return solved
 
-    def _calmed(
+    def _smoothed(
         self,
         given: Motion,
         made: Motion,
@@ -300,7 +300,11 @@ class _Cluster:
         neighbours: Neighbours,
         solved: Callable[[Motion, Sequence[Target], Neighbours], Motion],
     ) -> Motion:
-        """Use smoother targets in runs of frames in which the limb jumps; `made` is the solution for `targets`."""
+        """Replace the solution in runs of frames in which the limb jumps by the solution for smoother targets.
+
+        `given` is the motion before it is solved, and `made` is the solution for `targets`. Returns `made` if the
+        position target has a pole or an offset.
+        """
         (place,) = (one for one in targets if isinstance(one, PositionTarget))
         if place.pole is not None or np.any(place.offset):
             return made
@@ -310,12 +314,12 @@ class _Cluster:
             run = Neighbours(neighbours.frames[rows], neighbours.reach)
             others = [_rows_of(one, rows) for one in targets if one is not place]
             usual = self.usual[[limb.middle, limb.end]]
-            calm = CalmLimb(
+            smoother = LimbSmoother(
                 self.skeleton, limb, given.sliced(start, stop), usual, run.reach, 0.5 * self.damping_zone_rad
             )
             again = partial(_solved_for, solved, place, others, run)
             path = np.broadcast_to(place.values, (len(neighbours.frames), 3))[rows]
-            rotations[rows] = calm.solved(path, again, made.sliced(start, stop)).rotations
+            rotations[rows] = smoother.solved(path, again, made.sliced(start, stop)).rotations
         return made._replace(rotations=rotations)
 
     def _work(

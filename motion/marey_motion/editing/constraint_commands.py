@@ -1,4 +1,4 @@
-"""The commands of an edit that use inverse kinematics."""
+"""Edit commands that use inverse kinematics: `constrain` and `plant_feet`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.editing.calm_limbs import largest_steps
 from marey_motion.editing.compute_budget import PER_NUMBER, PER_PLANTED_NUMBER, PER_RIG
 from marey_motion.editing.constraining import Constraint, constrain_motion, current_values, residuals_of
 from marey_motion.editing.constraint_warnings import contradictions, joined, jumps, missed, require_acting
@@ -29,6 +28,7 @@ from marey_motion.editing.inverse_kinematics.targets import (
     Target,
     chain_of,
 )
+from marey_motion.editing.limb_smoothing import largest_steps
 from marey_motion.editing.take import EditFinding, Take
 from marey_motion.errors import MappingError, MotionError
 from marey_motion.rigs import JointAxes, guess_axes
@@ -43,7 +43,7 @@ from marey_schemas.editing.constraints import (
 )
 
 _OPTIONS = SolverOptions()
-# Joints that look with their front; others point along their bone.
+# Standard joints whose forward axis is directed at a look-at target; other joints use the direction of their bone.
 _LOOKING = ("pelvis", "spine", "spine_1", "spine_2", "neck", "head")
 
 
@@ -86,13 +86,13 @@ def constrain(take: Take, command: Constrain) -> Take:
         [residuals_of(take.skeleton, motion, one) for one in wanted] for motion in (take.motion, made.motion)
     )
     found = [_finding(*each) for each in zip(command.constraints, wanted, before, after, strict=True)]
-    edited = take.moved(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
+    edited = take.with_motion(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
     warnings = [*contradictions(wanted), *joined(pairs), *missed(wanted, after)]
     warnings += jumps(take.skeleton, take.motion, made.motion, wanted, blend)
     if blend > take.frame_count:
         warnings.append(f"the blend of {command.blend_s:g} s is longer than the clip")
     for warning in warnings:
-        edited = edited.warned("constrain", warning)
+        edited = edited.with_warning("constrain", warning)
     return edited
 
 
@@ -111,7 +111,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
     Raises
     ------
     MappingError    if the mapping does not define both legs
-    EditError    if the frames do not exist
+    EditError    if the take lacks one of the frames
     """
     take.budget.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
     rig = _Rig(take)
@@ -123,7 +123,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
         "slide_after_m": made.slide_after_m,
         "lowered_m": made.lowered_m,
     }
-    return take.moved(made.motion).with_finding(EditFinding("plant_feet", values))
+    return take.with_motion(made.motion).with_finding(EditFinding("plant_feet", values))
 
 
 class _Rig:

@@ -11,10 +11,10 @@ from itertools import combinations
 import numpy as np
 
 from marey_motion.arrays import Flags, Floats
-from marey_motion.editing.calm_limbs import allowed_steps, largest_steps
 from marey_motion.editing.constraining import Constraint
 from marey_motion.editing.constraint_windows import JoinedWindows
 from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget, SolverOptions, Target
+from marey_motion.editing.limb_smoothing import allowed_steps, largest_steps
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
@@ -50,7 +50,7 @@ def require_acting(skeleton: Skeleton, constraint: Constraint, *, root_moves: bo
     names = skeleton.joint_names
     turning = ", ".join(names[joint] for joint in constraint.joints)
     raise EditError(
-        f"turning {turning} does not move {names[target.joint]}, so its position cannot be constrained; choose a "
+        f"turning {turning} does not move {names[target.joint]}, so this position constraint has no effect; choose a "
         "higher joint as top, or set root_moves",
         code="constraint-idle",
         where="joint",

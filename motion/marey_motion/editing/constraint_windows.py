@@ -9,14 +9,14 @@ from itertools import permutations
 import numpy as np
 
 from marey_motion.arrays import Floats
-from marey_motion.editing.calm_limbs import MOST_STEP
 from marey_motion.editing.constraining import Constraint
 from marey_motion.editing.inverse_kinematics.targets import PositionTarget
+from marey_motion.editing.limb_smoothing import MOST_STEP
 
 
 @dataclass(frozen=True)
 class JoinedWindows:
-    """Two successive constraints of one joint, whose windows were shortened because the joint would jump between them.
+    """Two successive constraints of one joint, whose ranges of frames (windows) are too close for a smooth change.
 
     Parameters
     ----------

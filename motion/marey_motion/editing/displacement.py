@@ -23,14 +23,15 @@ from marey_motion.motion import Motion
 
 # Values of a cubic B-spline at its control points' frames.
 WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
-BENDING, PULLING = (1.0, -2.0, 1.0), (1.0, -1.0)
-# Tension falls with the square of the frames that swings may take: for the curve that bends least, this share of all.
+BENDING_STENCIL, TENSION_STENCIL = (1.0, -2.0, 1.0), (1.0, -1.0)
 SWING_SHARE = 1.0 / 6.0
-# As shares of the frames over which a change is blended: how far the tense curve swings, and what neighbours even out.
+"""Number of frames to which the overshoot of the first curve is limited, as a share of the frames of the window."""
 SINGLE_SWING_SHARE = 1.0 / 60.0
+"""Number of frames to which the overshoot of the second curve is limited, as a share of the blended frames."""
 NEIGHBOURS_SHARE = 0.2
-# Weight of meeting the given frames beside bending; what is then still missed is fitted again, until nothing is.
-MEETING = 1e4
+"""Number of frames over which given changes are smoothed, as a share of the blended frames."""
+# Weight of the given values relative to the bending energy. The remaining errors are fitted again, until they vanish.
+FIT_WEIGHT = 1e4
 MOST_REFINEMENTS = 40
 MISSED_SHARE = 1e-13
 
@@ -188,13 +189,13 @@ def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Flo
     most_missed = MISSED_SHARE * np.abs(values).max(initial=0.0)
     for i in range(3):
         for j in range(i + 1):
-            np.add.at(bands[i - j], columns[:, j], MEETING * weights[:, i] * weights[:, j])
+            np.add.at(bands[i - j], columns[:, j], FIT_WEIGHT * weights[:, i] * weights[:, j])
     factor = cholesky_banded(bands[:count], lower=True, check_finite=False)
     points, rest = np.zeros((count, values.shape[1])), values
     for _ in range(MOST_REFINEMENTS):
         right = np.zeros_like(points)
         for i in range(3):
-            np.add.at(right, columns[:, i], MEETING * weights[:, i, None] * rest)
+            np.add.at(right, columns[:, i], FIT_WEIGHT * weights[:, i, None] * rest)
         points += cho_solve_banded((factor, True), right, check_finite=False)
         rest = values - np.einsum("ni,nic->nc", weights, points[columns])
         if np.abs(rest).max(initial=0.0) <= most_missed:
@@ -215,7 +216,7 @@ def _energy(count: int, window: Window, swing: float) -> Floats:
     """
     bands = np.zeros((4, count))
     tension = swing**-2
-    for stencil, factor in ((BENDING, 1.0), (PULLING, tension)):
+    for stencil, factor in ((BENDING_STENCIL, 1.0), (TENSION_STENCIL, tension)):
         reach = len(stencil) - 1
         rows = np.arange(0 if not window.smooth_start else -reach, count - (0 if window.smooth_stop else reach))
         for i, a in enumerate(stencil):

@@ -14,17 +14,19 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 FAR_M = 0.05
-"""Error in metres: if a position is missed by more before the final step, the model counts as unable to reach it."""
+"""Error of a position constraint before the final step, in metres, above which the model counts as unable to meet it.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class FinishedMotion:
-    """A motion that meets its constraints.
+    """A motion whose constrained joints were moved to their targets in a final step.
 
     Parameters
     ----------
     motion : the whole motion
-    residual_before, residual_after : (C,) largest error of each constraint in its frames: metres, or radians
+    residual_before, residual_after : (C,) largest error of each constraint in its frames, before and after the final
+        step: metres for a position, radians for an orientation or look-at target
     far : (C,) True for position constraints with `residual_before` above `FAR_M`
     """
 
@@ -43,7 +45,7 @@ def finish(
     freedom: Freedom | None = None,
     options: SolverOptions | None = None,
 ) -> FinishedMotion:
-    """Move constrained joints exactly to their targets; the change is blended over a window with a cubic spline.
+    """Move constrained joints to their targets by inverse kinematics, and blend the change with a cubic spline.
 
     Parameters
     ----------

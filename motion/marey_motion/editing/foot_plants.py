@@ -32,11 +32,12 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.constraints import PlantOptions
 
 MOST_LOWERING_M = 0.1
+"""Greatest distance, in metres, by which the root is lowered so that the legs reach the planted feet."""
 SHORTEST_CONTACT_S = 0.06
 """Duration, in seconds, below which a contact counts as noise."""
 MOST_SUNK_M = 0.005
 """Greatest permitted depth of a planted sole below the floor, in metres, while the foot rolls."""
-# Less than this is rounding.
+# Metres; smaller values are rounding errors.
 SHORTEST_LOWERING_M = 1e-9
 
 
@@ -71,7 +72,8 @@ def find_feet(skeleton: Skeleton, mapping: JointMapping, axes: Mapping[str, Join
         leg = limb_ending_at(skeleton, mapping, ankle, axes)
         if leg is None:
             raise MappingError(
-                "the mapped hip, knee and ankle are not one chain of joints; correct the mapping", where=f"{side}_ankle"
+                "the mapped hip, knee and ankle are not a chain of joints in this order; correct the joint mapping",
+                where=f"{side}_ankle",
             )
         toe = f"{side}_toe"
         feet.append(Foot(leg, mapping.indices(skeleton, (toe,))[0] if toe in mapping.joints else ankle))
@@ -194,9 +196,9 @@ def _sunk_m(skeleton: Skeleton, motion: Motion, planted: Motion, feet: Sequence[
 
 
 def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: PlantOptions) -> FootContacts:
-    """Find the frames in which toe and ankle of a foot are slow.
+    """Find the frames in which a foot touches the ground, with its toe (if the toe is slow) or heel (if the ankle is).
 
-    Contacts shorter than `SHORTEST_CONTACT_S` count as noise; then gaps shorter than this count as noise, too.
+    Contacts shorter than `SHORTEST_CONTACT_S` are removed as noise; then gaps shorter than this duration are closed.
 
     Parameters
     ----------
@@ -347,7 +349,7 @@ def _enveloped(values: Floats, blend: int) -> Floats:
     The curve is zero in frames farther than 2·`blend` frames from any positive value. It changes slowly, so that the
     body does not bob.
     """
-    from scipy.ndimage import convolve1d, maximum_filter1d  # brings much of scipy: only who needs it shall wait
+    from scipy.ndimage import convolve1d, maximum_filter1d  # imported here, because this import is slow
 
     weights = np.hanning(2 * blend + 3)[1:-1]
     highest = maximum_filter1d(values, 2 * blend + 1, mode="nearest")

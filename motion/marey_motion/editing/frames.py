@@ -12,7 +12,7 @@ from marey_schemas.editing.commands import Resample, Retime, Split, Trim
 
 
 def trim(take: Take, command: Trim) -> Take:
-    """Keep a range of frames.
+    """Keep a range of frames of a take, and remove all other frames.
 
     Parameters
     ----------
@@ -25,19 +25,19 @@ def trim(take: Take, command: Trim) -> Take:
 
     Raises
     ------
-    EditError    if the frames do not exist
+    EditError    if the take lacks one of the frames
     """
     first, last = take.frames((command.start, command.stop))
-    return take.moved(take.motion.sliced(first, last))
+    return take.with_motion(take.motion.sliced(first, last))
 
 
 def split(take: Take, command: Split) -> tuple[Take, ...]:
-    """Cut a take into pieces.
+    """Cut a take into pieces, each of which becomes a take.
 
     Parameters
     ----------
     take : Take    F frames
-    command : Split    the cuts
+    command : Split    frames at which the take is cut: the first frame of each piece but the first
 
     Returns
     -------
@@ -57,7 +57,7 @@ def split(take: Take, command: Split) -> tuple[Take, ...]:
                 where="at",
             )
     return tuple(
-        replace(take.moved(take.motion.sliced(start, stop)), pieces=(*take.pieces, number))
+        replace(take.with_motion(take.motion.sliced(start, stop)), pieces=(*take.pieces, number))
         for number, (start, stop) in enumerate(pairwise(bounds), start=1)
     )
 
@@ -102,4 +102,4 @@ def retime(take: Take, command: Retime) -> Take:
     """
     slowed_hz = take.frame_rate_hz / command.speed
     take.require_room(count_samples(take.frame_count, take.frame_rate_hz, slowed_hz))
-    return take.moved(resample_motion(take.motion, take.frame_rate_hz, slowed_hz))
+    return take.with_motion(resample_motion(take.motion, take.frame_rate_hz, slowed_hz))

@@ -21,7 +21,8 @@ from marey_schemas.options.annotations import ContactOptions
 
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05
-"""Quantile of the heights of the lower sole that counts as the ground if the lower foot is never in stance."""
+"""Quantile of the height of the lower sole, over all frames, that counts as the ground if the lower foot never stands.
+"""
 
 SOLE_SHARE = 0.05
 """Height above the floor of the ball of a standing foot in a shoe, as a share of the length of the leg."""
@@ -62,7 +63,7 @@ def move_to_ground(take: Take, command: MoveToGround) -> Take:
     MappingError    if the feet are not known
     """
     ground = estimate_ground(take, command.sole_m) if command.height_m is None else Ground(command.height_m, 0)
-    moved = take.moved(shifted(take.motion, np.array((0.0, -ground.height_m, 0.0))))
+    moved = take.with_motion(shifted(take.motion, np.array((0.0, -ground.height_m, 0.0))))
     if command.height_m is not None:
         return moved
     return moved.with_finding(EditFinding("move_to_ground", ground._asdict()))
@@ -124,7 +125,7 @@ def find_contacts(take: Take, command: FindContacts) -> Take:
 def estimate_ground(take: Take, sole_m: float | None = None) -> Ground:
     """Estimate the height of the ground: the median height of the lower sole while the foot of that sole is in stance.
 
-    The median is robust against a foot that is below the floor for some frames and against a kick that is held.
+    The median is hardly affected if a foot is below the floor in some frames, or is kept in the air for a while.
 
     Parameters
     ----------
@@ -240,10 +241,10 @@ def _stances(take: Take, options: ContactOptions) -> tuple[list[Stance], ...]:
 
 
 def _ground_of(heights: Floats, stances: tuple[list[Stance], ...]) -> Ground:
-    told = heights[lower_soles_in_stance(heights, stances)]
-    if told.size == 0:
+    lower = heights[lower_soles_in_stance(heights, stances)]
+    if lower.size == 0:
         return Ground(float(np.quantile(heights.min(axis=1), LOWEST_SHARE)), 0)
-    return Ground(float(np.median(told)), int(told.size))
+    return Ground(float(np.median(lower)), int(lower.size))
 
 
 def _soles_of(take: Take) -> Floats:

@@ -1,4 +1,4 @@
-"""The command that joins two takes."""
+"""Edit command that appends a clip to a take: `concatenate`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.editing.annotations.contacts import contact_labels
 from marey_motion.editing.borders import blended, smooth_step
-from marey_motion.editing.calm_limbs import MOST_STEP, largest_steps
 from marey_motion.editing.foot_plants import Foot
 from marey_motion.editing.ground import heights_of_soles
 from marey_motion.editing.kept_feet import feet_as_motion, feet_of, with_feet
-from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, seam_offset
+from marey_motion.editing.limb_smoothing import MOST_STEP, largest_steps
+from marey_motion.editing.offsets import VELOCITY_S, add_offset, decayed_offset, seam_offset
 from marey_motion.editing.placement import body_track, moved_over
 from marey_motion.editing.take import EditFinding, Take, motion_of
 from marey_motion.editing.translations import with_equal_joints
@@ -58,15 +58,17 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     take, source, left_out = _without_rest_poses(take, command.source)
     added = _same_rate(take, source)
     first, second = with_equal_joints(take.motion, added.motion, take.skeleton)
-    before, after = take.moved(first), added.moved(second)
+    before, after = take.with_motion(first), added.with_motion(second)
     count = take.count_frames(command.blend_s)
     overlap = min(count, before.frame_count, after.frame_count) if command.blend == "slerp" else 0
     if left_out:
         take = take.with_finding(EditFinding("concatenate", left_out))
     if command.blend_s * take.frame_rate_hz > min(before.frame_count, after.frame_count):
-        take = take.warned("concatenate", f"the blend of {command.blend_s:g} s is longer than one of the two clips")
+        take = take.with_warning(
+            "concatenate", f"the blend of {command.blend_s:g} s is longer than one of the two clips"
+        )
     if command.place == "keep" and count == 0:
-        return take.moved(_in_a_row(first, second))
+        return take.with_motion(_in_a_row(first, second))
     seam = _seam(before, after, overlap) if command.place == "seam" else LoopSeam(0.0, np.zeros(2))
     body, carrier = take.skeleton, take.body.carrier
     stays = all(root_stands(motion, body, carrier) for motion in (first, second))
@@ -77,7 +79,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     if command.keep_feet and count:
         joined = _with_kept_feet(take, first, second, joined, overlap, count)
     fast = _fastest(take.skeleton, first, second, joined) if count else None
-    return take.moved(joined) if fast is None else take.moved(joined).warned("concatenate", fast)
+    return take.with_motion(joined) if fast is None else take.with_motion(joined).with_warning("concatenate", fast)
 
 
 def _fastest(skeleton: Skeleton, first: Motion, second: Motion, joined: Motion) -> str | None:
@@ -116,7 +118,7 @@ def _without_rest_poses(take: Take, name: str) -> tuple[Take, Clip, dict[str, in
     left_out = {}
     if end:
         left_out["rest_pose_frames_before_seam"] = end
-        take = take.moved(take.motion.sliced(0, take.frame_count - end))
+        take = take.with_motion(take.motion.sliced(0, take.frame_count - end))
     if start:
         left_out["rest_pose_frames_after_seam"] = start
         clip = Motion.of(clip).sliced(start, clip.frame_count).as_clip(clip.skeleton, clip.frame_rate_hz)
@@ -127,7 +129,7 @@ def _same_rate(take: Take, clip: Clip) -> Take:
     """Resample a source clip to the rate of the take. Raises `EditError` if the result is too long."""
     count = count_samples(clip.frame_count, clip.frame_rate_hz, take.frame_rate_hz)
     take.require_room(take.frame_count + count)
-    return take.moved(resample_motion(motion_of(clip), clip.frame_rate_hz, take.frame_rate_hz))
+    return take.with_motion(resample_motion(motion_of(clip), clip.frame_rate_hz, take.frame_rate_hz))
 
 
 def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
@@ -144,7 +146,7 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
         return LoopSeam(turn, target[[0, 2]] - rotated(start[[0, 2]], turn))
     ends, end_headings = body_track(before, max(0, before.frame_count - 2), before.frame_count)
     starts, start_headings = body_track(after, 0, min(2, after.frame_count))
-    # One frame alone stands still: it is its own neighbour.
+    # A motion of one frame stands still, so its frame is used twice.
     rows = np.stack((starts[0], starts[-1], ends[0], ends[-1]))[:, [0, 2]]
     return loop_seam(rows, np.array([start_headings[0], start_headings[-1], end_headings[0], end_headings[-1]]))
 
@@ -223,7 +225,7 @@ def _inertialised(first: Motion, second: Motion, count: int, frame_rate_hz: floa
     difference, velocity = seam_offset(first, second)
     ages = np.arange(min(count, second.frame_count), dtype=np.float64)
     velocity_life = min(float(count), max(1.0, VELOCITY_S * frame_rate_hz))
-    left = dying_away(difference, velocity, ages, float(count), velocity_life)
+    left = decayed_offset(difference, velocity, ages, float(count), velocity_life)
     return add_offset(second, np.arange(len(ages)), left)
 
 

@@ -20,7 +20,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.commands import Paste, RotateJoint
 
 SAME_AXES_RAD = 0.02
-"""Largest angle, in radians, between rest rotations that count as equal: those of two subjects differ a little."""
+"""Largest angle, in radians, between the rest rotations of a joint in two skeletons that counts as no difference."""
 
 
 def paste(take: Take, command: Paste) -> Take:
@@ -42,7 +42,7 @@ def paste(take: Take, command: Paste) -> Take:
     Raises
     ------
     UnknownJoint    if a joint does not exist; the error names it
-    EditError    if the source or the frames do not exist, or if the axes of a joint differ in the two skeletons
+    EditError    if the source or one of the frames is missing, or if the axes of a joint differ in the two skeletons
     """
     clip = take.source(command.source)
     targets = sorted({take.joint(name) for name in command.joints})
@@ -57,7 +57,7 @@ def paste(take: Take, command: Paste) -> Take:
             column = own.translated_joints.index(target)
             there = _translations_of(copied, origin, take.skeleton.offsets[target])
             translations[span, column] += shares[:, None] * (there - translations[span, column])
-    return take.moved(own._replace(rotations=rotations, translations=translations))
+    return take.with_motion(own._replace(rotations=rotations, translations=translations))
 
 
 def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> list[int]:
@@ -81,7 +81,7 @@ def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> l
 def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, count: int) -> Motion:
     """Resample the range `frames` of a clip to `count` frames. Raises `EditError` if the clip lacks these frames."""
     try:
-        start, stop = take.moved(motion_of(clip)).frames(frames)
+        start, stop = take.with_motion(motion_of(clip)).frames(frames)
     except EditError as error:
         error.where = "source_frames"
         raise
@@ -121,7 +121,7 @@ def rotate_joint(take: Take, command: RotateJoint) -> Take:
     Raises
     ------
     UnknownJoint    if a joint does not exist; the error names it
-    EditError    if the frames do not exist
+    EditError    if the take lacks one of the frames
     """
     index = take.joint(command.joint)
     span, shares = range_weights(take, command.frames, command.border_s)
@@ -129,10 +129,10 @@ def rotate_joint(take: Take, command: RotateJoint) -> Take:
     rotations = take.motion.rotations.copy()
     if command.space == "joint":
         rotations[span, index] = quaternions.multiply(rotations[span, index], turns)
-        return take.moved(take.motion._replace(rotations=rotations))
+        return take.with_motion(take.motion._replace(rotations=rotations))
     parent = int(take.skeleton.parents[index])
     if command.space == "world" and parent >= 0:
         frame = kinematics.as_global_rotations(take.skeleton, rotations[span])[:, parent]
         turns = quaternions.multiply(quaternions.conjugate(frame), quaternions.multiply(turns, frame))
     rotations[span, index] = quaternions.multiply(turns, rotations[span, index])
-    return take.moved(take.motion._replace(rotations=np.ascontiguousarray(rotations)))
+    return take.with_motion(take.motion._replace(rotations=np.ascontiguousarray(rotations)))

@@ -16,12 +16,12 @@ import numpy as np
 
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
-from marey_motion.editing.calm_limbs import CalmLimb, largest_steps
 from marey_motion.editing.compute_budget import PER_PLANTED_NUMBER, PER_RIG
 from marey_motion.editing.foot_plants import Foot, find_feet
 from marey_motion.editing.ground import heights_of_soles
 from marey_motion.editing.inverse_kinematics.solving import solve_two_bone
 from marey_motion.editing.inverse_kinematics.targets import Neighbours, OrientationTarget, PositionTarget
+from marey_motion.editing.limb_smoothing import LimbSmoother, largest_steps
 from marey_motion.editing.take import Take
 from marey_motion.errors import MappingError
 from marey_motion.motion import Motion
@@ -33,8 +33,8 @@ SUNK_M = 1e-4
 """Depth of a sole below its floor, in metres, that counts as rounding."""
 MOST_LIFTS = 5
 """Greatest number of times that feet are lifted and their legs solved again."""
-CALM_S = 0.6
-"""Longest time, in seconds, over which the movement of a leg is slowed down if its knee would jump."""
+SMOOTHING_S = 0.6
+"""Longest time, in seconds, over which the movement of a leg is smoothed if its knee would jump."""
 _ZONE_RAD = radians(PlantOptions().knee_damping_deg)
 ROUNDING = 1e-9
 """Difference, in metres and in components of quaternions, up to which a foot counts as in place."""
@@ -83,14 +83,14 @@ def feet_as_motion(skeleton: Skeleton, motion: Motion, feet: Sequence[Foot]) -> 
 def with_feet(
     take: Take, motion: Motion, feet: Sequence[Foot], wanted: Motion, floors: Floats, frames: slice
 ) -> Motion:
-    """Move feet to given places in a range of frames; soles that would be below the floor are lifted to the floor.
+    """Solve the legs so that the ankles follow given paths; soles are lifted where they would be below the floor.
 
     Parameters
     ----------
-    take : Take    the skeleton
+    take : Take    take whose skeleton and compute budget are used
     motion : Motion    F frames
     feet : sequence of Foot    n feet
-    wanted : Motion    ankles in F frames, in the form of `feet_as_motion`
+    wanted : Motion    positions and rotations of the ankles in F frames, as a motion that `feet_as_motion` makes
     floors : (F, n) float64    height below which no sole may be, metres
     frames : slice    the frames to change
 
@@ -107,7 +107,7 @@ def with_feet(
     moved = apart.max(axis=1) > ROUNDING
     places = [np.asarray(one.positions(take.skeleton), dtype=np.float64) for one in (take.motion, motion)]
     usual = np.maximum(*(largest_steps(one) for one in places))
-    reach = max(1.0, min(CALM_S * take.frame_rate_hz, 0.5 * (stop - start)))
+    reach = max(1.0, min(SMOOTHING_S * take.frame_rate_hz, 0.5 * (stop - start)))
     legs = [_Leg(take, foot, spins[:, number], usual, reach) for number, foot in enumerate(feet)]
     made = _solved(part, legs, ankles)
     for _ in range(MOST_LIFTS):
@@ -133,7 +133,11 @@ def _solved(motion: Motion, legs: Sequence[_Leg], ankles: Floats) -> Motion:
 
 @dataclass(frozen=True, eq=False)
 class _Leg:
-    """A leg whose ankle gets the rotations `spins` (F, 4) in the world; `usual` and `reach` as in `CalmLimb`."""
+    """A leg whose ankle is moved along a path, and gets the rotations `spins` (F, 4) in the world.
+
+    `usual` (J,) are the largest steps of the joints between two frames, in metres; `reach` is the number of frames over
+    which the movement is smoothed if the knee would jump.
+    """
 
     take: Take
     foot: Foot
@@ -144,9 +148,10 @@ class _Leg:
     def solved(self, motion: Motion, ankle: Floats) -> Motion:
         """Move the ankle to the positions `ankle` (F, 3), or only near them in frames in which the knee would jump."""
         leg = self.foot.leg
-        calm = CalmLimb(self.take.skeleton, leg, motion, self.usual[[leg.middle, leg.end]], self.reach, 0.5 * _ZONE_RAD)
+        usual = self.usual[[leg.middle, leg.end]]
+        smoother = LimbSmoother(self.take.skeleton, leg, motion, usual, self.reach, 0.5 * _ZONE_RAD)
         coherent = Neighbours(np.arange(len(ankle)), self.reach)
-        return calm.solved(ankle, partial(self._reached, neighbours=coherent), self._reached(motion, ankle))
+        return smoother.solved(ankle, partial(self._reached, neighbours=coherent), self._reached(motion, ankle))
 
     def _reached(self, motion: Motion, ankle: Floats, neighbours: Neighbours | None = None) -> Motion:
         end = self.foot.leg.end

@@ -1,4 +1,4 @@
-"""Conversion of clips to loops."""
+"""Edit commands that make a clip repeat without a visible seam: `close_loop` and `cut_loop`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from marey_motion.arrays import Floats
 from marey_motion.editing.compute_budget import PER_COMPARED_POSES
-from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, offset_to, step_of
+from marey_motion.editing.offsets import VELOCITY_S, add_offset, decayed_offset, offset_to, step_of
 from marey_motion.editing.placement import body_track, carried, moved_over
 from marey_motion.editing.take import EditFinding, Take
 from marey_motion.errors import EditError
@@ -61,7 +61,7 @@ def close_loop(take: Take, command: CloseLoop) -> Take:
     if command.blend_s is not None:
         life = min(life, max(1.0, command.blend_s * take.frame_rate_hz))
     closed = _closed(motion, seam, life, min(life, max(1.0, VELOCITY_S * take.frame_rate_hz)))
-    return take.moved(root_first(closed, body, carrier, root_stays=stays))
+    return take.with_motion(root_first(closed, body, carrier, root_stays=stays))
 
 
 def cut_loop(take: Take, command: CutLoop) -> Take:
@@ -93,7 +93,7 @@ def cut_loop(take: Take, command: CutLoop) -> Take:
         "travel_m": float(np.hypot(*seam.shift_m)),
         "metric": command.metric,
     }
-    return take.moved(motion).with_finding(EditFinding("cut_loop", values))
+    return take.with_motion(motion).with_finding(EditFinding("cut_loop", values))
 
 
 def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
@@ -121,7 +121,7 @@ def _closed(motion: Motion, seam: LoopSeam, life: float, velocity_life: float) -
     velocity = arrival.minus(step_of(following, 0)).times(0.5)
     touched = np.arange(min(frames, int(np.ceil(life))))
     ages = touched.astype(np.float64)
-    at_end = dying_away(difference.times(-1.0), velocity, ages + 1.0, life, velocity_life)
+    at_end = decayed_offset(difference.times(-1.0), velocity, ages + 1.0, life, velocity_life)
     motion = add_offset(motion, frames - 1 - touched, at_end)
-    at_start = dying_away(difference, velocity, ages, life, velocity_life)
+    at_start = decayed_offset(difference, velocity, ages, life, velocity_life)
     return add_offset(motion, touched, at_start.turned(-seam.turn_rad))

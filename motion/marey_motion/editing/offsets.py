@@ -104,7 +104,7 @@ def offset_to(motion: Motion, frame: int, other: Motion, other_frame: int) -> Po
 
 
 def step_of(motion: Motion, frame: int) -> PoseOffset:
-    """Compute the offset from a frame to the next one; zero at the last frame.
+    """Compute the offset from the pose of a frame to the pose of the next frame; zero at the last frame.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def step_of(motion: Motion, frame: int) -> PoseOffset:
 
     Returns
     -------
-    PoseOffset    of one pose
+    PoseOffset    the offset, without a frame axis
     """
     return offset_to(motion, frame, motion, min(frame + 1, motion.frame_count - 1))
 
@@ -131,7 +131,7 @@ def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
     Returns
     -------
     offset : PoseOffset    offset for the first frame of `after`
-    velocity : PoseOffset    per frame
+    velocity : PoseOffset    initial change of the offset per frame
     """
     arrival, departure = step_of(before, max(0, before.frame_count - 2)), step_of(after, 0)
     velocity = arrival.minus(departure).times(0.5)
@@ -142,7 +142,7 @@ def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
 
 
 def add_offset(motion: Motion, frames: NDArray[np.int64], offset: PoseOffset) -> Motion:
-    """Add offsets to frames.
+    """Add offsets to the poses of some frames.
 
     Parameters
     ----------
@@ -163,13 +163,15 @@ def add_offset(motion: Motion, frames: NDArray[np.int64], offset: PoseOffset) ->
     return motion._replace(root_translations=root, rotations=rotations, translations=translations)
 
 
-def dying_away(offset: PoseOffset, velocity: PoseOffset, ages: Floats, life: float, velocity_life: float) -> PoseOffset:
+def decayed_offset(
+    offset: PoseOffset, velocity: PoseOffset, ages: Floats, life: float, velocity_life: float
+) -> PoseOffset:
     """Compute an offset that decays over time, from its initial value and velocity.
 
     Parameters
     ----------
     offset : PoseOffset    of one pose
-    velocity : PoseOffset    per frame
+    velocity : PoseOffset    initial change of the offset per frame
     ages : (n,) float64    frames since the start
     life, velocity_life : float    frames after which the contribution of the initial value, or of the velocity, is zero
 

@@ -30,22 +30,22 @@ GROUND = np.array([1.0, 0.0, 1.0])
 
 
 def translate(take: Take, command: Translate) -> Take:
-    """Shift the motion.
+    """Shift the whole motion by a constant vector.
 
     Parameters
     ----------
     take : Take    F frames
-    command : Translate    the shift
+    command : Translate    the shift along the axes of the world, metres
 
     Returns
     -------
     Take    F frames
     """
-    return take.moved(shifted(take.motion, np.asarray(command.shift_m)))
+    return take.with_motion(shifted(take.motion, np.asarray(command.shift_m)))
 
 
 def rotate(take: Take, command: Rotate) -> Take:
-    """Rotate the motion about an axis of the world.
+    """Rotate the whole motion about an axis, which is given in the world and passes through a pivot.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def rotate(take: Take, command: Rotate) -> Take:
     """
     turn = np.asarray(quaternions.from_axis_angle(command.axis, radians(command.angle_deg)), dtype=np.float64)
     place = np.zeros(3) if command.pivot == "origin" else body_at(take, 0)[0] * GROUND
-    return take.moved(carried(take.motion, turn, place))
+    return take.with_motion(carried(take.motion, turn, place))
 
 
 def face(take: Take, command: Face) -> Take:
@@ -75,11 +75,12 @@ def face(take: Take, command: Face) -> Take:
 
     Raises
     ------
-    MotionError    if the body has no facing direction in that frame, as when it lies on its side
+    EditError    if the take lacks the frame
+    MotionError    if the body has no facing direction in the frame, as when it lies on its side
     """
     place, heading = body_at(take, command.frame)
     turn = about_vertical(np.asarray(radians(command.heading_deg) - heading))
-    return take.moved(carried(take.motion, turn, place))
+    return take.with_motion(carried(take.motion, turn, place))
 
 
 def move_to_origin(take: Take, command: MoveToOrigin) -> Take:
@@ -93,9 +94,13 @@ def move_to_origin(take: Take, command: MoveToOrigin) -> Take:
     Returns
     -------
     Take    F frames
+
+    Raises
+    ------
+    EditError    if the take lacks the frame
     """
     frame = command.frame
-    return take.moved(shifted(take.motion, -pelvis_track(take, frame, frame + 1)[0] * GROUND))
+    return take.with_motion(shifted(take.motion, -pelvis_track(take, frame, frame + 1)[0] * GROUND))
 
 
 def scale(take: Take, command: Scale) -> Take:
@@ -118,7 +123,7 @@ def scale(take: Take, command: Scale) -> Take:
     chosen = [command.translations or joint in carriers for joint in motion.translated_joints]
     scaled[:, chosen] *= command.factor
     roots = motion.root_translations * command.factor
-    return take.moved(motion._replace(root_translations=roots, translations=scaled))
+    return take.with_motion(motion._replace(root_translations=roots, translations=scaled))
 
 
 def flip_axes(take: Take, command: FlipAxes) -> Take:
@@ -137,18 +142,18 @@ def flip_axes(take: Take, command: FlipAxes) -> Take:
     """
     y, z = _direction(command.up), _direction(command.forward)
     turn = quaternions.from_matrix(np.stack((np.cross(y, z), y, z)))
-    return take.moved(carried(take.motion, np.asarray(turn, dtype=np.float64), np.zeros(3)))
+    return take.with_motion(carried(take.motion, np.asarray(turn, dtype=np.float64), np.zeros(3)))
 
 
 def carried(motion: Motion, turns: Floats, pivots: Floats, shifts: Floats | None = None) -> Motion:
-    """Rotate a motion about points, then shift it.
+    """Rotate a motion, as a whole or each frame by itself, about points, then shift it.
 
     Parameters
     ----------
     motion : Motion    F frames
     turns : (4,) or (F, 4) float64    rotations in the world
-    pivots : (3,) or (F, 3) float64    metres
-    shifts : (3,) or (F, 3) float64, optional    metres
+    pivots : (3,) or (F, 3) float64    points about which to rotate, metres
+    shifts : (3,) or (F, 3) float64, optional    shifts after the rotation, metres
 
     Returns
     -------
@@ -162,7 +167,7 @@ def carried(motion: Motion, turns: Floats, pivots: Floats, shifts: Floats | None
 
 
 def shifted(motion: Motion, shift: Floats) -> Motion:
-    """Shift a motion.
+    """Shift a whole motion by a constant vector in the world.
 
     Parameters
     ----------
@@ -177,7 +182,7 @@ def shifted(motion: Motion, shift: Floats) -> Motion:
 
 
 def moved_over(motion: Motion, seam: LoopSeam) -> Motion:
-    """Rotate a motion about the origin and shift it on the ground.
+    """Rotate a motion about the vertical through the origin, then shift it on the ground.
 
     Parameters
     ----------
@@ -193,7 +198,7 @@ def moved_over(motion: Motion, seam: LoopSeam) -> Motion:
 
 
 def pelvis_track(take: Take, start: int, stop: int) -> Floats:
-    """Compute the positions of the pelvis.
+    """Compute the positions of the pelvis in a range of frames.
 
     Parameters
     ----------
@@ -206,7 +211,7 @@ def pelvis_track(take: Take, start: int, stop: int) -> Floats:
 
     Raises
     ------
-    EditError    if the frames do not exist
+    EditError    if the take lacks one of the frames
     """
     return _positions(take, start, stop)[:, take.body.pelvis]
 
@@ -222,10 +227,11 @@ def body_at(take: Take, frame: int) -> tuple[Floats, float]:
     Returns
     -------
     position : (3,) float64    metres
-    heading : float    radians
+    heading : float    radians, 0 along +z, positive to the left
 
     Raises
     ------
+    EditError    if the take lacks the frame
     MotionError    if the body has no facing direction
     """
     places, headings = body_track(take, frame, frame + 1)
@@ -233,7 +239,7 @@ def body_at(take: Take, frame: int) -> tuple[Floats, float]:
 
 
 def body_track(take: Take, start: int, stop: int) -> tuple[Floats, Floats]:
-    """Compute the positions of the pelvis and the continuous headings of the body.
+    """Compute the positions of the pelvis and the headings of the body in a range of frames.
 
     Parameters
     ----------
@@ -243,10 +249,11 @@ def body_track(take: Take, start: int, stop: int) -> tuple[Floats, Floats]:
     Returns
     -------
     positions : (n, 3) float64    metres
-    headings : (n,) float64    radians
+    headings : (n,) float64    radians, 0 along +z, positive to the left, without jumps by full turns
 
     Raises
     ------
+    EditError    if the take lacks one of the frames
     MotionError    if the body has no facing direction
     """
     positions = _positions(take, start, stop)
@@ -276,7 +283,7 @@ def mirror(take: Take, _command: Mirror) -> Take:
     -------
     Take    the mirrored copy
     """
-    return take.moved(mirror_motion(take.skeleton, take.body.partners, take.motion))
+    return take.with_motion(mirror_motion(take.skeleton, take.body.partners, take.motion))
 
 
 def fix_drift(take: Take, command: FixDrift) -> Take:
@@ -296,7 +303,7 @@ def fix_drift(take: Take, command: FixDrift) -> Take:
 
     Raises
     ------
-    EditError    if the frames do not exist or the range is a single frame
+    EditError    if the take lacks one of the frames, or the range is a single frame
     """
     start, stop = take.frames(command.frames)
     if stop - start < 2:
@@ -310,4 +317,4 @@ def fix_drift(take: Take, command: FixDrift) -> Take:
     pivots = pelvis_track(take, 0, take.frame_count)
     pivots[stop:] = pivots[stop - 1]
     turns = about_vertical(shares * radians(command.turn_deg))
-    return take.moved(carried(take.motion, turns, pivots, shares[:, None] * np.asarray(command.shift_m)))
+    return take.with_motion(carried(take.motion, turns, pivots, shares[:, None] * np.asarray(command.shift_m)))

@@ -24,7 +24,15 @@ from marey_motion.editing.joints import paste, rotate_joint
 from marey_motion.editing.loops import close_loop, cut_loop
 from marey_motion.editing.placement import face, fix_drift, flip_axes, mirror, move_to_origin, rotate, scale, translate
 from marey_motion.editing.smoothing import smooth
-from marey_motion.editing.take import MOST_NUMBERS, EditedBody, EditFinding, Take, motion_of, require_finite, settled
+from marey_motion.editing.take import (
+    MOST_NUMBERS,
+    EditedBody,
+    EditFinding,
+    Take,
+    motion_of,
+    require_finite,
+    with_unit_rotations,
+)
 from marey_motion.errors import EditError, MotionError
 from marey_motion.motion import Motion
 from marey_schemas.editing.commands import Concatenate, NamedCommand, Paste
@@ -128,13 +136,13 @@ def edit_clip(
             place = f"commands[{number}] ({command.command})"
             error.where = place if error.where is None else f"{place}, {error.where}"
             raise
-    with np.errstate(over="ignore"):  # what is too large in single precision is refused as not finite
+    with np.errstate(over="ignore"):  # values too large for single precision are refused later
         clips = [take.motion.as_clip(take.skeleton, take.frame_rate_hz) for take in takes]
     return tuple(EditedClip(clip, take.pieces, take.findings) for clip, take in zip(clips, takes, strict=True))
 
 
 def apply_edit(clip: Clip, commands: Sequence[AnyCommand], **given: Any) -> Clip:
-    """Apply commands to a clip like `edit_clip`, and return the only result.
+    """Apply commands to a clip, and return the single clip that they make (see `edit_clip`).
 
     Parameters
     ----------
@@ -177,7 +185,7 @@ def apply_command(take: Take, command: AnyCommand) -> tuple[Take, ...]:
     """
     take.budget.spend(PER_COMMAND + PER_NUMBER * _size_for(take, command))
     made = COMMANDS[command.command](take, command)
-    return tuple(_settled(one, take.motion) for one in (made if isinstance(made, tuple) else (made,)))
+    return tuple(_checked(one, take.motion) for one in (made if isinstance(made, tuple) else (made,)))
 
 
 def _size_for(take: Take, command: AnyCommand) -> int:
@@ -186,7 +194,7 @@ def _size_for(take: Take, command: AnyCommand) -> int:
     return take.size + (0 if other is None else other.poses.size)
 
 
-def _settled(take: Take, before: Motion) -> Take:
+def _checked(take: Take, before: Motion) -> Take:
     """Check that changed numbers are finite, and normalise changed rotations to unit length; return the take.
 
     The signs of the rotations are made continuous, too.
@@ -196,4 +204,4 @@ def _settled(take: Take, before: Motion) -> Take:
         require_finite(motion.root_translations)
     if motion.translations is not before.translations:
         require_finite(motion.translations)
-    return take if motion.rotations is before.rotations else take.moved(settled(motion))
+    return take if motion.rotations is before.rotations else take.with_motion(with_unit_rotations(motion))

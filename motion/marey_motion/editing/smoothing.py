@@ -51,7 +51,7 @@ def smooth(take: Take, command: Smooth) -> Take:
     Raises
     ------
     UnknownJoint    if a joint does not exist; the error names it
-    EditError    if the frames do not exist, if the window is too short for the polynomials, or if a joint
+    EditError    if the take lacks one of the frames, if the window is too short for the polynomials, or if a joint
         spins so fast that its rotations have no mean
     """
     motion = take.motion
@@ -61,7 +61,7 @@ def smooth(take: Take, command: Smooth) -> Take:
     columns = slice(None) if command.joints is None else chosen
     weights = _weights(take, command)
     if command.window_s * take.frame_rate_hz > 2.0 * take.frame_count:
-        take = take.warned(
+        take = take.with_warning(
             "smooth", f"the window of {command.window_s:g} s is longer than the clip, so it was shortened"
         )
     take.budget.spend(take.size * min(PER_TAP * len(weights), MOST_OF_TAPS))
@@ -75,7 +75,7 @@ def smooth(take: Take, command: Smooth) -> Take:
     steps = _smooth_positions(translations[:, moved], weights) - translations[:, moved]
     translations[span, moved] += shares[:, None, None] * steps[span]
     made = motion._replace(root_translations=root, rotations=rotations, translations=translations)
-    return take.moved(_with_kept_feet(take, made, weights, span, shares) if command.keep_feet else made)
+    return take.with_motion(_with_kept_feet(take, made, weights, span, shares) if command.keep_feet else made)
 
 
 def _with_kept_feet(take: Take, smoothed: Motion, weights: Floats, span: slice, shares: Floats) -> Motion:

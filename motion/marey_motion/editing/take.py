@@ -1,4 +1,4 @@
-"""The input and output of the commands of an edit."""
+"""Takes, which the commands of an edit receive and return: a motion with its skeleton, findings and limits."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class Take:
         motion = self.motion
         return int(motion.root_translations.size + motion.rotations.size + motion.translations.size)
 
-    def moved(self, motion: Motion) -> Take:
+    def with_motion(self, motion: Motion) -> Take:
         """Replace the motion with another one of the same body and frame rate.
 
         Parameters
@@ -154,7 +154,7 @@ class Take:
         """
         return replace(self, findings=(*self.findings, finding))
 
-    def warned(self, command: str, warning: str) -> Take:
+    def with_warning(self, command: str, warning: str) -> Take:
         """Add a finding that warns of a parameter that does not fit the motion.
 
         Parameters
@@ -249,7 +249,7 @@ class Take:
         return round(seconds * self.frame_rate_hz)
 
     def require_room(self, frames: int) -> None:
-        """Check that a motion with a given number of frames is not too large.
+        """Check that a motion with a given number of frames is not too large, and subtract its work from the budget.
 
         Parameters
         ----------
@@ -257,13 +257,14 @@ class Take:
 
         Raises
         ------
-        EditError    if such a motion would have more values than `most_numbers`
+        EditError    if the motion would have more values than `most_numbers`, or its work exceeds the budget
         """
         width = 3 + 4 * self.skeleton.joint_count + 3 * len(self.motion.translated_joints)
         most = self.most_numbers // width
         if frames > most:
             raise EditError(
-                f"the edited clip would have {frames:,} frames; with this skeleton a clip may have at most {most:,}",
+                f"the edited clip would have {frames:,} frames; with this skeleton a clip may have at most {most:,}; "
+                "choose a shorter clip or a lower frame rate",
                 code="edit-too-large",
             )
         self.budget.spend(PER_NUMBER * width * frames)
@@ -281,7 +282,7 @@ def motion_of(clip: Clip) -> Motion:
     Motion    F frames
     """
     nothing = np.zeros((clip.frame_count, 0, 3))
-    return settled(
+    return with_unit_rotations(
         Motion(
             clip.root_translations.astype(np.float64),
             clip.rotations.astype(np.float64),
@@ -291,10 +292,10 @@ def motion_of(clip: Clip) -> Motion:
     )
 
 
-def settled(motion: Motion) -> Motion:
-    """Bring rotations to unit length and continuous sign.
+def with_unit_rotations(motion: Motion) -> Motion:
+    """Normalise rotations to unit length, and choose the signs of quaternions so that they are continuous in time.
 
-    Rotations of unit length in single precision stay unchanged.
+    Rotations whose length is 1 within single precision are not normalised.
 
     Parameters
     ----------

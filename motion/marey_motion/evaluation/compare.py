@@ -28,7 +28,7 @@ SAME_CHANGE = 1e-12
 """Relative difference up to which two values count as equal, because rounding can cause a difference of this size."""
 
 OBJECTIVE = "objective"
-"""Name of the objective of an improvement, whose change is reported in metres, in the form of a `MetricChange`."""
+"""Name under which the change of an objective (`improvement.objective`), in metres, is reported as `MetricChange`."""
 
 LESS_IS_BETTER = (
     OBJECTIVE,
@@ -49,7 +49,10 @@ LESS_IS_BETTER = (
     "foot_depth_p95",
     "treading_per_s",
 )
-"""Metrics for which a lower value is better, one family in Holm's correction; all other metrics are the second."""
+"""Metrics for which a lower value is better.
+
+They form one family in Holm's correction; all other metrics form the second family.
+"""
 
 
 @dataclass(frozen=True)
@@ -95,10 +98,10 @@ class MetricChange:
 
 @dataclass(frozen=True)
 class TrialChange:
-    """A trial whose records in two evaluations differ, with the first tick that differs and the mean offset in both.
+    """A trial whose simulation differs between two evaluations: the first tick that differs, and both mean offsets.
 
-    Records are those of the first replicate, and offsets are means over all replicates. `same_motion` is true if only
-    the names of displayed clips differ and all numbers are equal.
+    The first replicates are compared tick by tick; the offsets, in metres, are means over all replicates. `same_motion`
+    is true if only the names of displayed clips differ and all numbers are equal.
     """
 
     trial: str
@@ -115,7 +118,7 @@ class Comparison:
     Parameters
     ----------
     metrics : changes of the metrics that exist in both evaluations, in alphabetical order
-    changed : the trials whose records differ, in the suite's order
+    changed : the trials whose simulations differ, in the order of the suite
     removed, added : uids of the clips that are only in the first set, or only in the second
     newly_unused : uids of clips that are in both sets, but were used only in the first evaluation
     coverage_change_s : (V, O) float64    seconds of data gained per cell of the coverage map
@@ -171,7 +174,11 @@ def _compared(before: EvaluationResult, after: EvaluationResult) -> Comparison:
     """Compare two evaluations; probabilities are not corrected."""
     require_same_conditions(before, after)
     if not (len(before.records) == len(before.trials) == len(after.trials) == len(after.records)):
-        raise MotionError("both evaluations must contain the records of all their trials", code="records-missing")
+        raise MotionError(
+            "an evaluation lacks the records of its trials; read both evaluations with their records, or make them "
+            "again",
+            code="records-missing",
+        )
     uids = {clip.uid for clip in before.clips}, {clip.uid for clip in after.clips}
     used = _used(before), _used(after)
     return Comparison(
@@ -206,7 +213,8 @@ def paired_change(metric: str, before: Floats, after: Floats) -> MetricChange:
 
     Returns
     -------
-    MetricChange    mean change, its bounds, and its probability without a correction for other metrics
+    MetricChange    mean change, its bounds, and the probability of such a change by chance, which is not yet corrected
+        for the number of metrics
     """
     both = np.isfinite(before) & np.isfinite(after)
     defined = both.any(axis=0)
@@ -226,10 +234,10 @@ def paired_change(metric: str, before: Floats, after: Floats) -> MetricChange:
 
 
 def _differences(before: Floats, after: Floats) -> Floats:
-    """Subtract values; a difference that rounding can cause is 0.
+    """Subtract `before` from `after`; a difference that rounding can explain becomes 0.
 
-    Rounding differs if sums over clips have another order, because the clips have other names. Its differences are no
-    chance of the replicates, so a test over replicates would call some of them significant.
+    If clips have other names, sums over the clips have another order and are rounded differently. Such differences are
+    not random over the replicates, so a test over the replicates would call some of them significant.
     """
     differences = after - before
     return np.where(np.abs(differences) <= SAME_CHANGE * np.maximum(np.abs(before), np.abs(after)), 0.0, differences)
@@ -264,7 +272,7 @@ def corrected(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
 
     Returns
     -------
-    tuple of MetricChange    in the same order
+    tuple of MetricChange    with corrected probabilities, in the same order
     """
     found = list(changes)
     for judged in (True, False):
@@ -283,7 +291,7 @@ def corrected_family(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...
 
     Returns
     -------
-    tuple of MetricChange    in the same order
+    tuple of MetricChange    with corrected probabilities, in the same order
     """
     known = sorted((one.p, place) for place, one in enumerate(changes) if one.p is not None)
     raised: dict[int, float] = {}

@@ -154,10 +154,10 @@ def cell_deficits(seconds: Floats, least_s: float, window_s: float) -> Floats:
 
     Returns
     -------
-    (V, O) float64    seconds
+    (V, O) float64    seconds; a cell that lacks less than half of `window_s` lacks nothing
     """
     deficits = np.maximum(least_s - seconds, 0.0)
-    # A whole number of windows is meant, however its seconds are rounded.
+    # Data come in whole windows, so a deficit below half a window is a rounding error.
     return np.where(deficits < 0.5 * window_s, 0.0, deficits)
 
 
@@ -213,7 +213,7 @@ def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn
         for side in (turn_rates_deg_s > 0.0, turn_rates_deg_s < 0.0, turn_rates_deg_s == 0.0)
     ]
     left, right, straight = sides
-    if 0.0 not in sizes and bounds[0] == 0.0:  # one cell lies across zero and mirrors itself
+    if 0.0 not in sizes and bounds[0] == 0.0:  # the cell around zero is its own mirror image
         straight[:, 0] += left[:, 0] + right[:, 0]
         left[:, 0] = right[:, 0] = 0.0
     total = float(np.sum(left) + np.sum(right) + np.sum(straight))
@@ -222,7 +222,7 @@ def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn
 
 @dataclass(frozen=True)
 class Hole:
-    """A cell of the trial grid that lacks data."""
+    """A cell of the trial grid that lacks data: its centre, its seconds of data, and the seconds that are missing."""
 
     speed_m_s: float
     turn_rate_deg_s: float

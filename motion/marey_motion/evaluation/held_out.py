@@ -1,7 +1,7 @@
-"""Trials along the paths of real takes: the path of a clip is asked for, and the clip itself is left out of the set.
+"""Trials along the paths of real takes: the path of a clip is the desired path, and the clip is left out of the set.
 
-A person walked such a path, so what the set cannot follow is missing in the set. Clips without a path, such as those of
-standing people, have no trial; of long clips, only the beginning is asked for.
+A person walked such a path, so if the set cannot follow it, the set lacks data. Clips without a path, such as those of
+standing people, have no trial; of a long clip, only the beginning is used.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from marey_motion.matching.search import SearchIndex, build_index
 from marey_schemas.options.evaluation import EvaluationOptions
 
 LEAST_S = 3.0
-"""Shortest part of a clip that is asked for, in seconds; a second more is needed for the look-ahead."""
+"""Shortest part of a clip that can be a desired path, in seconds; a second more is needed for the look-ahead."""
 LEAST_PATH_M = 2.0
-"""Shortest path that is asked for, in metres."""
+"""Shortest path of a clip, in metres, that can be a desired path."""
 MOST_NAME = 80
 """Longest name of a clip in the name of a trial; longer names are replaced by the uid."""
 
@@ -33,15 +33,16 @@ def take_trials(database: MatchingDatabase, options: EvaluationOptions) -> tuple
     Parameters
     ----------
     database : MatchingDatabase    the set
-    options : EvaluationOptions    greatest number and duration of these trials
+    options : EvaluationOptions    families of trials, and greatest number and duration of trials along takes
 
     Returns
     -------
-    tuple of Trial    at most `most_takes`, evenly distributed over the clips; empty if the options ask for none
+    tuple of Trial    at most `options.most_takes`, evenly distributed over the clips; empty if `options.families` lacks
+        the family "takes"
 
     Raises
     ------
-    MotionError    if no clip has a path that can be asked for, or if the set has no other clip
+    MotionError    if no clip is long enough and travels far enough, or if the set has no other clip
     """
     if "takes" not in options.families:
         return ()
@@ -51,8 +52,8 @@ def take_trials(database: MatchingDatabase, options: EvaluationOptions) -> tuple
     found = [(clip, path) for clip in sources if (path := _path_of(database, clip, options.duration_s)) is not None]
     if not found or len(np.unique(equal_clips(database)[asked])) < 2:
         raise MotionError(
-            f"no clip has a path to ask for: trials along takes need another clip, at least {LEAST_S + LOOK_AHEAD_S:g} "
-            f"s, and a path of {LEAST_PATH_M:g} m",
+            f"trials along takes need two different clips, one of which lasts at least {LEAST_S + LOOK_AHEAD_S:g} s "
+            f"and travels at least {LEAST_PATH_M:g} m; add such clips, or leave out the family takes",
             code="no-takes",
         )
     chosen = np.unique(np.linspace(0, len(found) - 1, min(options.most_takes, len(found))).round().astype(int))
@@ -79,9 +80,10 @@ def _trial(clip: DatabaseClip, path: Floats, options: EvaluationOptions, names: 
 
 
 def _path_of(database: MatchingDatabase, clip: DatabaseClip, longest_s: float) -> Floats | None:
-    """Return the beginning of a clip's path as keys of x, z and heading (K, 3); None if it is too short.
+    """Return the beginning of a clip's path as keys of x, z and heading (K, 3), in metres and radians.
 
-    The path starts at the origin with the heading 0.
+    The path starts at the origin with the heading 0. Returns None if the clip is too short, travels too little, or
+    shows walking in place.
     """
     rate_hz, rows = database.options.rate_hz, slice(clip.start, clip.stop)
     seconds = min(longest_s, (clip.frame_count - 1) / rate_hz - LOOK_AHEAD_S)
@@ -104,7 +106,7 @@ def _length_m(path: Floats) -> float:
 
 
 def index_for(database: MatchingDatabase, index: SearchIndex, trial: Trial) -> SearchIndex:
-    """Return the search index of a trial: without the clip whose path it asks for, its mirrored copy, and equal clips.
+    """Return the search index of a trial: without the clip whose path is followed, its mirrored copy and equal clips.
 
     Parameters
     ----------
@@ -114,7 +116,7 @@ def index_for(database: MatchingDatabase, index: SearchIndex, trial: Trial) -> S
 
     Returns
     -------
-    SearchIndex    `index` itself if the trial leaves nothing out
+    SearchIndex    the index; `index` itself if the trial is not along the path of a clip
 
     Raises
     ------

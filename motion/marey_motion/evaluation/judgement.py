@@ -136,8 +136,8 @@ class Judgement:
     ----------
     grade : str    one of `GRADES`
     trials : tuple of TrialVerdict    in the order of the suite
-    looks_measured : bool    False for results of versions that did not measure looks; their trials are judged by place,
-        speed and turn rate only
+    looks_measured : bool    False for results of old versions, which did not measure how the motion looks; their trials
+        are judged by place, speed and turn rate only
     """
 
     grade: str
@@ -267,7 +267,7 @@ def _looks_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitChec
 
 
 def exceeded_in_suite(result: EvaluationResult) -> frozenset[str]:
-    """Find the metrics of the suite that exceed the limits for single trials.
+    """Find the metrics whose values for the whole suite exceed the limits for single trials.
 
     Limits that depend on the desired speed of a trial are not checked.
 
@@ -293,7 +293,7 @@ def _check(measure: Measure, metrics: Metrics, metric: str, limit: float) -> Lim
 def mean_speed_m_s(trial: Trial) -> float:
     """Compute the mean desired speed of a trial after its approach.
 
-    If the desired speed alternates, the path begins at the base speed.
+    If the desired speed alternates, the first period after the approach has the base speed.
 
     Parameters
     ----------

@@ -1,4 +1,6 @@
-"""The windows of `coverage.sliding_windows` for frames that arrive one by one, at a constant cost per frame.
+"""Windows of one second of a motion whose frames arrive one by one, at a constant cost per frame.
+
+The windows are those of `coverage.sliding_windows`.
 
 The root is smoothed as in `matching.simulation_root`. The filters look half a second ahead, so results are half a
 second late (`LiveWindows.delay_s`). When a take ends, its last frames are smoothed like the end of a clip, so that no
@@ -58,7 +60,16 @@ class Filters(NamedTuple):
 
 
 class LiveWindows:
-    """Computation of windows of one second for a performance at `rate_hz`, one take after another."""
+    """Computation of windows of one second for a live performance, one take after another.
+
+    Parameters
+    ----------
+    rate_hz : float    frames per second of the performance
+
+    Raises
+    ------
+    MotionError    if the frame rate is too low or too high
+    """
 
     def __init__(self, rate_hz: float) -> None:
         if not LEAST_FRAME_RATE_HZ <= rate_hz <= MOST_FRAME_RATE_HZ:

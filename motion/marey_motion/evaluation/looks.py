@@ -57,7 +57,7 @@ class ClipLooks:
 
 
 class LooksMeter:
-    """Measures of the looks of trials over one database.
+    """Measurement of how the simulated motion of trials looks, in comparison with the clips of one database.
 
     Parameters
     ----------
@@ -70,11 +70,11 @@ class LooksMeter:
         self.clips = clip_looks(database)
 
     def measure(self, record: TrialRecord, window: Flags) -> dict[str, float | None]:
-        """Measure the looks of a trial.
+        """Measure how the simulated motion of a trial looks: feet, steps on the spot, and smoothness.
 
         Parameters
         ----------
-        record : TrialRecord    T ticks
+        record : TrialRecord    T simulated ticks
         window : (T - 1,) bool    the steps that count; step k leads from tick k to tick k + 1
 
         Returns
@@ -122,7 +122,7 @@ class LooksMeter:
 
 
 def clip_looks(database: MatchingDatabase) -> ClipLooks:
-    """Measure the looks of the clips of a database, as they are played without transitions.
+    """Measure contacts, sliding feet and smoothness of the clips of a database, played without transitions.
 
     Parameters
     ----------
@@ -177,7 +177,9 @@ def ground_speeds(points: AnyFloats, positions: Floats, headings: Floats, rate_h
 
 
 def standing_steps(contacts: Flags) -> Flags:
-    """Mark the steps during which a foot stays on the ground: it is in contact at both ends of the step.
+    """Mark the steps, each from one frame to the next, during which a foot stays on the ground.
+
+    The foot is in contact at both ends of such a step.
 
     Parameters
     ----------
@@ -191,7 +193,7 @@ def standing_steps(contacts: Flags) -> Flags:
 
 
 def begun_contacts(contacts: Flags) -> Flags:
-    """Mark the steps at whose end a foot comes into contact.
+    """Mark the steps, each from one frame to the next, at whose end a foot comes into contact.
 
     Parameters
     ----------

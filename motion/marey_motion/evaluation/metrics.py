@@ -29,9 +29,9 @@ RESPONSE_SHARE = 0.1
 RESPONSE_HOLD_S = 0.5
 """Seconds for which the error must stay below `RESPONSE_SHARE` for the speed to count as reached."""
 SETTLING_S = 1.0
-"""Seconds around a change of the desired speed or direction that do not count as settled.
+"""Seconds before and after a change of the desired speed or direction that do not count as settled.
 
-The character changes its motion before this time, too, because it looks one second ahead.
+The character reacts before a change, too, because it looks one second ahead.
 """
 
 
@@ -49,7 +49,8 @@ class TrialSeries:
     cross_track_m, along_track_m : components of this offset, positive to the left and ahead in the reference's
         direction of travel
     heading_errors_rad : recorded minus desired heading at the same tick
-    settled : whether the step is at least `SETTLING_S` away from changes of the desired speed or direction
+    settled : whether the step is at least `SETTLING_S` seconds away from any change of the desired speed or direction;
+        if changes are frequent, at least a quarter of the time between two changes
     changes_speed : whether the desired speed alternates, so that there are responses to measure
     varies : whether the desired speed and turn rate vary all the time, so that the spread of their errors is measured
     regimes : index of the step's regime in `REGIMES`
@@ -81,7 +82,7 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
     ----------
     trial : Trial    the trial
     reference : Reference    trajectory of the trial
-    record : TrialRecord    T ticks
+    record : TrialRecord    T simulated ticks
 
     Returns
     -------
@@ -130,15 +131,18 @@ def measure_trial(
     options: EvaluationOptions,
     looks: LooksMeter | None = None,
 ) -> TrialResult:
-    """Compute every metric of one trial (docs/explanation/evaluation.md), and of each regime if there are several.
+    """Compute every metric of one trial (docs/explanation/evaluation.md), also per regime if there are several.
+
+    A regime is all time with the same desired motion: the approach, the base speed, or the speed after switches.
 
     Parameters
     ----------
     trial : Trial    the trial
     reference : Reference    trajectory of the trial
-    record : TrialRecord    T ticks
+    record : TrialRecord    T simulated ticks
     options : EvaluationOptions    options of the evaluation
-    looks : LooksMeter, optional    measures of looks over the database of the record; left out if None
+    looks : LooksMeter, optional    measurement of feet and smoothness over the database of the record; if None, these
+        metrics are left out
 
     Returns
     -------
@@ -171,7 +175,11 @@ def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
 
 
 def _settled(trial: Trial, times_s: Floats) -> Flags:
-    """Mark the times that are not near a change of the desired motion; if changes are frequent, half of all times."""
+    """Mark the times that are not near a change of the desired motion.
+
+    A time that is not near a change is at least `SETTLING_S` seconds away from it or, if changes are frequent, at least
+    a quarter of the time between two changes.
+    """
     if (every_s := trial.changes_every_s) is None:
         return np.full(len(times_s), True)
     margin_s = min(SETTLING_S, 0.25 * every_s)

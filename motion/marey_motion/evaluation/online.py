@@ -36,7 +36,7 @@ FARTHEST_M = 1e6
 
 PATH_RATE_HZ = 5.0
 AWAY_DECIMALS = 1
-"""Number of decimals to which distances between cells are compared.
+"""Number of decimals to which distances between cells, in widths of a cell, are rounded before they are compared.
 
 Of two equally distant cells, the cell that lacks more seconds comes first.
 """
@@ -46,8 +46,8 @@ Of two equally distant cells, the cell that lacks more seconds comes first.
 class PerformerState:
     """Position of the performer in the newest frame, and mean motion in the newest window.
 
-    `window` is None until a window exists. The position is on the ground, in metres; the heading is in radians; strafe
-    is positive to the left.
+    `window` is None until a window exists. The position is on the ground, in metres. The heading is in radians, 0 along
+    +z and positive to the left; strafe is positive to the left.
     """
 
     x_m: float
@@ -97,7 +97,9 @@ class OnlineCoverage:
         shape = len(self.speed_edges_m_s) - 1, len(self.turn_rate_edges_deg_s) - 1
         if shape[0] * shape[1] > MOST_CELLS:
             raise MotionError(
-                f"the grid has {shape[0]} x {shape[1]} cells; at most {MOST_CELLS} are allowed", where="grid"
+                f"the grid has {shape[0]} x {shape[1]} cells; at most {MOST_CELLS} are allowed, so choose fewer "
+                "speeds or turn rates",
+                where="grid",
             )
         self._before = np.zeros(shape) if seconds is None else np.array(seconds, dtype=np.float64)
         if self._before.shape != shape:
@@ -109,10 +111,10 @@ class OnlineCoverage:
         self.counts = np.zeros(shape, dtype=np.int64)
         self.frame_count = 0
 
-    # -- what comes in -------------------------------------------------------------------------------------------------
+    # -- frames --------------------------------------------------------------------------------------------------------
 
     def add_frames(self, body: MatchingBody, clip: Clip) -> Windows:
-        """Add the next frames.
+        """Add the next frames of the performance.
 
         A take begins with the first frame in which hips and shoulders define a facing direction.
 
@@ -182,7 +184,7 @@ class OnlineCoverage:
         self.counts += counts.astype(np.int64)
         return windows
 
-    # -- what is known -------------------------------------------------------------------------------------------------
+    # -- coverage ------------------------------------------------------------------------------------------------------
 
     @property
     def delay_s(self) -> float:
@@ -242,7 +244,7 @@ class OnlineCoverage:
             for a, b in zip(v[nearest], w[nearest], strict=True)
         )
 
-    # -- what is kept --------------------------------------------------------------------------------------------------
+    # -- state ---------------------------------------------------------------------------------------------------------
 
     def as_tree(self) -> dict[str, Any]:
         """Save the state for `from_tree`.

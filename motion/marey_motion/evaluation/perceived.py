@@ -22,12 +22,12 @@ from marey_schemas.documents.metrics import MetricDocument, MetricIdentity
 
 @dataclass(frozen=True)
 class PerceivedTransitions:
-    """Perceptual distances between the poses that transitions entered and the poses that would have followed.
+    """Perceptual distances of jumps, from the pose that would have followed to the pose that the jump entered.
 
     Parameters
     ----------
     metric : str    name of the metric, for people
-    digest : str    digest of everything that determines distances
+    digest : str    digest of the parts of the metric that determine its distances
     transitions : int    number of jumps, over all trials
     mean, median, p95 : float or None    mean, median and 95th percentile of their distances, without unit; 0 is a jump
         that nobody sees. None if there are no jumps
@@ -78,7 +78,7 @@ class PerceivedRows:
         self._database, self._metric, self.document = database, metric_of(metric), metric
 
     def transitions(self, switches: Ints) -> PerceivedTransitions:
-        """Compare the poses that jumps entered with the poses that would have followed.
+        """Compare the poses that jumps entered with the poses that would have followed without the jump.
 
         Parameters
         ----------
@@ -194,11 +194,13 @@ def indistinguishable(metric: MetricDocument) -> float:
 
 
 def require_same_metric(before: PerceivedTransitions | None, after: PerceivedTransitions | None) -> None:
-    """Check that two evaluations were measured by the same metric, if both were measured by one.
+    """Check that two evaluations used the same perceptual metric.
+
+    The check passes if one of the evaluations used no metric.
 
     Parameters
     ----------
-    before, after : PerceivedTransitions or None    their transitions
+    before, after : PerceivedTransitions or None    transitions of each evaluation; None if no metric was chosen
 
     Raises
     ------

@@ -33,7 +33,7 @@ def pool_suite(
     options: EvaluationOptions,
     further: MeasuredReplicates | None = None,
 ) -> PooledSuite:
-    """Pool the metrics of a suite.
+    """Pool the metrics of a suite's trials over the trials and their replicates.
 
     Parameters
     ----------

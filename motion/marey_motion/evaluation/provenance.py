@@ -49,7 +49,10 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
 
 
 def _asked(trial: Trial) -> dict[str, Any]:
-    """Return the members of a trial for the digest; members that old trials lack only if they are not empty."""
+    """Return the members of a trial that its digest covers; members in `_LATER_MEMBERS` are left out if they are empty.
+
+    So a trial without these members has the same digest as in versions that did not have the members.
+    """
     return {name: value for name, value in asdict(trial).items() if name not in _LATER_MEMBERS or value}
 
 
@@ -64,7 +67,7 @@ def _drawn(options: EvaluationOptions) -> list[dict[str, int]]:
 def require_comparable(
     before: Provenance, after: Provenance, options: Mapping[str, Sequence[str]] | None = None
 ) -> None:
-    """Check that the cost functions, options and scenarios of two evaluations agree.
+    """Check that the normalisers, options, scenarios and limits of two evaluations agree.
 
     Parameters
     ----------
@@ -132,7 +135,7 @@ _CONDITIONS = {
     "scenarios": ("scenarios", "evaluate both over the same trials, with the same replicates and the same seed"),
     "limits": (
         "limits of the verdict",
-        "evaluate both with the same limits, and again if one of them has none, since looks were not measured then",
+        "evaluate both with the same limits; an evaluation by an old version has no limits and must be made again",
     ),
 }
 

@@ -69,7 +69,7 @@ def find_jumps(clips: Sequence[DatabaseClip], record: TrialRecord) -> Jumps:
     Parameters
     ----------
     clips : sequence of DatabaseClip    the clips
-    record : TrialRecord    T ticks
+    record : TrialRecord    T simulated ticks
 
     Returns
     -------
@@ -88,13 +88,13 @@ def find_jumps(clips: Sequence[DatabaseClip], record: TrialRecord) -> Jumps:
 
 @dataclass(frozen=True, eq=False)
 class UsageTally:
-    """Count of the use of C clips with N rows, to which records are added one after the other.
+    """Count of the use of C clips with N rows, to which runs of trials are added one after another.
 
     Parameters
     ----------
     popularity : (N,) int64    number of ticks that displayed each row
     entries : (C,) int64    number of jumps to each clip
-    shown : mapping of str to (C,) bool    by name of the trial, True for each clip that a record of the trial displayed
+    shown : mapping of str to (C,) bool    by name of the trial, True for each clip that a run of the trial displayed
     """
 
     popularity: NDArray[np.int64]
@@ -117,7 +117,9 @@ class UsageTally:
 
     @classmethod
     def total(cls, tallies: Sequence[UsageTally]) -> UsageTally:
-        """Add counts of the same clips; a trial displayed a clip if it did so in any of the counts.
+        """Add several tallies of the same clips.
+
+        A trial counts as having displayed a clip if it did so in any of the tallies.
 
         Parameters
         ----------
@@ -137,13 +139,13 @@ class UsageTally:
         return total
 
     def add(self, clips: Sequence[DatabaseClip], trial: str, record: TrialRecord) -> None:
-        """Count one more record of a trial.
+        """Add the simulated ticks of one run of a trial to the counts.
 
         Parameters
         ----------
         clips : sequence of DatabaseClip    the clips
         trial : str    name of the trial
-        record : TrialRecord    T ticks
+        record : TrialRecord    T simulated ticks
         """
         self.popularity[:] += np.bincount(record.rows, minlength=len(self.popularity))
         shown = np.bincount(clips_of_rows(clips, record.rows), minlength=len(clips)) > 0
@@ -152,7 +154,7 @@ class UsageTally:
         self.entries[:] += np.bincount(entered, minlength=len(clips))
 
     def usage(self, clips: Sequence[DatabaseClip]) -> tuple[ClipUsage, ...]:
-        """Return the use of each clip.
+        """Compute the use of each clip: ticks, share of all ticks, jumps to the clip, and trials.
 
         Parameters
         ----------
@@ -175,12 +177,12 @@ class UsageTally:
 
 
 def measure_usage(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> tuple[ClipUsage, ...]:
-    """Count the ticks that display each clip, and the jumps to it, over all records.
+    """Count the ticks that display each clip, and the jumps to each clip, over all trials.
 
     Parameters
     ----------
     clips : sequence of DatabaseClip    the clips
-    records : sequence of TrialRecord    the trials
+    records : sequence of TrialRecord    simulated ticks of each trial
 
     Returns
     -------
@@ -193,12 +195,12 @@ def measure_usage(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord])
 
 
 def count_switches(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> NDArray[np.int64]:
-    """Count the jumps between each pair of rows, over all records.
+    """Count the jumps between each pair of rows, over all trials.
 
     Parameters
     ----------
     clips : sequence of DatabaseClip    the clips
-    records : sequence of TrialRecord    the trials
+    records : sequence of TrialRecord    simulated ticks of each trial
 
     Returns
     -------
@@ -298,7 +300,7 @@ def treading_share(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]
     Parameters
     ----------
     clips : sequence of DatabaseClip    the clips
-    records : sequence of TrialRecord    the trials
+    records : sequence of TrialRecord    simulated ticks of each trial
 
     Returns
     -------
@@ -315,7 +317,7 @@ def treading_steps(clips: Sequence[DatabaseClip], record: TrialRecord) -> NDArra
     Parameters
     ----------
     clips : sequence of DatabaseClip    the clips
-    record : TrialRecord    T ticks
+    record : TrialRecord    T simulated ticks
 
     Returns
     -------

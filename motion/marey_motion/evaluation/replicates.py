@@ -39,7 +39,10 @@ APPROACH_S = 1.0
 
 @dataclass(frozen=True)
 class TrialReplicate:
-    """One run of a trial; `driven` is a copy of the trial with the approach time of this replicate."""
+    """One run of a trial.
+
+    `driven` is a copy of the trial with the approach time of this replicate; `start_ticks` is the delay of the start.
+    """
 
     trial: Trial
     replicate: int
@@ -48,7 +51,7 @@ class TrialReplicate:
 
 
 def run_of(trial: Trial, replicate: int, options: EvaluationOptions) -> TrialReplicate:
-    """Draw one replicate of a trial.
+    """Draw the start and the approach of one replicate of a trial.
 
     Parameters
     ----------
@@ -70,13 +73,13 @@ def run_of(trial: Trial, replicate: int, options: EvaluationOptions) -> TrialRep
     return TrialReplicate(trial, replicate, replace(trial, approach_s=approach_s), round(later * START_S * rate_hz))
 
 
-def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
+def trajectory_for(trial: Trial, database: MatchingDatabase) -> Reference:
     """Compute a trial's trajectory, extended beyond the end of the trial by the look-ahead of the database.
 
     Parameters
     ----------
     trial : Trial    the trial
-    database : MatchingDatabase    rate and horizons
+    database : MatchingDatabase    frame rate, and horizons up to which its features look ahead
 
     Returns
     -------
@@ -100,11 +103,11 @@ def simulate(
 
     Returns
     -------
-    TrialRecord    the ticks
+    TrialRecord    displayed row, position, heading and costs at each tick
     """
-    guide = guide_for(run.driven, database)
+    trajectory = trajectory_for(run.driven, database)
     own = index_for(database, index, run.trial)
-    return run_trial(database, own, guide, options.controller, start_ticks=run.start_ticks)
+    return run_trial(database, own, trajectory, options.controller, start_ticks=run.start_ticks)
 
 
 def measure_run(
@@ -116,9 +119,9 @@ def measure_run(
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
-    looks : LooksMeter    measures of looks over the database
+    looks : LooksMeter    measurement of feet and smoothness over the database
     run : TrialReplicate    the replicate
-    record : TrialRecord    its record
+    record : TrialRecord    simulated ticks of the replicate
 
     Returns
     -------
@@ -199,8 +202,8 @@ class MeasuredReplicates:
 
 
 @dataclass(eq=False)
-class _Kept:
-    """Metrics of the replicates that have ended, and the use of clips in them; records are not kept."""
+class _FinishedReplicates:
+    """Metrics of the replicates that have ended, and the use of clips in them."""
 
     usage: UsageTally
     runs: dict[tuple[str, int], MeasuredRun] = field(default_factory=dict)
@@ -216,7 +219,9 @@ def run_replicates(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> MeasuredReplicates | None:
-    """Simulate and measure all replicates of the trials except replicate 0, the trial itself; no record is kept.
+    """Simulate and measure all replicates of the trials except replicate 0, which is the trial itself.
+
+    The simulated ticks are discarded after they are measured.
 
     Parameters
     ----------
@@ -241,7 +246,7 @@ def run_replicates(
     searched = index or index_of(database)
     looks = LooksMeter(database, options.controller)
     runs = [run_of(trial, number, options) for trial in trials for number in range(1, options.replicates)]
-    kept = _Kept(UsageTally.of(database.clips))
+    ended = _FinishedReplicates(UsageTally.of(database.clips))
     report = progress or (lambda _done, _total, _note: None)
 
     def run(one: TrialReplicate) -> tuple[MeasuredRun, TrialRecord]:
@@ -252,11 +257,11 @@ def run_replicates(
 
     def keep(one: TrialReplicate, made: tuple[MeasuredRun, TrialRecord]) -> None:
         measured, record = made
-        kept.usage.add(database.clips, one.trial.name, record)
-        kept.runs[one.trial.name, one.replicate] = measured
-        report(len(kept.runs), len(runs), one.trial.name)
+        ended.usage.add(database.clips, one.trial.name, record)
+        ended.runs[one.trial.name, one.replicate] = measured
+        report(len(ended.runs), len(runs), one.trial.name)
 
     run_each(run, runs, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     numbers = range(1, options.replicates)
-    ordered = {trial.name: tuple(kept.runs[trial.name, number] for number in numbers) for trial in trials}
-    return MeasuredReplicates(ordered, kept.usage)
+    ordered = {trial.name: tuple(ended.runs[trial.name, number] for number in numbers) for trial in trials}
+    return MeasuredReplicates(ordered, ended.usage)

@@ -1,4 +1,4 @@
-"""Content of an evaluation: its conditions, the record of every trial, and the measures computed from them."""
+"""Content of an evaluation: its conditions, the simulated ticks of every trial, and the metrics of the ticks."""
 
 from __future__ import annotations
 
@@ -175,10 +175,11 @@ class EvaluationResult:
     usage : use of each clip, in the order of `clips`
     switches : (S, 3) int64    for each pair of rows between which the suite jumped: the row before the jump, the
         row after it, and the number of these jumps; ordered by the first two
-    records : record of each trial, in the order of `trials`; if there are replicates, of the first one. `switches`
-        belong to these records, and `usage` to all replicates
+    records : simulated ticks of each trial, in the order of `trials`; if there are replicates, of the first one.
+        `switches` are counted over these ticks, and `usage` over those of all replicates
     replicates : metrics of each replicate; None if there is only one
-    perceived : transitions under a perceptual metric; None if none was chosen
+    perceived : perceptual distances of the jumps; None if no perceptual metric was chosen
+    notes : remarks on data that were left out or look doubtful
     baseline : result of the same suite over clips generated for every cell of the grid, without records; None if not
         computed
     """

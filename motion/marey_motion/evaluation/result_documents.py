@@ -1,4 +1,4 @@
-"""Conversion of evaluations and records to and from plain values and arrays."""
+"""Conversion of evaluations, and of the simulated ticks of their trials, to and from plain values and arrays."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ Tree = dict[str, Any]
 
 
 def result_to_tree(result: EvaluationResult) -> Tree:
-    """Convert an evaluation without its records, which are a separate document.
+    """Convert an evaluation to the content of its document, without the simulated ticks of its trials.
+
+    The ticks are a separate document (`records_to_tree`).
 
     Parameters
     ----------
@@ -115,16 +117,20 @@ def _result_body(result: EvaluationResult) -> Tree:
 
 
 def result_from_tree(tree: Mapping[str, Any], records: Sequence[TrialRecord] = ()) -> EvaluationResult:
-    """Make an evaluation from the content of its document, with or without records.
+    """Make an evaluation from the content of its document, with or without the simulated ticks of its trials.
 
     Parameters
     ----------
     tree : mapping    result of `result_to_tree`
-    records : sequence of TrialRecord    its records, if they were read
+    records : sequence of TrialRecord    ticks of each trial, in the order of the trials; empty if they were not read
 
     Returns
     -------
     EvaluationResult    the evaluation
+
+    Raises
+    ------
+    MotionError    if the document has another schema
     """
     _require(tree, EVALUATION_SCHEMA)
     return _result(tree, records)
@@ -203,7 +209,7 @@ def _usage(tree: Mapping[str, Any], clips: Sequence[DatabaseClip]) -> tuple[Clip
 
 
 def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> Tree:
-    """Join the records of all or some trials into a few large arrays.
+    """Join the simulated ticks of all or some trials into a few large arrays.
 
     Record r has the ticks [starts[r], starts[r + 1]). Costs are not defined at every tick. Each cost is stored
     as two arrays: the ticks at which it is defined, counted over all records, and its values at these ticks.
@@ -211,7 +217,7 @@ def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> 
     Parameters
     ----------
     trials : sequence of Trial    R trials
-    records : sequence of TrialRecord    their records
+    records : sequence of TrialRecord    simulated ticks of each trial
 
     Returns
     -------
@@ -241,7 +247,7 @@ def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> 
 
 
 def records_from_tree(tree: Mapping[str, Any]) -> dict[str, TrialRecord]:
-    """Make the records of trials from the content of their document.
+    """Read the simulated ticks of trials from the content of their document.
 
     Parameters
     ----------
@@ -250,6 +256,10 @@ def records_from_tree(tree: Mapping[str, Any]) -> dict[str, TrialRecord]:
     Returns
     -------
     dict of str to TrialRecord    by the name of their trial, in the order they were written
+
+    Raises
+    ------
+    MotionError    if the document has another schema
     """
     _require(tree, RECORDS_SCHEMA)
     starts = tree["starts"].tolist()

@@ -27,14 +27,14 @@ def run_each(
     threads: int,
     cancelled: CancelCallback,
 ) -> None:
-    """Run items on several threads, and pass on each result as soon as it exists, so that few are in memory.
+    """Call a function for many items on several threads, and pass on each result at once, so that few are in memory.
 
     Parameters
     ----------
     run : callable    called with one item, in a worker thread
     items : sequence    the items
     keep : callable    called with each item and its result, in the calling thread
-    threads : int    number of items at a time
+    threads : int    number of items that are processed at a time
     cancelled : callable    called before items are started, until it returns True to stop
 
     Raises

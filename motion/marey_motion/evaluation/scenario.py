@@ -1,7 +1,8 @@
 """The trials of an evaluation and their trajectories.
 
-A trial starts at the origin facing +z, goes straight for its approach, and then follows the course of its family. Each
-course is a chain of arcs with constant speed and turn rate; corners and changes of speed are at fixed intervals.
+A trial starts at the origin facing +z, goes straight for its approach, and then follows the course of its family. A
+course is a chain of arcs with constant speed and turn rate; corners and changes of speed are at fixed intervals. The
+course of a trial along a take is the path of the take.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from marey_schemas.options.evaluation import EvaluationOptions, Family
 from marey_schemas.options.matching import TICK_RATE_HZ
 
 LOOK_AHEAD_S = 1.0
-# A boundary belongs to the tick that it falls on, however its time in seconds is rounded.
+# Tolerance, so that rounding of times in seconds does not move a boundary to the next tick.
 TIME_TOLERANCE_S = 1e-9
 STRAIGHT_DEG_S = 1e-6
 KEY_RATE_HZ = 10.0
-"""Keys per second of the path of a take; roots are smoothed over half a second, so more keys would say no more."""
+"""Keys per second of the path of a take; roots are smoothed over half a second, so more keys would add no detail."""
 LEAST_TRAVEL_M_S = 0.05
 """Speed, in metres per second, below which the direction of travel of a step is not defined."""
 
@@ -39,9 +40,9 @@ class Trial:
     the second speed: 0 in `stopping` trials, ignored in families with one speed. `angle_rad` is the angle of the
     corners, or from the heading to the direction of travel.
 
-    A trial along a take has the members `left_out`, the uid of the take, which is not in the set; `label`, its name;
-    and `path`, keys of x and z in metres and heading in radians, `KEY_RATE_HZ` per second, from (0, 0, 0) on. Its speed
-    is the mean speed of the path.
+    A trial along a take has three more members: `left_out` is the uid of the take, which the trial must not use;
+    `label` is the name of the take; and `path` contains its keys, x and z in metres and heading in radians,
+    `KEY_RATE_HZ` per second, from (0, 0, 0) on. The speed of such a trial is the mean speed of the path.
     """
 
     family: Family
@@ -118,7 +119,8 @@ class Reference:
     headings : (T + L,) float64    facing direction in radians; continuous, except at corners
     speeds_m_s : (T + L,) float64    speed of the step that follows each tick
     turn_rates_rad_s : (T + L,) float64    turn rate of this step; a corner is turned within one step
-    directions : (T + L,) float64    direction of travel in radians; differs from the heading only while strafing
+    directions : (T + L,) float64    direction of travel in radians; differs from the heading while strafing, and along
+        takes
     """
 
     rate_hz: float
@@ -165,7 +167,7 @@ def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
 
 
 def require_names(trials: Iterable[Trial]) -> None:
-    """Check that trials have different names, since records are stored by name.
+    """Check that trials have different names, since their results are stored by name.
 
     Parameters
     ----------
@@ -179,14 +181,15 @@ def require_names(trials: Iterable[Trial]) -> None:
     for trial in trials:
         if trial.name in seen:
             raise MotionError(
-                f"two trials are called {trial.name}; each trial needs a different name",
+                f"two trials are called {trial.name}, because two values of the grid are equal or nearly equal; remove "
+                "one of these values",
                 where="grid",
             )
         seen.add(trial.name)
 
 
 def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float = LOOK_AHEAD_S) -> Reference:
-    """Compute a trial's trajectory in closed form, sampled at t = tick / rate_hz.
+    """Compute a trial's trajectory, sampled at the times tick / rate_hz.
 
     Parameters
     ----------
@@ -236,11 +239,14 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
 
 
 def _along_keys(trial: Trial, times: Floats, rate_hz: float, tick_count: int) -> Reference:
-    """Compute the trajectory along the keys of a take; the approach goes straight, with the first velocity."""
+    """Compute the trajectory of a trial along a take: a cubic spline through the keys `trial.path`.
+
+    The approach is straight, with the velocity at the first key.
+    """
     from scipy.interpolate import CubicSpline
 
     curve = CubicSpline(np.arange(len(trial.path)) / KEY_RATE_HZ, np.array(trial.path))
-    # One row more gives the last step.
+    # One more row, from which the last step is computed.
     since_s = np.append(times, times[-1] + 1.0 / rate_hz) - trial.approach_s
     found = curve(np.clip(since_s, 0.0, (len(trial.path) - 1) / KEY_RATE_HZ))
     positions, headings = found[:, :2] + np.minimum(since_s, 0.0)[:, None] * curve(0.0, 1)[:2], found[:, 2]
@@ -274,7 +280,7 @@ def _pieces(trial: Trial, end_s: float) -> tuple[Floats, Floats, Floats, Floats]
     corners = np.zeros(len(starts))
     if trial.changes_speed:
         speeds[2::2] = trial.switch_speed_m_s
-        # A character that stands does not turn either.
+        # A standing character does not turn.
         turn_rates[2::2] *= trial.switch_speed_m_s > 0.0
     elif trial.family == "eights":
         turn_rates[2::2] *= -1.0

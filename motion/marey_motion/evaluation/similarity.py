@@ -66,7 +66,7 @@ def accepted_distance(records: Sequence[TrialRecord]) -> float | None:
 
     Parameters
     ----------
-    records : sequence of TrialRecord    the trials
+    records : sequence of TrialRecord    simulated ticks of each trial
 
     Returns
     -------
@@ -82,7 +82,7 @@ def measure_similarity(
     coverage: Coverage,
     threshold: float,
     *,
-    seen: PerceivedRows | None = None,
+    perceived_rows: PerceivedRows | None = None,
     most_frames: int = MOST_FRAMES,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
@@ -95,10 +95,11 @@ def measure_similarity(
     ----------
     database : MatchingDatabase    the clips
     coverage : Coverage    coverage of the clips
-    threshold : float    distance up to which a frame can be blended, usually `accepted_distance`; metres, or the
-        distance of a metric
-    seen : PerceivedRows, optional    the rows under a perceptual metric, which is used instead of metres
-    most_frames : int    frames compared per cell
+    threshold : float    distance up to which a frame can be blended, usually `accepted_distance`; in metres or, with
+        `perceived_rows`, in the distance of the metric
+    perceived_rows : PerceivedRows, optional    rows of `database`, prepared for a perceptual metric; if None, distances
+        are in metres
+    most_frames : int    greatest number of frames compared per cell
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
 
@@ -124,7 +125,7 @@ def measure_similarity(
             raise EvaluationCancelled(f"the comparison of grid cells was stopped after {done} of {len(filled)} cells")
         own, place = rows[cells == cell], divmod(cell, shape[1])
         chosen = every_kth(own, most_frames)
-        found = _nearest_rows(database, seen, chosen, own, groups)
+        found = _nearest_rows(database, perceived_rows, chosen, own, groups)
         frames[place], sources[place], measured[place] = len(own), len(np.unique(groups[own])), len(chosen)
         share[place] = np.mean(found <= threshold)
         if sources[place] > 1:
@@ -133,20 +134,20 @@ def measure_similarity(
             progress(done + 1, len(filled), "")
     total = int(frames.sum())
     overall = float(np.nansum(share * frames) / total) if total else None
-    metric = None if seen is None else MetricIdentity.of(seen.document)
+    metric = None if perceived_rows is None else MetricIdentity.of(perceived_rows.document)
     return PoseSimilarity(threshold, frames, sources, measured, distance, share, overall, metric)
 
 
 def _nearest_rows(
     database: MatchingDatabase,
-    seen: PerceivedRows | None,
+    perceived_rows: PerceivedRows | None,
     chosen: NDArray[np.int64],
     own: NDArray[np.int64],
     groups: NDArray[np.int64],
 ) -> Floats:
     """Compute the distance of each row of `chosen` from the nearest row of `own` that is in another group."""
-    if seen is not None:
-        return seen.nearest(chosen, groups[chosen], seen, own, groups[own])
+    if perceived_rows is not None:
+        return perceived_rows.nearest(chosen, groups[chosen], perceived_rows, own, groups[own])
     return nearest_poses(database.pose_points[chosen], groups[chosen], database.pose_points[own], groups[own])
 
 
@@ -160,7 +161,7 @@ def every_kth(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
     Returns
     -------
-    (m,) int64    every k-th row, with the smallest possible k
+    (m,) int64    every k-th row, with the smallest k that keeps at most `most` rows
     """
     return rows[:: max(1, -(-len(rows) // most))]
 

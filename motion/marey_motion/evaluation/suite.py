@@ -59,12 +59,12 @@ def run_suite(
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     trials : sequence of Trial, optional    the trials to run; all of the suite if None
-    done : mapping of str to TrialRecord, optional    existing records, by the name of the trial; trials with a record
-        are not run again
+    done : mapping of str to TrialRecord, optional    simulated ticks of trials that have run already, by name of the
+        trial; these trials are not run again
     index : SearchIndex, optional    index of the database's normalised features, built if None
     threads : int, optional    number of trials at a time; one per processor if None
     progress : callable, optional    called as progress(trials done, total, name of the last trial)
-    finished : callable, optional    called with each trial and its record as soon as the trial ends
+    finished : callable, optional    called with each trial and its simulated ticks as soon as the trial ends
     cancelled : callable, optional    called before trials are started; returns True to stop
 
     Returns
@@ -119,7 +119,7 @@ def assemble(
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     trials : sequence of Trial    the trials
-    records : sequence of TrialRecord    their records
+    records : sequence of TrialRecord    simulated ticks of each trial, in the order of the trials
     replicates : MeasuredReplicates, optional    the further replicates, if the options ask for more than one
     baseline : EvaluationResult, optional    the same suite over generated clips
 
@@ -170,16 +170,18 @@ def evaluate(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> EvaluationResult:
-    """Run and measure the whole suite, by default together with the same suite over generated clips for comparison.
+    """Evaluate a database: run all trials, and measure them.
+
+    By default, the same trials also run over generated clips, the baseline, for comparison.
 
     Parameters
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     threads : int, optional    number of trials at a time; one per processor if None
-    with_baseline : bool    whether to also evaluate generated clips; no baseline has trials along takes
-    progress : callable, optional    called as progress(runs done, total, name of the last trial); runs are all
-        replicates of the trials, and the trials over generated clips
+    with_baseline : bool    whether to evaluate the baseline, too; it never has trials along takes
+    progress : callable, optional    called as progress(runs done, total, name of the last trial); a run is one
+        replicate of a trial, over the database or over generated clips
     cancelled : callable, optional    returns True to stop
 
     Returns
@@ -232,10 +234,11 @@ def evaluate_baseline(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> EvaluationResult:
-    """Evaluate clips generated for every cell of the grid, without records; the last result is cached.
+    """Evaluate the baseline: the same trials over clips generated for every cell of the grid.
 
-    The baseline runs in as many replicates as the evaluation, because chance affects its metrics like those of any
-    other set. But it runs in at most as many as a confidence interval needs, because it is only compared by eye.
+    The result contains no simulated ticks; the last result is cached. The baseline runs in as many replicates as the
+    evaluation, because chance affects its metrics, too, but in at most as many as a confidence interval needs, because
+    differences from the baseline are not tested.
 
     Parameters
     ----------
@@ -274,7 +277,7 @@ def baseline_replicates(options: EvaluationOptions) -> int:
 
     Returns
     -------
-    int    at most as many as an interval needs, since the baseline is not compared by a test
+    int    that of the evaluation, but at most as many as a confidence interval needs
     """
     return min(options.replicates, LEAST_REPLICATES)
 

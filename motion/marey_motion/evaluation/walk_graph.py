@@ -29,7 +29,7 @@ class WalkGraph:
     rows : (N,) int64    the nodes: displayed database rows, ascending
     ticks : (N,) int64    number of ticks in which each row was displayed
     edges : (E, 3) int64    row left, row entered and count; ordered by the first two
-    walks : for each record, an array (R, 3) int64 of its R runs without a jump: first tick, first row and number of
+    walks : for each trial, an array (R, 3) int64 of its R runs without a jump: first tick, first row and number of
         frames
     """
 
@@ -46,7 +46,7 @@ def walk_graph(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) ->
     Parameters
     ----------
     clips : sequence of DatabaseClip    the clips
-    records : sequence of TrialRecord    the trials
+    records : sequence of TrialRecord    simulated ticks of each trial
 
     Returns
     -------

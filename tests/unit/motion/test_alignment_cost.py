@@ -122,7 +122,7 @@ def test_both_directions_cost_the_same() -> None:
         ({"a": np.full((3, 4, 3), np.nan)}, "frame 0: a position is infinite or not a number"),
         ({"weights": (1, 2)}, "weights: .* one weight for each of 4 points"),
         ({"weights": (1, 1, 1, -1)}, "at least 0"),
-        ({"weights": (0, 0, 0, 0)}, "one must be above 0"),
+        ({"weights": (0, 0, 0, 0)}, "at least one must be above 0"),
     ],
 )
 def test_what_makes_no_cost_is_refused(arguments: dict[str, Any], said: str) -> None:

@@ -99,7 +99,7 @@ def test_examples_that_were_not_aligned_together_are_told_apart(
 
 
 def test_no_examples_make_no_set() -> None:
-    with pytest.raises(MotionError, match="needs at least one clip"):
+    with pytest.raises(MotionError, match="no aligned clips were given"):
         set_from_examples([])
 
 

@@ -49,7 +49,7 @@ def test_labels_that_repeat_are_numbered_in_the_order_of_time() -> None:
     assert [cut.labels for cut in cuts_of(layer)] == [("left",), ("right",), ("left 2",)]
     clash = Layer(60, (Segment("left", 0, 20), Segment("left", 20, 40), Segment("left 2", 40, 60)))
     with pytest.raises(
-        AnnotationError, match="left 2: this is both the label of one cut and the numbered name of a repeated label"
+        AnnotationError, match="left 2: one cut has this label, and another label that repeats gets the same name"
     ):
         cuts_of(clash)
 

@@ -13,7 +13,7 @@ from tests.support.present import present
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
-from marey_motion.difference.changes import Course, spans_where
+from marey_motion.difference.changes import MatchedFrames, spans_where
 from marey_motion.difference.clips import MOST_ROWS, compare_clips
 from marey_motion.editing.registry import apply_edit
 from marey_motion.resampling import resample_clip
@@ -244,12 +244,12 @@ def test_the_plot_shows_the_largest_change_of_each_row_and_no_change_where_no_fr
 def test_spans_less_than_a_tenth_of_a_second_apart_are_joined(frames: list[int], spans: Any) -> None:
     exceeds = np.zeros(100, dtype=np.bool_)
     exceeds[frames] = True
-    assert spans_where(exceeds, Course(np.arange(100), 60.0)) == spans
+    assert spans_where(exceeds, MatchedFrames(np.arange(100), 60.0)) == spans
 
 
 def test_the_number_of_spans_is_limited() -> None:
     exceeds = np.arange(100_000) % 20 == 0
-    spans = spans_where(exceeds, Course(np.arange(100_000), 60.0))
+    spans = spans_where(exceeds, MatchedFrames(np.arange(100_000), 60.0))
     assert 0 < len(spans) <= 100
     assert spans[0][0] == 0
     assert spans[-1][1] == 99_981

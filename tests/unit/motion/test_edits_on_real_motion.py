@@ -13,8 +13,8 @@ import pytest
 from scipy.ndimage import minimum_filter1d
 
 from marey_motion.clip import Clip
-from marey_motion.editing.calm_limbs import allowed_steps, largest_steps
 from marey_motion.editing.ground import heights_of_soles
+from marey_motion.editing.limb_smoothing import allowed_steps, largest_steps
 from marey_motion.editing.registry import EditedClip, edit_clip
 from marey_motion.formats import read_motion
 from marey_motion.motion import Motion

@@ -42,7 +42,7 @@ def database() -> MatchingDatabase:
 def test_the_poses_of_a_cell_are_compared_by_the_metric() -> None:
     known = database()
     coverage = measure_coverage(known, OPTIONS)
-    found = measure_similarity(known, coverage, 0.5, seen=PerceivedRows(known, PAPER))
+    found = measure_similarity(known, coverage, 0.5, perceived_rows=PerceivedRows(known, PAPER))
     assert found.metric == MetricIdentity.of(PAPER)
     cell = int(np.argmax(found.frames))
     place = divmod(cell, found.frames.shape[1])
@@ -66,11 +66,11 @@ def test_the_poses_of_a_cell_are_compared_by_the_metric() -> None:
             for other in np.flatnonzero(sources != sources[number])
         ]
         nearest.append(min(others))
-    seen = PerceivedRows(known, PAPER)
+    perceived_rows = PerceivedRows(known, PAPER)
     groups = source_of_rows(known)
-    told = seen.nearest(rows[::20], groups[rows[::20]], seen, rows, groups[rows])
+    told = perceived_rows.nearest(rows[::20], groups[rows[::20]], perceived_rows, rows, groups[rows])
     np.testing.assert_allclose(told, nearest, atol=1e-9)
-    whole = seen.nearest(rows, groups[rows], seen, rows, groups[rows])
+    whole = perceived_rows.nearest(rows, groups[rows], perceived_rows, rows, groups[rows])
     assert found.blendable_share[place] == np.mean(whole <= 0.5)
     assert found.distance[place] == np.median(whole)
 
@@ -95,14 +95,14 @@ def test_suggestions_use_the_metric_and_name_it() -> None:
     options = SuggestionOptions(removals=2, duplicate_cm=20.0, lost_pose=100.0)
     outside = replace(known, clips=tuple(replace(clip, uid=f"x{clip.uid}") for clip in known.clips))
     found = suggest(known, result, collections={"others": outside}, options=options, metric=PAPER)
-    seen = PerceivedRows(known, PAPER)
-    expected = seen.transitions(result.switches).median or indistinguishable(PAPER)
+    perceived_rows = PerceivedRows(known, PAPER)
+    expected = perceived_rows.transitions(result.switches).median or indistinguishable(PAPER)
     assert found.similarity.threshold == expected
     assert found.fillings == rank_fillings(
-        known, result.coverage, {"others": outside}, result.options, expected, seen=seen
+        known, result.coverage, {"others": outside}, result.options, expected, perceived_rows=perceived_rows
     )
     assert {one.blendable_share for one in found.fillings} <= {1.0}  # every pose is in the set
-    lost = LostPoses(known, seen, expected)
+    lost = LostPoses(known, perceived_rows, expected)
     gone = {clip.source for clip in found.unused.clips}
     plain = suggest(known, result, options=options)
     harms = {one.source: one.harm for one in plain.redundant}

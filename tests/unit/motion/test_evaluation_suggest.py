@@ -87,7 +87,8 @@ def test_effects_are_confirmed_in_other_replicates_or_said_not_to_be(found: Sugg
         assert planned["confirmed"]["objective"]["verdict"] == step.confirmed.objective.verdict
         assert "was not confirmed" not in planned["reason"]
     assert all("was not confirmed" in clip["reason"] for clip in tree["redundant"]["clips"])
-    assert tree["unused"]["confirmed_clips"]["reason"].startswith("Without all of them, in other replicates, ")
+    reason = tree["unused"]["confirmed_clips"]["reason"]
+    assert reason.startswith("Without all of this unused data, in other replicates, ")
     assert tree["unused"]["confirmed_ranges"]["objective"]["replicates"] == 3
     assert tree["chance"]["offset_mean"] > 0.0
 

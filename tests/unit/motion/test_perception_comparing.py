@@ -192,7 +192,7 @@ def test_alignment_by_a_metric_needs_no_weights_and_changes_nothing_without_one(
     assert [one.cost for one in seen.clips] != [one.cost for one in plain.clips]
     assert seen.clips[0].cost == 0.0
     assert (np.diff(seen.clips[1].time_function) > 0).all()
-    with pytest.raises(MotionError, match="has weights of its own"):
+    with pytest.raises(MotionError, match="replaces the options cost, window and weights"):
         align_clips(examples, body, AlignOptions(weights={"Hips": 1.0}), metric=METRIC)
 
 
@@ -226,7 +226,7 @@ def test_near_duplicates_that_look_different_are_kept() -> None:
     slow, *_ = gaits()
     shifted = generate_gait(1.12, 0.0, 4.0)
     database = database_of({"a@1": slow, "b@1": slow, "c@1": shifted})
-    seen = find_near_duplicates(database, threshold_cm=30.0, seen=PerceivedRows(database, PAPER))
+    seen = find_near_duplicates(database, threshold_cm=30.0, perceived_rows=PerceivedRows(database, PAPER))
     by_pair = {(pair.first, pair.second): pair.perceived for pair in seen.pairs}
     assert by_pair["a@1", "b@1"] == 0.0
     others = [distance for pair, distance in by_pair.items() if "c@1" in pair]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Literal
 
-from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment, require_segments, wrong
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment, layer_error, require_segments
 from marey_motion.errors import AnnotationError
 
 # Segments
@@ -36,19 +36,19 @@ def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite:
     first, stop = layer.overlapping(start, end)
     covered = layer.segments[first:stop]
     if covered and not overwrite:
-        raise wrong(
+        raise layer_error(
             made,
             "segments-overlap",
             f"the new segment overlaps {covered[0]}; set overwrite, or move the other segment first",
         )
-    require_segments((made,), layer.frame_count)  # what is no segment must not cut others
+    require_segments((made,), layer.frame_count)  # before an invalid segment shortens others
     before = [one._replace(end=start) for one in covered if one.start < start]
     after = [one._replace(start=end) for one in covered if one.end > end]
     return layer.with_segments(first, stop, *before, made, *after)
 
 
 def remove_segment(layer: Layer, at: int) -> Layer:
-    """Remove the segment that holds a frame.
+    """Remove the segment that contains a frame.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def remove_segment(layer: Layer, at: int) -> Layer:
 
     Raises
     ------
-    AnnotationError    if no segment holds the frame
+    AnnotationError    if no segment contains the frame
     """
     index = layer.index_at(at)
     return layer.with_segments(index, index + 1)
@@ -82,12 +82,12 @@ def split_segment(layer: Layer, at: int, label: str | None) -> Layer:
 
     Raises
     ------
-    AnnotationError    if no segment can be split there
+    AnnotationError    if no segment contains the frame, or if it is the first frame of its segment
     """
     index = layer.index_at(at)
     segment = layer.segments[index]
     if at == segment.start:
-        raise wrong(segment, "empty-segment", f"the segment starts at frame {at}; split it at a later frame")
+        raise layer_error(segment, "empty-segment", f"the segment starts at frame {at}; split it at a later frame")
     rest = Segment(segment.label if label is None else label, at, segment.end)
     return layer.with_segments(index, index + 1, segment._replace(end=at), rest)
 
@@ -121,14 +121,14 @@ def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", 
         neighbour = "previous" if previous else "next"
     other = previous if neighbour == "previous" else following
     if other is None:
-        raise wrong(segment, "no-neighbour", f"the segment has no {neighbour} neighbour to merge with")
+        raise layer_error(segment, "no-neighbour", f"the segment has no {neighbour} neighbour to merge with")
     merged = Segment(segment.label, min(segment.start, other.start), max(segment.end, other.end))
     first = index if neighbour == "next" else index - 1
     return layer.with_segments(first, first + 2, merged)
 
 
 def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int) -> Layer:
-    """Move the start or the end of the segment that holds a frame.
+    """Move the start or the end of the segment that contains a frame.
 
     An adjacent segment stays adjacent, and an overlapped segment is shortened. No segment may become empty.
 
@@ -145,13 +145,13 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
 
     Raises
     ------
-    AnnotationError    if a segment would become empty
+    AnnotationError    if no segment contains the frame, or if a segment would become empty or extend outside the clip
     """
     index = layer.index_at(at)
     segment = layer.segments[index]
     moved = segment._replace(start=to) if edge == "start" else segment._replace(end=to)
     if moved.end <= moved.start:
-        raise wrong(
+        raise layer_error(
             segment,
             "empty-segment",
             f"with its {edge} at frame {to}, the segment would have no frames; choose another frame or remove the "
@@ -166,7 +166,7 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
     elif edge == "end" and (other.start == segment.end or other.start < to):
         changed = other._replace(start=to)
     if changed.end <= changed.start:
-        raise wrong(
+        raise layer_error(
             other,
             "neighbour-in-the-way",
             f"moving the {edge} of {segment} to frame {to} would leave its neighbour {other} without frames; choose a "
@@ -177,7 +177,7 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
 
 
 def relabel_segment(layer: Layer, at: int, label: str) -> Layer:
-    """Change the label of the segment that holds a frame.
+    """Change the label of the segment that contains a frame.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def relabel_segment(layer: Layer, at: int, label: str) -> Layer:
 
     Raises
     ------
-    AnnotationError    if no segment holds the frame
+    AnnotationError    if no segment contains the frame
     """
     index = layer.index_at(at)
     return layer.with_segments(index, index + 1, layer.segments[index]._replace(label=label))
@@ -264,7 +264,9 @@ def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
     place = layer.place_of(gone)
     if gone not in layer.keyframes[place : place + 1]:
         raise AnnotationError(
-            "the layer has no keyframe with this label and frame", code="no-keyframe", where=str(gone)
+            "the layer has no keyframe with this label and frame; choose an existing keyframe",
+            code="no-keyframe",
+            where=str(gone),
         )
     return layer.with_keyframes(place, place + 1)
 
@@ -313,13 +315,17 @@ def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
     Returns
     -------
     Layer    the new layer, with frames counted from `start`
+
+    Raises
+    ------
+    AnnotationError    if the segment is not inside [start, end)
     """
     if not 0 <= start <= segment.start < segment.end <= end <= layer.frame_count:
-        raise wrong(
+        raise layer_error(
             segment,
             "outside-clip",
             f"the segment is not within the frames {start}:{end} that are kept of the clip's "
-            f"{layer.frame_count} frames",
+            f"{layer.frame_count} frames; keep more frames, or choose another segment",
         )
     return Layer(
         end - start,

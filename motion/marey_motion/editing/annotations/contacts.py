@@ -14,7 +14,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_schemas.options.annotations import ContactOptions
 
 LEAVING_FACTOR = 1.6
-"""Hysteresis: a contact begins below a speed, and ends when the foot is faster than this factor times that speed."""
+"""Speed at which a contact ends, as a multiple of the speed limit below which the contact begins (hysteresis)."""
 SMOOTHING_S = 0.045
 
 
@@ -46,7 +46,7 @@ def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None 
 
 
 def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
-    """Compute the speed of the slowest point of a foot, without outliers.
+    """Compute the speed of the slowest point of a foot in each frame, and remove outliers by a median filter.
 
     While a foot rolls from heel strike to toe off, first its heel does not move, then its toe. The ankle is close to
     the heel, so the slower of ankle and toe is slow during the whole contact.
@@ -60,7 +60,7 @@ def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
     -------
     (F,) float64    metres per second
     """
-    from scipy.ndimage import median_filter  # brings much of scipy: only who needs it shall wait
+    from scipy.ndimage import median_filter  # imported here, because this import is slow
 
     speed = np.linalg.norm(kinematics.velocities(points, frame_rate_hz), axis=-1).min(axis=1)
     width = 2 * int(0.5 * SMOOTHING_S * frame_rate_hz) + 1
@@ -115,16 +115,16 @@ def _with_hysteresis(values: Floats, low: float, high: float) -> NDArray[np.bool
 
 
 def without_short(states: NDArray[np.bool_], shortest: float) -> NDArray[np.bool_]:
-    """Remove short runs of equal states. Runs at either end are kept, since they may continue outside the clip.
+    """Set short runs of true states to false. Runs at either end are kept, since they may continue outside the clip.
 
     Parameters
     ----------
-    states : (F,) bool    states
-    shortest : float    frames; runs shorter than this are inverted
+    states : (F,) bool    state in each frame
+    shortest : float    frames; shorter runs become false
 
     Returns
     -------
-    (F,) bool    states
+    (F,) bool    states without the short runs
     """
     kept = states.copy()
     for start, end in runs(states):

@@ -39,9 +39,9 @@ class Keyframe(NamedTuple):
 
 @dataclass(frozen=True)
 class Layer:
-    """Segments and keyframes of a clip, both sorted by time. The segments do not overlap.
+    """Segments and keyframes of a clip, which are checked, and sorted by time, when the layer is made.
 
-    Two keyframes may share a frame if their labels differ. Segments and keyframes may be given in any order.
+    Segments must not overlap. Two keyframes may share a frame if their labels differ.
 
     Raises
     ------
@@ -188,12 +188,12 @@ def require_segments(segments: Sequence[Segment], frame_count: int) -> None:
     for segment in segments:
         _require_label(segment.label, str(segment))
         if segment.end <= segment.start:
-            raise wrong(segment, "empty-segment", "the end of a segment must be after its start")
+            raise layer_error(segment, "empty-segment", "the end of a segment must be after its start")
         if segment.start < 0 or segment.end > frame_count:
-            raise wrong(segment, "outside-clip", f"the segment must be within the clip's frames 0:{frame_count}")
+            raise layer_error(segment, "outside-clip", f"the segment must be within the clip's frames 0:{frame_count}")
     for before, after in pairwise(segments):
         if after.start < before.end:
-            raise wrong(
+            raise layer_error(
                 after,
                 "segments-overlap",
                 f"the segment overlaps {before}, but segments of one layer must not overlap",
@@ -205,10 +205,12 @@ def _require_keyframes(keyframes: Sequence[Keyframe], frame_count: int) -> None:
     for keyframe in keyframes:
         _require_label(keyframe.label, str(keyframe))
         if not 0 <= keyframe.frame < frame_count:
-            raise wrong(keyframe, "outside-clip", f"the keyframe must be within the clip's frames 0:{frame_count}")
+            raise layer_error(
+                keyframe, "outside-clip", f"the keyframe must be within the clip's frames 0:{frame_count}"
+            )
     for earlier, later in pairwise(keyframes):
         if earlier == later:
-            raise wrong(
+            raise layer_error(
                 later, "keyframe-exists", "the layer already has this keyframe; choose another label or another frame"
             )
 
@@ -218,7 +220,7 @@ def _require_label(label: str, place: str) -> None:
         raise AnnotationError(f"a label must have 1 to {MAX_LABEL_LENGTH} characters", code="bad-label", where=place)
 
 
-def wrong(what: Segment | Keyframe, code: str, reason: str) -> AnnotationError:
+def layer_error(what: Segment | Keyframe, code: str, reason: str) -> AnnotationError:
     """Make the error about one segment or keyframe.
 
     Parameters

@@ -26,9 +26,10 @@ REST_S = 0.1
 
 
 def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: VelocityMinimaProposal | None = None) -> Layer:
-    """Propose a keyframe `pause` at each minimum of the joints' mean speed, and segments `movement` between them.
+    """Propose a keyframe `pause` at each deep minimum of the joints' mean speed, and segments `movement` between them.
 
-    The first segment starts with the clip, and the last segment ends with the clip.
+    The depth of a minimum, and the time between two minima, must reach the limits in `options`. The first segment
+    starts with the clip, and the last segment ends with the clip.
 
     Parameters
     ----------
@@ -38,9 +39,9 @@ def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: VelocityMini
 
     Returns
     -------
-    Layer    the proposal
+    Layer    the proposal; an empty layer if the joints never move
     """
-    from scipy.signal import find_peaks  # brings all of scipy's signals and statistics: only who needs it shall wait
+    from scipy.signal import find_peaks  # imported here, because this import is slow
 
     options = options or VelocityMinimaProposal()
     positions = kinematics.global_positions(clip)
@@ -77,7 +78,7 @@ def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposa
 
     Returns
     -------
-    Layer    the proposal
+    Layer    the proposal; an empty layer if the wrist never moves `options.least_reach_m` away from rest
 
     Raises
     ------
@@ -132,7 +133,7 @@ def _downhill(values: Floats, frame: int, step: Literal[-1, 1], last: int) -> in
 
 
 def _smooth(values: Floats, deviation_s: float, frame_rate_hz: float) -> Floats:
-    from scipy.ndimage import gaussian_filter1d  # brings much of scipy: only who needs it shall wait
+    from scipy.ndimage import gaussian_filter1d  # imported here, because this import is slow
 
     smoothed = gaussian_filter1d(values.astype(np.float64), deviation_s * frame_rate_hz, axis=0, mode="nearest")
     return np.asarray(smoothed)

@@ -127,7 +127,7 @@ def _label(step: _Step, has_flight: bool) -> str | None:
 
 
 class _Travel(NamedTuple):
-    """Ground positions of hips (F, 2) and ankles (F, 2, 2), headings (F,) of the body, and frames per second."""
+    """Ground positions of hips (F, 2) and ankles (F, 2, 2), metres; headings (F,), radians; and frames per second."""
 
     hips: NDArray[np.float64]
     ankles: NDArray[np.float64]

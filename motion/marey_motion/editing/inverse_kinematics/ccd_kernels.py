@@ -34,10 +34,10 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
 )
 from marey_motion.kernels import compiled, inverse, product, put_rotation
 
-# A sweep that improves the objective by less than this share, so often in a row, is the last one.
+# The solver ends after this number of successive sweeps that each improve the objective by less than this share.
 STALLED_SHARE = 1e-4
 STALLED_SWEEPS = 4
-# Weight of staying put, relative to that of the targets: decides between rotations that are equally good.
+# Weight of no rotation, relative to the targets, so that the smallest of equally good rotations is chosen.
 STAYING = 1e-9
 
 
@@ -67,14 +67,14 @@ def _pair_up(targets, frame, k, body, place, tips, turns, matrix):
             pairs += 3
             continue
         if targets.kinds[c] == POSITION:
-            wished = vector_at(values, c)
+            goal = vector_at(values, c)
             axes = targets.axes
-            wished = (
-                wished[0] if axes[c, 0] > 0.0 else tip[0],
-                wished[1] if axes[c, 1] > 0.0 else tip[1],
-                wished[2] if axes[c, 2] > 0.0 else tip[2],
+            goal = (
+                goal[0] if axes[c, 0] > 0.0 else tip[0],
+                goal[1] if axes[c, 1] > 0.0 else tip[1],
+                goal[2] if axes[c, 2] > 0.0 else tip[2],
             )
-            a, b = minus(tip, place), minus(wished, place)
+            a, b = minus(tip, place), minus(goal, place)
         else:
             a, b = rotated(turn, vector_at(targets.directions, c)), direction(minus(vector_at(values, c), tip))
         _add_pair(matrix, weight, a, b)
@@ -218,14 +218,14 @@ def _turned_joint(body, k, spin, local, pairs, start, end, work):
     if flexible < 1.0:
         turn = exponential(scaled(logarithm(turn), flexible))
     above = product(spin, inverse(local))
-    wished = unit(product(inverse(above), product(turn, spin)))
+    goal = unit(product(inverse(above), product(turn, spin)))
     if not body.limited[k]:
-        return wished
-    wished = within_limits(limit, wished)
+        return goal
+    goal = within_limits(limit, goal)
     _davenport(work.matrix, work.form)
-    turn = product(product(above, wished), inverse(spin))
+    turn = product(product(above, goal), inverse(spin))
     worse = _form_value(work.form, turn) < work.form[0, 0]
-    return local if worse else wished
+    return local if worse else goal
 
 
 @compiled
@@ -254,9 +254,9 @@ def _sweep(body, targets, frame, local, work):
 def _descend_frame(body, targets, frame, offsets, ends, carried, local, root, best, work, before, after):
     """Solve one frame: change the pose `local` (K, 4) in place.
 
-    `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `descend`. If `carried`, the
-    solver starts with the pose `best` (K, 4), which is overwritten. Returns the number of sweeps, and whether all
-    targets are reached.
+    `before` and `after` (C,) are filled with the errors of the targets; `ends` are the stopping criteria (see
+    `descend`). If `carried`, the solver starts with the pose `best` (K, 4), which is overwritten. Returns the number of
+    sweeps, and whether all targets are reached.
     """
     most_sweeps, tolerance_m, tolerance_rad = ends
     cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
@@ -290,9 +290,10 @@ def _descend_frame(body, targets, frame, offsets, ends, carried, local, root, be
 def descend(body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found):
     """Solve the frames `order` (n,) in this order; change `rotations` (F, K, 4) and fill the `SolverResult` `found`.
 
-    `given_rotations` and `given_roots` are the poses of all frames before they were solved; `carried` is as in
-    `least_squares_kernels.solve_frames`. `ends` holds the three stopping criteria: the maximum number of sweeps, and
-    the tolerances in metres and in radians.
+    `given_rotations` and `given_roots` are the poses of all frames before they were solved. If `carried[i]` is at least
+    0, frame `order[i]` is solved from its given pose, changed as frame `carried[i]` was changed; otherwise, it is
+    solved from its given pose. `ends` holds the three stopping criteria: the maximum number of sweeps, and the
+    tolerances in metres and in radians.
     """
     best = np.empty(rotations.shape[1:])
     for n in range(order.shape[0]):

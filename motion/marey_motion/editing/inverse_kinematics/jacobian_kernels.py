@@ -22,10 +22,10 @@ from marey_motion.kernels import compiled
 
 
 @compiled
-def _turned_error(kind, error, gaze, wished, turn, drift):
+def _turned_error(kind, error, gaze, goal, turn, drift):
     """Compute the change of an angular error if the joint turns by `turn` and the target direction by `drift`.
 
-    `turn` and `drift` are small rotation vectors; `gaze` and `wished` are the unit directions of the look-at axis and
+    `turn` and `drift` are small rotation vectors; `gaze` and `goal` are the unit directions of the look-at axis and
     of its target.
     """
     if kind == ORIENTATION:
@@ -35,18 +35,18 @@ def _turned_error(kind, error, gaze, wished, turn, drift):
         share = (1.0 - half / math.tan(half)) / (angle * angle) if angle > 1e-4 else 1.0 / 12.0
         twice = cross(error, cross(error, turn))
         return plus(minus(turn, scaled(cross(error, turn), 0.5)), scaled(twice, share))
-    return plus(cross(drift, error), _look_change(gaze, wished, minus(turn, drift)))
+    return plus(cross(drift, error), _look_change(gaze, goal, minus(turn, drift)))
 
 
 @compiled
-def _look_change(gaze, wished, turn):
-    """Compute the change of `look_error(gaze, wished)` if the gaze turns by the small rotation vector `turn`."""
-    across = cross(wished, gaze)
-    sine, cosine = length(across), dot(wished, gaze)
+def _look_change(gaze, goal, turn):
+    """Compute the change of `look_error(gaze, goal)` if the gaze turns by the small rotation vector `turn`."""
+    across = cross(goal, gaze)
+    sine, cosine = length(across), dot(goal, gaze)
     if sine < 1e-9:
         return minus(turn, scaled(gaze, dot(gaze, turn)))
     axis = scaled(across, 1.0 / sine)
-    moved = minus(scaled(turn, cosine), scaled(gaze, dot(wished, turn)))
+    moved = minus(scaled(turn, cosine), scaled(gaze, dot(goal, turn)))
     moved = minus(moved, scaled(axis, dot(axis, moved)))
     return plus(scaled(axis, dot(axis, turn)), scaled(moved, math.atan2(sine, cosine) / sine))
 
@@ -66,10 +66,10 @@ def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, colu
     else:
         way = minus(vector_at(targets.values[frame], c), tip)
         far = length(way)
-        wished = direction(way)
-        drift = scaled(cross(move, wished), 1.0 / max(far, TINY))  # the eye moves, the point does not
+        goal = direction(way)
+        drift = scaled(cross(move, goal), 1.0 / max(far, TINY))  # the eye moves, the point does not
         gaze = rotated(turn, vector_at(targets.directions, c))
-        change = _turned_error(targets.kinds[c], error, gaze, wished, spin, drift)
+        change = _turned_error(targets.kinds[c], error, gaze, goal, spin, drift)
     for i in range(3):
         jacobian[3 * c + i, column] = targets.scales[c] * change[i]
 

@@ -33,10 +33,10 @@ from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 LONGEST_STEP_RAD = 1.0
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8
-EASING, TIGHTENING = 0.02, 8.0
+DAMPING_DECREASE, DAMPING_INCREASE = 0.02, 8.0
 # An accepted step that improves the objective by less than this share is the last one: while targets are missed, and
 # once they are reached and only the displacement still shrinks.
-CONVERGED_SHARE, SETTLED_SHARE = 1e-13, 1e-3
+CONVERGED_SHARE, REACHED_SHARE = 1e-13, 1e-3
 # Passes in which joints at a limit are found, for each step.
 LIMIT_PASSES = 6
 LIMIT_REACHED_RAD = 1e-9
@@ -55,35 +55,40 @@ def _displace(body, local, root, first_local, first_root, work):
             moved = logarithm(product(inverse(rotation_at(first_local, k)), rotation_at(local, k)))
             for axis in range(3):
                 work.displacement[columns] = moved[axis]
-                cost += work.holding[columns] * moved[axis] ** 2
+                cost += work.displacement_weights[columns] * moved[axis] ** 2
                 columns += 1
     for axis in range(3):
         work.displacement[columns] = root[axis] - first_root[axis]
-        cost += work.holding[columns] * work.displacement[columns] ** 2
+        cost += work.displacement_weights[columns] * work.displacement[columns] ** 2
         columns += 1
     return cost
 
 
 @compiled
-def _fill_softness(body, damping, work):
-    """Fill `work.softness`, the diagonal of D⁻¹; D is the sum of the damping and the weights of the displacements."""
+def _fill_inverse_diagonal(body, damping, work):
+    """Fill `work.inverse_diagonal` (3·V + 3,), the diagonal of D⁻¹.
+
+    The diagonal matrix D is the sum of the damping and the weights of the displacements.
+    """
     columns = 0
     for k in range(body.parents.shape[0]):
         if body.movable[k]:
             flexible = (1.0 - body.stiffness[k]) ** 2
             for _ in range(3):
-                work.softness[columns] = 1.0 / (work.holding[columns] + damping / flexible)
+                work.inverse_diagonal[columns] = 1.0 / (work.displacement_weights[columns] + damping / flexible)
                 columns += 1
     for _ in range(3):
-        work.softness[columns] = 1.0 / (work.holding[columns] + damping) if body.root_moves else 0.0
+        work.inverse_diagonal[columns] = (
+            1.0 / (work.displacement_weights[columns] + damping) if body.root_moves else 0.0
+        )
         columns += 1
 
 
 @compiled
-def _soften(work, vector, out):
+def _apply_inverse(work, vector, out):
     """Fill `out` with D⁻¹·vector; the components along directions that `_block` has excluded are removed.
 
-    D is the matrix of `_fill_softness`.
+    `work.inverse_diagonal` is the diagonal of D⁻¹ (see `_fill_inverse_diagonal`).
     """
     for v in range(work.blocked.shape[0]):
         known, along = work.blocked[v], 0.0
@@ -95,10 +100,10 @@ def _soften(work, vector, out):
                 kept -= along * work.outward[v, i]
             elif known == 2:
                 kept = along * work.outward[v, i]
-            out[3 * v + i] = work.softness[3 * v + i] * kept
+            out[3 * v + i] = work.inverse_diagonal[3 * v + i] * kept
     first = 3 * work.blocked.shape[0]
     for i in range(first, first + 3):
-        out[i] = work.softness[i] * vector[i]
+        out[i] = work.inverse_diagonal[i] * vector[i]
 
 
 @compiled
@@ -126,11 +131,11 @@ def _solve_positive(matrix, right):
 
 @compiled
 def _fill_step(work):
-    """Fill `work.step` with -(JᵀJ + D)⁻¹·gradient; J is the Jacobian, D as in `_fill_softness`."""
+    """Fill `work.step` with -(JᵀJ + D)⁻¹·gradient; J is the Jacobian, D as in `_fill_inverse_diagonal`."""
     rows, columns = work.jacobian.shape
-    _soften(work, work.gradient, work.step)
+    _apply_inverse(work, work.gradient, work.step)
     for i in range(rows):
-        _soften(work, work.jacobian[i], work.softened[i])
+        _apply_inverse(work, work.jacobian[i], work.scaled_rows[i])
     for i in range(rows):
         total = 0.0
         for n in range(columns):
@@ -139,13 +144,13 @@ def _fill_step(work):
         for j in range(i + 1):
             total = 1.0 if i == j else 0.0
             for n in range(columns):
-                total += work.jacobian[i, n] * work.softened[j, n]
+                total += work.jacobian[i, n] * work.scaled_rows[j, n]
             work.matrix[i, j] = total
     _solve_positive(work.matrix, work.right)
     for n in range(columns):
         total = work.step[n]
         for i in range(rows):
-            total -= work.softened[i, n] * work.right[i]
+            total -= work.scaled_rows[i, n] * work.right[i]
         work.step[n] = -total
 
 
@@ -187,7 +192,7 @@ def _take_step(body, local, root, work):
             kept = within_limits(body.limits[k], new)
             over = logarithm(product(inverse(kept), new))
             gone = logarithm(product(inverse(rotation_at(local, k)), kept))
-            # A joint that is still on its way to the limit goes up to it; one that is there is blocked.
+            # A joint that has not reached its limit moves up to it; a joint at its limit is blocked.
             if length(over) > LIMIT_REACHED_RAD and dot(gone, direction(over)) < LIMIT_REACHED_RAD:
                 newly_blocked = _block(work, v, direction(over)) or newly_blocked
             new = kept
@@ -202,7 +207,7 @@ def _take_step(body, local, root, work):
 @compiled
 def _fill_gradient(work):
     for n in range(work.gradient.shape[0]):
-        total = work.holding[n] * work.displacement[n]
+        total = work.displacement_weights[n] * work.displacement[n]
         for c in range(work.errors.shape[0]):
             for i in range(3):
                 total += work.jacobian[3 * c + i, n] * work.scaled_errors[3 * c + i]
@@ -229,11 +234,11 @@ def _prepare(body, targets, frame, work):
 
 @compiled
 def _try_step(body, damping, local, root, work):
-    """Take a damped step from the pose `local` and `root`; fill `work.trial` and `work.trial_root` with the new pose.
+    """Compute the pose after one damped step from the pose `local` and `root`.
 
-    Joints at a limit slide along this limit.
+    The new pose is `work.trial` and `work.trial_root`. Joints at a limit move only along this limit.
     """
-    _fill_softness(body, damping, work)
+    _fill_inverse_diagonal(body, damping, work)
     work.blocked[:] = 0
     for _ in range(LIMIT_PASSES):
         _fill_step(work)
@@ -245,9 +250,9 @@ def _try_step(body, damping, local, root, work):
 def _solve_frame(body, targets, frame, offsets, ends, carried, local, root, work, before, after):
     """Solve one frame: change the pose `local` (K, 4) and `root` (3,) in place.
 
-    `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `solve_frames`. If `carried`,
-    the solver starts with the pose `work.trial` and `work.trial_root`, and changes it as little as possible. Returns
-    the number of steps tried, and whether all targets are reached.
+    `before` and `after` (C,) are filled with the errors of the targets; `ends` are the stopping criteria (see
+    `solve_frames`). If `carried`, the solver starts with the pose `work.trial` and `work.trial_root`, and changes it as
+    little as possible. Returns the number of steps tried, and whether all targets are reached.
     """
     most_steps, tolerance_m, tolerance_rad = ends
     work.first[:] = local
@@ -280,8 +285,8 @@ def _solve_frame(body, targets, frame, offsets, ends, carried, local, root, work
         )
         trial += _displace(body, work.trial, work.trial_root, work.first, work.first_root, work)
         if not trial < cost:
-            damping *= TIGHTENING
-            # The displacements of the pose that is kept; its Jacobian and gradient still stand.
+            damping *= DAMPING_INCREASE
+            # Restores the displacements of the pose before the step; its Jacobian and gradient are unchanged.
             _displace(body, local, root, work.first, work.first_root, work)
             if damping > MOST_DAMPING:
                 break
@@ -291,9 +296,9 @@ def _solve_frame(body, targets, frame, offsets, ends, carried, local, root, work
         store_residuals(work.errors, after)
         gained = cost - trial
         cost, reached = trial, arrived
-        if gained < (SETTLED_SHARE if reached else CONVERGED_SHARE) * trial:
+        if gained < (REACHED_SHARE if reached else CONVERGED_SHARE) * trial:
             break
-        damping = max(EASING * damping, LEAST_DAMPING)
+        damping = max(DAMPING_DECREASE * damping, LEAST_DAMPING)
         _prepare(body, targets, frame, work)
     return steps, reached
 

@@ -60,13 +60,13 @@ def place_tips(targets, spins, places, tips, turns):
 
 
 @compiled
-def look_error(gaze, wished):
-    """Compute the rotation vector, in radians, from the unit direction `wished` to the unit direction `gaze`."""
-    across = cross(wished, gaze)
-    sine, cosine = length(across), dot(wished, gaze)
+def look_error(gaze, goal):
+    """Compute the rotation vector, in radians, from the unit direction `goal` to the unit direction `gaze`."""
+    across = cross(goal, gaze)
+    sine, cosine = length(across), dot(goal, gaze)
     if sine > TINY:
         return scaled(across, math.atan2(sine, cosine) / sine)
-    return (0.0, 0.0, 0.0) if cosine > 0.0 else scaled(perpendicular(wished), math.pi)
+    return (0.0, 0.0, 0.0) if cosine > 0.0 else scaled(perpendicular(goal), math.pi)
 
 
 @compiled

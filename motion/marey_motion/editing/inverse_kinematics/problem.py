@@ -72,8 +72,8 @@ class Targets(NamedTuple):
 class SolverResult(NamedTuple):
     """Results of a solver for F frames and C targets.
 
-    `before` and `after` (F, C) are the errors of the targets; `iterations` (F,) are the numbers of iterations, and
-    `reached` (F,) whether all targets are reached.
+    `before` and `after` (F, C) are the errors of the targets in the given and in the solved poses, in metres or
+    radians. `iterations` (F,) are the numbers of iterations, and `reached` (F,) whether all targets are reached.
     """
 
     before: Floats
@@ -82,7 +82,7 @@ class SolverResult(NamedTuple):
     reached: Flags
 
 
-class Placing(NamedTuple):
+class DescentScratch(NamedTuple):
     """Scratch arrays of cyclic coordinate descent, for one pose of K joints and C targets.
 
     Parameters
@@ -102,8 +102,8 @@ class Placing(NamedTuple):
     vectors: Floats
 
 
-class Stepping(NamedTuple):
-    """Scratch arrays of least squares: for one pose, as in `Placing`, and for a step with n unknowns and m errors.
+class LeastSquaresScratch(NamedTuple):
+    """Scratch arrays of the least-squares solver: for one pose, as in `DescentScratch`, and for one step.
 
     The unknowns are displacements of the pose from the pose at the start, `first` and `first_root`. `trial` and
     `trial_root` are the pose after a step; the other arrays are terms of the equations of the step.
@@ -118,13 +118,13 @@ class Stepping(NamedTuple):
     first_root: Floats
     trial: Floats
     trial_root: Floats
-    holding: Floats
+    displacement_weights: Floats
     displacement: Floats
     gradient: Floats
     step: Floats
-    softness: Floats
+    inverse_diagonal: Floats
     jacobian: Floats
-    softened: Floats
+    scaled_rows: Floats
     scaled_errors: Floats
     right: Floats
     matrix: Floats
@@ -138,6 +138,8 @@ class IkProblem(NamedTuple):
     Parameters
     ----------
     joints : (K,) indices in the skeleton
+    body : parents, offsets, limits and stiffness of these joints
+    targets : the C targets
     roots, rotations : (F, 3) in metres and (F, K, 4) local rotations, copied from the motion
     """
 
@@ -156,12 +158,12 @@ class IkProblem(NamedTuple):
         )
 
     @property
-    def placing(self) -> Placing:
+    def descent_scratch(self) -> DescentScratch:
         """Make scratch arrays for cyclic coordinate descent."""
         room = self._pose_room()
-        return Placing(**room, matrix=np.zeros((3, 3)), form=np.zeros((4, 4)), vectors=np.zeros((4, 4)))
+        return DescentScratch(**room, matrix=np.zeros((3, 3)), form=np.zeros((4, 4)), vectors=np.zeros((4, 4)))
 
-    def stepping(self, regularisation_m: float) -> Stepping:
+    def least_squares_scratch(self, regularisation_m: float) -> LeastSquaresScratch:
         """Make scratch arrays for least squares.
 
         Parameters
@@ -170,25 +172,25 @@ class IkProblem(NamedTuple):
 
         Returns
         -------
-        named tuple    scratch arrays
+        LeastSquaresScratch    scratch arrays
         """
         movable = int(self.body.movable.sum())
         joints, unknowns, errors = len(self.joints), 3 * movable + 3, 3 * len(self.targets.kinds)
-        holding = np.full(unknowns, regularisation_m**2)
-        holding[:-3] /= np.repeat((1.0 - self.body.stiffness[self.body.movable]) ** 2, 3)
-        return Stepping(
+        displacement_weights = np.full(unknowns, regularisation_m**2)
+        displacement_weights[:-3] /= np.repeat((1.0 - self.body.stiffness[self.body.movable]) ** 2, 3)
+        return LeastSquaresScratch(
             **self._pose_room(),
             first=np.zeros((joints, 4)),
             first_root=np.zeros(3),
             trial=np.zeros((joints, 4)),
             trial_root=np.zeros(3),
-            holding=holding,
+            displacement_weights=displacement_weights,
             displacement=np.zeros(unknowns),
             gradient=np.zeros(unknowns),
             step=np.zeros(unknowns),
-            softness=np.zeros(unknowns),
+            inverse_diagonal=np.zeros(unknowns),
             jacobian=np.zeros((errors, unknowns)),
-            softened=np.zeros((errors, unknowns)),
+            scaled_rows=np.zeros((errors, unknowns)),
             scaled_errors=np.zeros(errors),
             right=np.zeros(errors),
             matrix=np.zeros((errors, errors)),
@@ -218,7 +220,7 @@ class IkProblem(NamedTuple):
 
 
 def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom) -> IkProblem:
-    """Pack targets for the frames of a motion.
+    """Pack the frames of a motion, the joints that may turn, and the targets into arrays for the kernels.
 
     Parameters
     ----------

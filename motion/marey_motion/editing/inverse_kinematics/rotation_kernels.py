@@ -115,7 +115,7 @@ def between(a, b):
     if w > 1e-9:
         x, y, z = cross(a, b)
         return unit((w, x, y, z))
-    # Opposite: half a turn about any perpendicular, then what is left.
+    # Opposite vectors: half a turn about any perpendicular, then the remaining rotation.
     i, j, k = perpendicular(a)
     x, y, z = cross(b, a)
     return product(unit((1.0 - dot(a, b), x, y, z)), (0.0, i, j, k))

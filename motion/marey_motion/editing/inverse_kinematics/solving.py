@@ -53,8 +53,9 @@ class SolvedPoses:
     Parameters
     ----------
     motion : the frames, with the joints turned
-    residual_before, residual_after : (F, C) error of each target, in metres or radians
-    iterations : (F,) sweeps or steps
+    residual_before, residual_after : (F, C) error of each target before and after, in metres (position) or radians
+        (orientation, look-at)
+    iterations : (F,) number of sweeps (ccd) or steps (least squares) in each frame; 0 or 1 for the two-bone solver
     reached : (F,) whether all targets are met within the tolerances
     """
 
@@ -204,7 +205,7 @@ def solve_ccd(
             where="root_moves",
         )
     problem = pose_problem(skeleton, motion, targets, freedom)
-    found, room = problem.found, problem.placing
+    found, room = problem.found, problem.descent_scratch
     solve_in_order(ccd_kernels.descend, problem, options, room, found, neighbours)
     return _solved(motion, problem, found)
 
@@ -243,7 +244,7 @@ def solve_least_squares(
     from marey_motion.editing.inverse_kinematics import least_squares_kernels
 
     problem = pose_problem(skeleton, motion, targets, freedom)
-    found, room = problem.found, problem.stepping(options.regularisation_m)
+    found, room = problem.found, problem.least_squares_scratch(options.regularisation_m)
     solve_in_order(least_squares_kernels.solve_frames, problem, options, room, found, neighbours)
     return _solved(motion, problem, found)
 
@@ -315,7 +316,7 @@ def solve_two_bone(
         _STILL if orientation is None else np.ascontiguousarray(problem.targets.values[:, 1]),
         problem.roots,
         problem.rotations,
-        problem.placing,
+        problem.descent_scratch,
     )
     if neighbours is not None:
         pole = None if position.pole is None else np.asarray(position.pole, dtype=np.float64)
@@ -364,7 +365,7 @@ def _measure(problem: IkProblem, options: SolverOptions, residuals: Floats, foun
         (float(options.tolerance_m), float(options.tolerance_rad)),
         problem.roots,
         problem.rotations,
-        problem.placing,
+        problem.descent_scratch,
         residuals,
         found.reached,
     )
@@ -381,7 +382,7 @@ def measure_residuals(skeleton: Skeleton, motion: Motion, targets: Sequence[Targ
 
     Returns
     -------
-    (F, C) float64    metres or radians
+    (F, C) float64    metres for position targets, radians for orientation and look-at targets
     """
     problem = pose_problem(skeleton, motion, targets, _ANYWHERE)
     found = problem.found

@@ -85,9 +85,9 @@ def pole_swivels(limb, body, roots, after, pole, work, angles, weights):
         line = direction(minus(_far_end(limb, work), start))
         way = direction(minus((pole[0], pole[1], pole[2]), start))
         upper = direction(minus(vector_at(work.places, limb.middle), start))
-        wished, now = minus(way, scaled(line, dot(way, line))), minus(upper, scaled(line, dot(upper, line)))
-        angles[f] = math.atan2(dot(line, cross(now, wished)), dot(now, wished))
-        weights[f] = length(wished) * min(1.0, 10.0 * length(now))
+        goal, now = minus(way, scaled(line, dot(way, line))), minus(upper, scaled(line, dot(upper, line)))
+        angles[f] = math.atan2(dot(line, cross(now, goal)), dot(now, goal))
+        weights[f] = length(goal) * min(1.0, 10.0 * length(now))
 
 
 @compiled

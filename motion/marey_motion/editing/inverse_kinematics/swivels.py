@@ -40,26 +40,26 @@ def swivel_coherently(
     """
     from marey_motion.editing.inverse_kinematics import swivel_kernels
 
-    count, work, reach = len(neighbours.frames), problem.placing, neighbours.reach
+    count, work, reach = len(neighbours.frames), problem.descent_scratch, neighbours.reach
     lines, jumps, turns = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
     posed = limb, problem.body, problem.roots
     swivel_kernels.measure_swivels(*posed, before, problem.rotations, work, lines, jumps, turns)
-    wished, clear = np.zeros(count), (0.5 + 0.5 * np.cos(turns)) ** 2
+    goal, clear = np.zeros(count), (0.5 + 0.5 * np.cos(turns)) ** 2
     if pole is not None:
-        swivel_kernels.pole_swivels(*posed, problem.rotations, pole, work, wished, clear)
+        swivel_kernels.pole_swivels(*posed, problem.rotations, pole, work, goal, clear)
         reach = POLE_FRAMES
     angles = np.zeros(count)
     for start, stop in neighbours.runs:
         part = slice(start, stop)
         jumps[start] = 0.0
         if pole is not None or np.abs(jumps[part]).max() > COHERENT_RAD:
-            angles[part] = _even_swivels(wished[part], jumps[part], clear[part], reach)
+            angles[part] = _even_swivels(goal[part], jumps[part], clear[part], reach)
     if not angles.any():
         return
     alone = problem.rotations.copy()
     swivel_kernels.swivel_frames(*posed, angles, lines, problem.rotations, work)
     if pole is None:
-        steps = [_restlessness(limb, problem, rotations) for rotations in (alone, problem.rotations)]
+        steps = [_limb_speeds(limb, problem, rotations) for rotations in (alone, problem.rotations)]
         for start, stop in neighbours.runs:
             part = slice(start, stop - 1)
             worst = [sum(float(one[part].max(initial=0.0)) for one in both) for both in steps]
@@ -67,7 +67,7 @@ def swivel_coherently(
                 problem.rotations[start:stop] = alone[start:stop]
 
 
-def _restlessness(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floats, Floats]:
+def _limb_speeds(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floats, Floats]:
     """Compute two speeds (F - 1,), in radians per frame: of the upper bone in the world, and of its joint in the limb.
 
     The speed of the bone does not include a twist of a straight limb. The speed of the joint, computed from its local
@@ -76,22 +76,22 @@ def _restlessness(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Flo
     from marey_motion.editing.inverse_kinematics import swivel_kernels
 
     bones = np.zeros((len(rotations), 3))
-    swivel_kernels.fill_upper_bones(limb, problem.body, problem.roots, rotations, problem.placing, bones)
+    swivel_kernels.fill_upper_bones(limb, problem.body, problem.roots, rotations, problem.descent_scratch, bones)
     turns = np.sum(rotations[1:, limb.start] * rotations[:-1, limb.start], axis=-1)
     moved = np.linalg.norm(np.diff(bones, axis=0), axis=-1)
     return np.asarray(moved), np.asarray(2.0 * np.arccos(np.minimum(np.abs(turns), 1.0)))
 
 
-def _even_swivels(wished: Floats, jumps: Floats, clear: Floats, reach: float) -> Floats:
-    """Compute swivels (n,) near the wished swivels, with which the change of the limb varies slowly.
+def _even_swivels(goal: Floats, jumps: Floats, clear: Floats, reach: float) -> Floats:
+    """Compute swivels (n,) near the desired swivels, with which the change of the limb varies slowly.
 
-    Minimises Σ c (a - w)² + reach² Σ (Δa + jump)² over the swivels a. The wished swivels w are angles on a circle; the
-    weights c, from 0 to 1, are small if a wished swivel is ambiguous. All angles are in radians.
+    Minimises Σ c (a - w)² + reach² Σ (Δa + jump)² over the swivels a. The desired swivels w are angles on a circle; the
+    weights c, from 0 to 1, are small where a desired swivel is ambiguous. All angles are in radians.
     """
     from scipy.linalg import solveh_banded
 
-    carried = np.cumsum(jumps)  # what the swivels add up to if none is corrected
-    data = _unwrapped(wished + carried, clear)
+    carried = np.cumsum(jumps)  # sum of the swivels if none is corrected
+    data = _unwrapped(goal + carried, clear)
     weights = np.maximum(clear, LEAST_CLARITY)
     stiff = reach**2
     bands = np.zeros((2, len(data)))
@@ -109,8 +109,8 @@ def _unwrapped(angles: Floats, clear: Floats) -> Floats:
 
     The weights are `clear` (n,). Angles with less weight are not compared.
     """
-    told = np.flatnonzero(clear >= min(0.05, float(clear.max())))
-    turns = np.round(np.diff(angles[told]) / (2.0 * np.pi))
+    weighted = np.flatnonzero(clear >= min(0.05, float(clear.max())))
+    turns = np.round(np.diff(angles[weighted]) / (2.0 * np.pi))
     full = np.zeros(len(angles))
-    full[told[1:]] = turns
+    full[weighted[1:]] = turns
     return angles - 2.0 * np.pi * np.cumsum(full)

@@ -1,7 +1,7 @@
 """Inputs of inverse kinematics: targets of joints, limits of joints, and the joints that may turn.
 
-Right-handed, Y up, metres, radians; quaternions (w, x, y, z). Targets are in the world, tips and limits in a joint's
-own frame.
+Right-handed, Y up, metres, radians; quaternions (w, x, y, z). Targets are in the world, offsets and limits in a
+joint's own frame.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class PositionTarget:
     ----------
     joint : index of the joint
     position : (3,), or (F, 3) for each frame    metres, world
-    axes : coordinates that must match, such as "xz"; the others are free
+    axes : coordinates that must match, such as "xz"; all other coordinates are free
     offset : (3,) metres in the joint's frame, from the joint to the point, such as the tip of a tool
     weight : weight of the squared distance
     pole : (3,) metres, world; point to which the elbow or knee of the limb that ends at the joint is directed (two-bone
@@ -165,8 +165,9 @@ class JointLimit:
         Parameters
         ----------
         axes : JointAxes    axes of the joint
-        swing_rad : float or (float, float)    half angle of the cone, or of its two axes
-        twist_rad : (float, float)    bounds of the twist
+        swing_rad : float or (float, float)    half angle of a round cone, or both half angles of an elliptical cone
+            (`JointLimit.swing_rad`)
+        twist_rad : (float, float)    bounds of the twist about the bone; by default, the twist is free
         reference : (4,)    local rotation in the middle of the cone
 
         Returns
@@ -212,7 +213,7 @@ class SolverOptions:
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """Joints that a solver may turn.
+    """Joints that a solver may turn, with their limits and stiffness.
 
     Parameters
     ----------
@@ -275,7 +276,8 @@ def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
     if top not in path:
         names = skeleton.joint_names
         raise EditError(
-            f"the joint {names[top]} is not an ancestor of the target's joint {names[effector]}; choose one that is",
+            f"the joint {names[top]} is not an ancestor of the target's joint {names[effector]}; choose an ancestor of "
+            "this joint as top",
             code="chain-invalid",
             where=names[top],
         )

@@ -25,11 +25,12 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
 )
 from marey_motion.kernels import compiled, inverse, product, put_rotation
 
-# Radians: a limb bent by less bends about its hinge, one bent by more about the axis that it is bent about now.
-HINGED, TOLD = math.radians(15.0), math.radians(30.0)
+# Bends in radians: up to the first, a limb bends about its hinge; from the second on, about its present axis.
+HINGE_BEND_RAD, CLEAR_BEND_RAD = math.radians(15.0), math.radians(30.0)
 # Sine of the inner angle below which the axis of a folded limb is drawn towards its hinge.
 NEARLY_FOLDED = 0.05
-# What of a hinge's unit direction must be across the upper bone for it to say anything.
+# Least length of the part of a hinge's unit direction that is perpendicular to the upper bone. Below it, the hinge is
+# not used.
 SHORTEST_HINGE = 0.1
 # The joint at the limb's end turns with the bones, keeps its rotation in the world, or gets a given rotation.
 CARRIED, HELD, GIVEN = 0, 1, 2
@@ -47,19 +48,18 @@ def bend_at(distance, first, second):
 
 
 @compiled
-def damped_bend(angle, wished, zone):
-    """Damp the change of the angle between the bones, from `angle` to `wished`, near a straight or folded limb.
-
-    Kovar et al. (2002), section 5.2; all angles are in radians.
+def damped_bend(angle, goal, zone):
+    """Damp the change of the angle between the bones, from `angle` to `goal`, near a straight or folded limb.
 
     In the last `zone` radians before the limb is straight, and in the last `zone` radians before it is folded, the
-    change is weighted by a cubic that falls from 1 to 0.
+    change is weighted by a cubic that falls from 1 to 0 (Kovar et al. 2002, section 5.2). Returns the damped angle; all
+    angles are in radians.
     """
-    if wished < angle and wished < zone:
-        return math.pi - damped_bend(math.pi - angle, math.pi - wished, zone)
-    if wished <= angle or zone <= 0.0:
-        return wished
-    return angle + _weighed(wished, zone) - _weighed(angle, zone)
+    if goal < angle and goal < zone:
+        return math.pi - damped_bend(math.pi - angle, math.pi - goal, zone)
+    if goal <= angle or zone <= 0.0:
+        return goal
+    return angle + _weighed(goal, zone) - _weighed(angle, zone)
 
 
 @compiled
@@ -69,8 +69,8 @@ def _weighed(angle, zone):
 
 
 @compiled
-def _bent(upper, fore, wished, hinge):
-    """Compute the vector of the lower bone after the limb is bent so that the angle between its bones is `wished`.
+def _bent(upper, fore, goal, hinge):
+    """Compute the vector of the lower bone after the limb is bent so that the angle between its bones is `goal`.
 
     `upper` and `fore` are the vectors from the middle joint to both ends of the limb; `hinge` is the direction about
     which a straight limb bends, zero if unknown.
@@ -81,21 +81,21 @@ def _bent(upper, fore, wished, hinge):
     if length(hinge) > SHORTEST_HINGE:
         hinge = direction(hinge)
         side = cross(back, hinge)
-        turn = _turn_from_hinge(dot(axis, hinge), dot(axis, side), dot(back, way), math.pi - wished)
+        turn = _turn_from_hinge(dot(axis, hinge), dot(axis, side), dot(back, way), math.pi - goal)
         axis = plus(scaled(hinge, math.cos(turn)), scaled(side, math.sin(turn)))
     else:
         axis = direction(minus(axis, scaled(back, dot(axis, back))))
     across = cross(axis, back)
     size = length(fore)
-    return plus(scaled(back, size * math.cos(wished)), scaled(across, size * math.sin(wished)))
+    return plus(scaled(back, size * math.cos(goal)), scaled(across, size * math.sin(goal)))
 
 
 @compiled
-def _turn_from_hinge(along, across, cosine, wished):
+def _turn_from_hinge(along, across, cosine, goal):
     """Compute the angle, about the upper bone, from a limb's hinge to the axis about which the limb is to bend.
 
-    `wished` is the bend in radians. A nearly straight limb, even a little overstretched, bends about its hinge and
-    keeps an existing bend to the side. A bent limb continues to bend about the axis of its present bend.
+    `goal` is the desired bend in radians. A nearly straight limb, even a little overstretched, bends about its hinge
+    and keeps an existing bend to the side. A bent limb continues to bend about the axis of its present bend.
 
     Parameters
     ----------
@@ -108,9 +108,9 @@ def _turn_from_hinge(along, across, cosine, wished):
         along += max(0.0, NEARLY_FOLDED - sine)
     now = math.atan2(sine, -cosine)
     measured = math.atan2(across, along)
-    hinged = math.asin(now * math.sin(measured) / max(now, wished, 1e-12))
-    told = min(1.0, max(0.0, (now - HINGED) / (TOLD - HINGED)))
-    return hinged + told * told * (3.0 - 2.0 * told) * (measured - hinged)
+    hinged = math.asin(now * math.sin(measured) / max(now, goal, 1e-12))
+    share = min(1.0, max(0.0, (now - HINGE_BEND_RAD) / (CLEAR_BEND_RAD - HINGE_BEND_RAD)))
+    return hinged + share * share * (3.0 - 2.0 * share) * (measured - hinged)
 
 
 @compiled
@@ -135,9 +135,9 @@ def _reach(limb, body, offsets, root, local, target, rotation, work):
     way = minus(target, start)
     distance = min(max(length(way), abs(first - second)), first + second)
     now = bend_at(length(minus(tip, start)), first, second)
-    wished = damped_bend(now, bend_at(distance, first, second), limb.damping_zone)
+    goal = damped_bend(now, bend_at(distance, first, second), limb.damping_zone)
     hinge = rotated(rotation_at(work.spins, limb.middle), (limb.hinge[0], limb.hinge[1], limb.hinge[2]))
-    bent = _bent(upper, fore, wished, hinge)
+    bent = _bent(upper, fore, goal, hinge)
     opening = between(direction(fore), direction(bent))
     aim = between(direction(minus(plus(middle, bent), start)), direction(way))
     _turn(body, work, local, limb.start, aim)

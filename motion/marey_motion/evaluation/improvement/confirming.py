@@ -1,4 +1,4 @@
-"""Confirmation of suggestions: their effects are measured in replicates from which no suggestion was chosen."""
+"""Confirmation of suggestions: their effects are measured in replicates that were not used to choose them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Confirmed:
-    """Effects of suggestions, measured in replicates from which no suggestion was chosen.
+    """Effects of suggestions, measured in replicates that were not used to choose the suggestions.
 
     The probabilities of each metric are corrected for the total number of these effects; the intervals are not.
 
@@ -67,7 +67,7 @@ def confirm(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> Confirmed | None:
-    """Measure the effects of suggestions in replicates from which no suggestion was chosen.
+    """Measure the effects of suggestions in replicates that were not used to choose the suggestions.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def _addition_effects(
     states = [outside]
     for step in steps:
         states.append(states[-1] - {step.filling.source})
-    # The set with all additions comes first: what needs none of them is then not simulated again without them.
+    # The set with all additions comes first, so that trials that need none of them are not simulated again.
     for absent in reversed(states[1:]):
         stages.next(confirming.outcomes(absent))
     return [stages.next(effect_of(confirming, how.objective, *pair)) for pair in pairwise(states)]

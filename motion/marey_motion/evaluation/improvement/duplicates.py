@@ -33,7 +33,8 @@ class NearDuplicate:
     ----------
     first, second : uids of the source clips
     first_name, second_name : names of the clips
-    distance_cm : distance of the two motions per frame, as in the description of the module, but in centimetres
+    distance_cm : distance of the two motions in centimetres: the mean distances of corresponding points, summed along
+        the best alignment in time and divided by the frames of the longer clip
     same_content : whether both are the same frames of clips with equal content
     mirrored : whether the first motion is nearly the mirror image of the second
     perceived : perceptual distance of the two motions; None without a metric
@@ -51,7 +52,11 @@ class NearDuplicate:
 
 @dataclass(frozen=True)
 class NearDuplicates:
-    """Pairs of clips within the threshold, nearest first; numbers of pairs that were aligned, and of all pairs."""
+    """Near-duplicates of a set of clips.
+
+    `pairs` lists the pairs within `threshold_cm`, the nearest first. `compared` is the number of all pairs, and
+    `aligned` the number of pairs whose distance had to be computed by an alignment.
+    """
 
     pairs: tuple[NearDuplicate, ...]
     threshold_cm: float
@@ -63,7 +68,7 @@ def find_near_duplicates(
     database: MatchingDatabase,
     *,
     threshold_cm: float,
-    seen: PerceivedRows | None = None,
+    perceived_rows: PerceivedRows | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
@@ -75,8 +80,9 @@ def find_near_duplicates(
     Parameters
     ----------
     database : MatchingDatabase    the clips
-    threshold_cm : float    centimetres per frame
-    seen : PerceivedRows, optional    the rows under a perceptual metric, by which pairs are measured, too
+    threshold_cm : float    greatest distance of near-duplicates (`NearDuplicate.distance_cm`), centimetres
+    perceived_rows : PerceivedRows, optional    rows of `database`, prepared for a perceptual metric; if given, the
+        perceptual distance of each pair is computed, too
     threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -89,7 +95,7 @@ def find_near_duplicates(
     ------
     EvaluationCancelled    if cancelled
     """
-    families = _Families(database, seen)
+    families = _Families(database, perceived_rows)
     found: list[NearDuplicate] = []
     aligned = compared = 0
 
@@ -114,8 +120,8 @@ def find_near_duplicates(
 class _Families:
     """The clips of a database, grouped by source: a clip and its mirrored copy have the same source."""
 
-    def __init__(self, database: MatchingDatabase, seen: PerceivedRows | None) -> None:
-        self._seen = seen
+    def __init__(self, database: MatchingDatabase, perceived_rows: PerceivedRows | None) -> None:
+        self._perceived_rows = perceived_rows
         families = clips_by_source(database.clips).values()
         self._clips = [database.clips[index] for own in families for index in own]
         self._family = np.repeat(np.arange(len(families)), [len(own) for own in families])
@@ -148,7 +154,11 @@ class _Families:
             aligned += 1
             distance = warped_distance(own, theirs, limit=limit_m)
             if distance <= limit_m:
-                perceived = None if self._seen is None else self._seen.distance(self._clips[one], self._clips[place])
+                perceived = (
+                    None
+                    if self._perceived_rows is None
+                    else self._perceived_rows.distance(self._clips[one], self._clips[place])
+                )
                 pair = _pair(self._clips[one], self._clips[place], distance, perceived)
                 near.setdefault(self._family[place], []).append(pair)
         nearest = [min(pairs, key=lambda pair: pair.distance_cm) for pairs in near.values()]
@@ -160,7 +170,7 @@ class _Families:
 
 
 def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
-    """Compute the pose joints and the root at each horizon as points.
+    """Compute the positions of the pose joints, and of the future root at each horizon, for each row of a database.
 
     Parameters
     ----------
@@ -180,7 +190,7 @@ def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
 def spared_sources(
     database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int], *, most_perceived: float = np.inf
 ) -> tuple[tuple[str, NearDuplicate], ...]:
-    """Choose the source clips that can be spared: after their removal, no pair of near-duplicates is left.
+    """Choose the source clips that can be spared: after their removal, no near-duplicates that look alike are left.
 
     Of each pair, the source that is displayed for fewer ticks is removed. If the numbers of ticks are equal, the
     shorter source is removed; if the durations are equal, too, the source with the higher uid is removed.

@@ -51,11 +51,11 @@ def estimation_replicates(options: ConfirmedEffects) -> range:
 
     Parameters
     ----------
-    options : ConfirmedEffects    how many
+    options : ConfirmedEffects    numbers of replicates
 
     Returns
     -------
-    range    the first numbers, which are those of the evaluation
+    range    from 0 to `options.estimation_replicates` - 1
     """
     return range(options.estimation_replicates)
 
@@ -63,11 +63,11 @@ def estimation_replicates(options: ConfirmedEffects) -> range:
 def confirmation_replicates(options: ConfirmedEffects, evaluation: EvaluationOptions, turn: int = 0) -> range:
     """Return the numbers of the replicates in which effects are confirmed; no choice was based on these replicates.
 
-    All replicates of the evaluation are excluded, because unused clips are those that no replicate displays.
+    All replicates of the evaluation are excluded, too, because unused clips were found by all of them.
 
     Parameters
     ----------
-    options : ConfirmedEffects    how many
+    options : ConfirmedEffects    numbers of replicates
     evaluation : EvaluationOptions    options of the evaluation whose set is improved
     turn : int    0 for the first confirmation, 1 for a second confirmation in different replicates
 
@@ -93,7 +93,7 @@ def effect_between(
 
     Returns
     -------
-    Effect    with probabilities that are not corrected for other effects
+    Effect    the effect; its probabilities are not yet corrected for the number of effects that are reported together
     """
     means = [[headline_means(one) for one in side] for side in (before, after)]
     values = [
@@ -128,18 +128,18 @@ def _addends(results: Replicates, name: str) -> Floats:
 def effect_of(
     simulation: Resimulation, objective: ObjectiveOptions, before: Sources, after: Sources, *, with_data: bool = False
 ) -> Effect:
-    """Simulate the effect of a change of a set, in the replicates of a simulation.
+    """Compute the effect of adding clips to a set or removing clips, by simulating the trials before and after.
 
     Parameters
     ----------
-    simulation : Resimulation    the trials
+    simulation : Resimulation    the trials, and the replicates in which they run
     objective : ObjectiveOptions    weights of the objective
-    before, after : frozenset of str    sources that are not in the set, before and after the change
+    before, after : frozenset of str    uids of the source clips that are not in the set, before and after the change
     with_data : bool    whether the objective includes the price of the data
 
     Returns
     -------
-    Effect    with probabilities that are not corrected for other effects
+    Effect    the effect; its probabilities are not yet corrected for the number of effects that are reported together
     """
     data_s = (simulation.seconds(before), simulation.seconds(after)) if with_data else (0.0, 0.0)
     return effect_between(objective, simulation.by_replicate(before), simulation.by_replicate(after), data_s)
@@ -154,7 +154,7 @@ def corrected_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
 
     Returns
     -------
-    tuple of Effect    in the same order
+    tuple of Effect    with corrected probabilities, in the same order
     """
     objectives = corrected_family([effect.objective for effect in effects])
     headlines = {name: corrected_family([effect.headlines[name] for effect in effects]) for name in HEADLINES}

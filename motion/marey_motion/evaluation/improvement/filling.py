@@ -92,7 +92,7 @@ def rank_fillings(
     options: EvaluationOptions,
     threshold: float,
     *,
-    seen: PerceivedRows | None = None,
+    perceived_rows: PerceivedRows | None = None,
     most_frames: int = MOST_FRAMES,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
@@ -105,9 +105,11 @@ def rank_fillings(
     coverage : Coverage    coverage of the set
     collections : mapping of str to MatchingDatabase    databases by name, of any skeleton, at the set's frame rate
     options : EvaluationOptions    grid and minimum seconds per cell
-    threshold : float    distance up to which a frame can be blended, as in `similarity`
-    seen : PerceivedRows, optional    the rows of the set under a perceptual metric, which is used instead of metres
-    most_frames : int    frames compared per source
+    threshold : float    distance up to which a frame can be blended, in metres or, with `perceived_rows`, in the
+        distance of the metric
+    perceived_rows : PerceivedRows, optional    rows of the set, prepared for a perceptual metric; None for distances in
+        metres
+    most_frames : int    greatest number of frames compared per source
     progress : callable, optional    called as progress(sources done, total, name)
     cancelled : callable, optional    returns True to stop
 
@@ -125,7 +127,7 @@ def rank_fillings(
     for name, other in collections.items():
         comparable = same_skeleton(database, other)
         present = set(clips_by_source(database.clips)) if comparable else set()
-        nearest = _nearest_of_set(database, other, seen)
+        nearest = _nearest_of_set(database, other, perceived_rows)
         for source, (own, rows, cells) in seconds[name].items():
             if cancelled is not None and cancelled():
                 raise EvaluationCancelled(f"the comparison was stopped after {done} of {total} candidates")
@@ -157,7 +159,7 @@ def plan_fillings(
     ----------
     fillings : sequence of Filling    result of `rank_fillings`
     coverage : Coverage    coverage of the set
-    collections : mapping of str to MatchingDatabase    by name
+    collections : mapping of str to MatchingDatabase    databases by name, as for `rank_fillings`
     options : EvaluationOptions    grid and minimum seconds per cell
 
     Returns
@@ -221,15 +223,15 @@ def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Float
 
 
 def _nearest_of_set(
-    database: MatchingDatabase, other: MatchingDatabase, seen: PerceivedRows | None
+    database: MatchingDatabase, other: MatchingDatabase, perceived_rows: PerceivedRows | None
 ) -> Callable[[NDArray[np.int64]], Floats]:
     """Return a function that computes the distances of rows of another database from the nearest row of the set."""
     everything, ones = np.arange(database.row_count), np.ones(database.row_count, dtype=np.int64)
-    if seen is None:
+    if perceived_rows is None:
         points = other.pose_points
         return lambda rows: nearest_poses(points[rows], np.zeros_like(rows), database.pose_points, ones)
-    theirs = PerceivedRows(other, seen.document)
-    return lambda rows: theirs.nearest(rows, np.zeros_like(rows), seen, everything, ones)
+    theirs = PerceivedRows(other, perceived_rows.document)
+    return lambda rows: theirs.nearest(rows, np.zeros_like(rows), perceived_rows, everything, ones)
 
 
 def _filling(

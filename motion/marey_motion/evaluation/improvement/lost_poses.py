@@ -32,7 +32,7 @@ class LostPoses:
     Parameters
     ----------
     database : MatchingDatabase    the clips
-    seen : PerceivedRows    its rows under the metric
+    perceived_rows : PerceivedRows    its rows, prepared for the perceptual metric
     threshold : float    greatest distance of poses that replace each other
     most_poses : int    number of poses to compare, at least one of each clip
     progress : callable, optional    called as progress(poses done, total, name)
@@ -46,7 +46,7 @@ class LostPoses:
     def __init__(
         self,
         database: MatchingDatabase,
-        seen: PerceivedRows,
+        perceived_rows: PerceivedRows,
         threshold: float,
         *,
         most_poses: int = MOST_POSES,
@@ -68,7 +68,7 @@ class LostPoses:
         self._alike: Flags = np.zeros((total, len(own)), np.bool_)
         """Whether a source has a pose within the threshold of each compared pose."""
         ordered, firsts = _rows_by_source(database)
-        for start, block in seen.blocks(rows, seen, ordered):
+        for start, block in perceived_rows.blocks(rows, perceived_rows, ordered):
             if cancelled is not None and cancelled():
                 raise EvaluationCancelled(f"the comparison was stopped after {start} of {total} poses")
             self._alike[start : start + len(block)] = np.minimum.reduceat(block, firsts, axis=1) <= threshold

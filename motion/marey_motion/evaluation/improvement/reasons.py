@@ -45,7 +45,7 @@ def why_unused_range(part: UnusedRange) -> str:
 
 
 def why_unused_again(effect: Effect) -> str:
-    """Describe the effect of removing all unused data, in replicates that the evaluation did not contain.
+    """Describe the effect of removing all unused data, in replicates that are not part of the evaluation.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def why_unused_again(effect: Effect) -> str:
     -------
     str    a sentence
     """
-    return f"Without all of them, in other replicates, {distance_in_words(effect)}."
+    return f"Without all of this unused data, in other replicates, {distance_in_words(effect)}."
 
 
 def why_redundant(removal: Removal, trials: int, confirmed: Effect | None = None) -> str:
@@ -65,7 +65,7 @@ def why_redundant(removal: Removal, trials: int, confirmed: Effect | None = None
     ----------
     removal : Removal    the clip and its estimated effect
     trials : int    number of trials of the suite
-    confirmed : Effect, optional    the effect in replicates from which the removal was not chosen
+    confirmed : Effect, optional    the effect in replicates that were not used to choose the removal
 
     Returns
     -------
@@ -91,7 +91,7 @@ def distance_in_words(effect: Effect) -> str:
 
     Parameters
     ----------
-    effect : Effect    the effect in replicates that had no part in the choice
+    effect : Effect    the effect in replicates that were not used to choose the change
 
     Returns
     -------
@@ -121,7 +121,7 @@ def why_duplicate(source: str, pair: NearDuplicate, most_perceived: float | None
     ----------
     source : str    uid of the clip to remove
     pair : NearDuplicate    the pair
-    most_perceived : float, optional    greatest perceptual distance of motions that look the same, if a metric was used
+    most_perceived : float, optional    perceptual distance up to which motions look the same; None without a metric
 
     Returns
     -------

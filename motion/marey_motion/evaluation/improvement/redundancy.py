@@ -22,7 +22,7 @@ class Removal:
     ----------
     seconds : seconds of data saved
     trials : number of trials that need the clip; all other trials stay identical
-    estimate : effect on the trials in the replicates from which removals are chosen
+    estimate : effect on the trials, in the replicates that are used to choose removals
     harm : estimated change of the objective without its term for the amount of data, metres; negative if the removal
         helps. With a perceptual metric, the price of the poses that the removal loses is added
     harm_per_s : `harm` per second of data saved; removals are ranked by this number, the least harmful first
@@ -64,7 +64,8 @@ class PlannedRemoval:
     removal : the removed source, and the effect of its removal compared with the state after the previous step
     metrics : headline metrics of the suite after this step, in the replicates of the estimate
     seconds_left : seconds of data that are left after this step
-    confirmed : the same effect in other replicates, corrected for the number of steps; None if it was not confirmed
+    confirmed : effect of this removal in other replicates, corrected for the number of steps; None if it was not
+        simulated in them
     """
 
     removal: Removal
@@ -87,7 +88,7 @@ def leave_one_out(
     Parameters
     ----------
     simulation : Resimulation    the suite over the set
-    objective : ObjectiveOptions    measure of harm
+    objective : ObjectiveOptions    weights of the objective, whose change is the harm
     removed : collection of str    sources that are removed already
     consider : int, optional    number of sources to try; sources that fewer trials need come first, then the order is
         that of the uids; all if None
@@ -138,7 +139,7 @@ def plan_removals(
     ----------
     simulation : Resimulation    the suite over the set
     count : int    largest number of removals
-    objective : ObjectiveOptions    measure of harm
+    objective : ObjectiveOptions    weights of the objective, whose change is the harm
     removed : collection of str    sources that are removed already
     consider, appearance : optional    as for `leave_one_out`
     progress : callable, optional    called as progress(steps done, total, uid)

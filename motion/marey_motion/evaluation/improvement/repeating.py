@@ -37,7 +37,7 @@ class RepeatedChange(MetricChange):
 
 
 def repeated(change: MetricChange, before: Floats, differences: Floats) -> RepeatedChange:
-    """Add the interval for repetitions to a change.
+    """Add to a change the interval in which the change lies if its measurement is repeated with another seed.
 
     Parameters
     ----------

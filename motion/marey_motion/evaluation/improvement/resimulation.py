@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from marey_motion.evaluation.held_out import index_for
 from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
 from marey_motion.evaluation.looks import LooksMeter
-from marey_motion.evaluation.replicates import TrialReplicate, guide_for, measure_run, run_of, simulate
+from marey_motion.evaluation.replicates import TrialReplicate, measure_run, run_of, simulate, trajectory_for
 from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.running import CancelCallback, ProgressCallback, run_each
 from marey_motion.evaluation.scenario import Trial, require_names, suite_trials
@@ -145,7 +145,7 @@ class Resimulation:
 
         Returns
         -------
-        tuple of TrialResult    one per run, in the order of `outcomes`
+        tuple of TrialResult    one per run: all trials of the first replicate, in their order, then all of the next
         """
         return tuple(outcome.result for outcome in self.outcomes(removed))
 
@@ -269,7 +269,7 @@ def needed_rows(
     database : MatchingDatabase    the clips
     index : SearchIndex    the index that the trial was run with
     trial : Trial    the trial
-    record : TrialRecord    record of the trial
+    record : TrialRecord    simulated ticks of the trial
     options : EvaluationOptions    options of the evaluation
 
     Returns
@@ -280,9 +280,9 @@ def needed_rows(
 
     chosen = switched_rows(database, record.rows)
     rows = [record.rows.astype(np.int64), chosen[chosen >= 0]]
-    # What the last search chose is not displayed any more when it was made at the last tick.
+    # If the last search is at the last tick, the row that it chose is never displayed.
     if not np.isnan(record.match_cost[-1]):
-        asked, last = guide_for(trial, database), len(record.rows) - 1
+        asked, last = trajectory_for(trial, database), len(record.rows) - 1
         own = index_for(database, index, trial)
         reason = explain_choice(database, own, asked, options.controller, record, last, count=1)
         rows.append(np.array([reason.chosen]))

@@ -45,7 +45,7 @@ from marey_schemas.options.improvement import SuggestionOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 USUAL_BLENDABLE_M = 0.5
-"""Largest blendable distance that is used if a suite made no transition from which the distance could be measured.
+"""Distance up to which poses count as blendable if the suite made no transition that shows this distance.
 
 The distance is a pose cost, in metres, summed over seven joints.
 """
@@ -60,7 +60,8 @@ class Suggestions:
     unused : data whose removal changes no trial
     redundant : all clips that were tried, ranked by the harm of their removal per second saved
     plan : a sequence of removals from the set without its unused clips, with confirmed effects
-    confirmed : effects, measured in replicates from which no suggestion was chosen
+    confirmed : effects, measured in replicates that were not used to choose suggestions; None if the options ask for no
+        such replicates
     spared : near-duplicates to remove, each with the pair to which it belongs; the other clip of the pair stays
     fillings, additions : clips of other collections that fill holes. In `fillings`, each is measured alone; `additions`
         is a sequence in which each is measured after all earlier clips were added
@@ -122,18 +123,18 @@ def suggest(
     _require_same(database, result)
     stages = _SuggestionStages(progress, cancelled)
     simulation = _simulation(database, result, how, threads, cancelled)
-    seen = None if metric is None else PerceivedRows(database, metric)
+    rows = None if metric is None else PerceivedRows(database, metric)
     unused = _unused(simulation, result)
     duplicates = find_near_duplicates(
-        database, threshold_cm=how.duplicate_cm, seen=seen, threads=threads, **stages.watch("duplicates")
+        database, threshold_cm=how.duplicate_cm, perceived_rows=rows, threads=threads, **stages.watch("duplicates")
     )
-    threshold = _threshold(how, result, seen)
-    similarity = measure_similarity(database, result.coverage, threshold, seen=seen, **stages.watch("similarity"))
+    limit = _threshold(how, result, rows)
+    similarity = measure_similarity(database, result.coverage, limit, perceived_rows=rows, **stages.watch("similarity"))
     fillings = rank_fillings(
-        database, result.coverage, others, result.options, threshold, seen=seen, **stages.watch("filling")
+        database, result.coverage, others, result.options, limit, perceived_rows=rows, **stages.watch("filling")
     )
     gone = frozenset(clip.source for clip in unused.clips)
-    appearance = _appearance(database, how, seen, threshold, stages)
+    appearance = _appearance(database, how, rows, limit, stages)
     redundant, plan = _redundancy(simulation, how, gone, appearance, stages)
     additions = plan_fillings(fillings, result.coverage, others, result.options)
     confirmed = confirm(
@@ -202,24 +203,28 @@ def _spared(
     return spared_sources(database, duplicates, ticks, most_perceived=most)
 
 
-def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: PerceivedRows | None) -> float:
+def _threshold(how: SuggestionOptions, result: EvaluationResult, perceived_rows: PerceivedRows | None) -> float:
     """Return the greatest distance of poses that can be blended: in metres or, with a metric, without unit."""
-    if seen is None:
+    if perceived_rows is None:
         return how.blendable_m or accepted_distance(result.records) or USUAL_BLENDABLE_M
-    return how.blendable_distance or seen.transitions(result.switches).median or indistinguishable(seen.document)
+    return (
+        how.blendable_distance
+        or perceived_rows.transitions(result.switches).median
+        or indistinguishable(perceived_rows.document)
+    )
 
 
 def _appearance(
     database: MatchingDatabase,
     how: SuggestionOptions,
-    seen: PerceivedRows | None,
+    perceived_rows: PerceivedRows | None,
     threshold: float,
     stages: _SuggestionStages,
 ) -> Appearance | None:
     """Compare the poses of all clips by the perceptual metric; None if no metric was chosen."""
-    if seen is None:
+    if perceived_rows is None:
         return None
-    return Appearance(LostPoses(database, seen, threshold, **stages.watch("lost poses")), how.lost_pose)
+    return Appearance(LostPoses(database, perceived_rows, threshold, **stages.watch("lost poses")), how.lost_pose)
 
 
 def _redundancy(
@@ -255,7 +260,10 @@ def _redundancy(
 
 def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
     if len(result.records) != len(result.trials):
-        raise MotionError("suggestions need an evaluation with the records of all its trials", code="records-missing")
+        raise MotionError(
+            "the evaluation lacks the records of its trials; read it with its records, or make it again",
+            code="records-missing",
+        )
     own = provenance_of(database, result.options, [trial.trial for trial in result.trials])
     different = [name for name in ("dataset", "normaliser") if getattr(own, name) != getattr(result.provenance, name)]
     if different:

@@ -53,8 +53,8 @@ class Influence:
     ----------
     spread : largest minus least objective, metres
     best_weight : weight with the least objective
-    gain : decrease of the objective from the first setting to the best, metres; estimated in the replicates from which
-        the best was chosen
+    gain : decrease of the objective from the first setting to the best, metres; estimated in the replicates that are
+        used to choose the best setting
     confirmed : change of the objective from the first setting to the best in other replicates, corrected for the number
         of groups; None if no setting is better than the first, or if there are no other replicates
     """

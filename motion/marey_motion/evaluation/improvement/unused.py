@@ -101,7 +101,7 @@ def find_unused(
     ----------
     database : MatchingDatabase    the clips
     trials : sequence of Trial    the trials
-    records : sequence of TrialRecord    their records
+    records : sequence of TrialRecord    simulated ticks of each trial
     options : EvaluationOptions    options of the evaluation
     index : SearchIndex, optional    the index that the trials were run with, built if None
     shown : (N,) bool, optional    rows that were displayed in replicates without a record, and are needed, too
@@ -114,7 +114,7 @@ def find_unused(
     if shown is not None:
         needed |= shown
     rate = database.options.rate_hz
-    # What may not be chosen near a frame must stay in one clip with it: only a clip's own frames are barred.
+    # Searches may not choose rows of the displayed clip near the displayed row, so these rows must stay in one clip.
     barred = int(np.ceil(options.controller.reselect_window_s * rate)) + 1
     before = max(barred, int(np.ceil(MARGIN_BEFORE_S * rate)))
     after = max(barred, int(np.ceil((max(database.options.horizons_s) + MARGIN_AFTER_S) * rate)))

@@ -25,7 +25,7 @@ from marey_motion.skeleton import Skeleton
 MOST_STEP = 1.5
 """Largest permitted step of a joint between two frames, as a multiple of its largest step in the unedited motion."""
 BLEND_PEAK = 2.0
-"""Largest step between two frames of a change that is blended in, as a multiple of the mean step of this change."""
+"""Greatest rate at which a change is blended in, as a multiple of its mean rate over the blended frames."""
 _WIDTHS = (0.0, 0.1, 0.2, 0.4, 0.8)
 """Smoothing widths that are tried in turn, as shares of the number of frames within which changes are blended."""
 _CLEAR = 0.5
@@ -71,8 +71,8 @@ class _Attempt(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class CalmLimb:
-    """A limb in a run of consecutive frames, and the limits of its steps from frame to frame.
+class LimbSmoother:
+    """Solver of a limb in a run of frames, which smooths the path of the limb's end until no joint of the limb jumps.
 
     Parameters
     ----------
@@ -111,8 +111,8 @@ class CalmLimb:
         jumps[:-1] |= best.excess > 0.0
         jumps[1:] |= best.excess > 0.0
         starts = self._places(self.given)[:, 0]
-        for width, calmer in product(_WIDTHS, (self._slowed, self._evened)):
-            path = starts + calmer(targets - starts, jumps, max(1, round(width * self.reach)))
+        for width, smooth in product(_WIDTHS, (self._slowed, self._evened)):
+            path = starts + smooth(targets - starts, jumps, max(1, round(width * self.reach)))
             made = self._judged(solve(self.given, path))
             if made.excess.max() < best.excess.max():
                 best = made
@@ -131,10 +131,11 @@ class CalmLimb:
         return _Attempt(motion, (steps - allowed_steps(self.usual, moved, self.reach)).max(axis=1))
 
     def _slowed(self, vectors: Floats, jumps: Flags, width: int) -> Floats:
-        """Slow down the turns of a path (n, 3), relative to the limb's first joint, and lead it round this joint.
+        """Slow down the turns of the path of the limb's end, and lead the path round the limb's first joint.
 
-        From `width` frames before to `width` frames after each jump, or each frame in which the limb would have to fold
-        too far, the direction changes evenly, and the distance is at least that of the folded limb.
+        `vectors` (n, 3) are the positions of the path relative to the first joint; `jumps` (n,) are the frames next to
+        a jump. From `width` frames before to `width` frames after each such frame, and each frame in which the limb
+        would have to fold too far, the direction changes evenly, and the distance is at least that of the folded limb.
         """
         from scipy.ndimage import maximum_filter1d
 
@@ -152,7 +153,11 @@ class CalmLimb:
         return np.asarray(np.where(turning[:, None], np.maximum(sizes, least)[:, None] * slowed, vectors))
 
     def _evened(self, vectors: Floats, jumps: Flags, width: int) -> Floats:
-        """Average a path (n, 3), relative to the first joint, around jumps, over about `width` frames."""
+        """Smooth the path of the limb's end near jumps by a Gaussian filter.
+
+        `vectors` (n, 3) are the positions of the path relative to the limb's first joint, `jumps` (n,) are the frames
+        next to a jump, and `width` is the standard deviation of the filter in frames.
+        """
         from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
         share = maximum_filter1d(jumps.astype(np.float64), 4 * width + 1)
@@ -168,9 +173,9 @@ def _directions(vectors: Floats, otherwise: Floats) -> Floats:
 
 
 def _turned(first: Floats, last: Floats, guide: Floats, places: Floats) -> Floats:
-    """Interpolate between two unit directions (3,) on a great circle; if they are opposite, by way of `guide`.
+    """Interpolate between two unit directions (3,) on a great circle; if they are opposite, through `guide`.
 
-    Returns the directions (n, 3) at `places` (n,): 0 is the first direction, 1 the last.
+    Returns the directions (n, 3) at `places` (n,), from 0 for the first direction to 1 for the last.
     """
     middle, chord = first + last, last - first
     size = float(np.linalg.norm(middle))

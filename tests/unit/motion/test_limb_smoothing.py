@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from marey_motion.clip import Clip
-from marey_motion.editing.calm_limbs import allowed_steps, largest_steps
+from marey_motion.editing.limb_smoothing import allowed_steps, largest_steps
 from marey_motion.editing.registry import EditedClip, edit_clip
 from marey_motion.errors import EditError
 from marey_motion.formats import read_motion
@@ -126,7 +126,7 @@ def test_a_short_window_between_two_others_keeps_a_frame() -> None:
 def test_a_constraint_that_cannot_act_is_refused(idle: dict[str, Any]) -> None:
     clip = generate_gait(1.2, 0.0, 1.0)
     other = {"kind": "position", "joint": "left_wrist", "frames": [10, 20]}
-    with pytest.raises(EditError, match="so its position cannot be constrained") as refused:
+    with pytest.raises(EditError, match="so this position constraint has no effect") as refused:
         _constrained(clip, other, {"kind": "position", **idle})
     assert refused.value.code == "constraint-idle"
     assert "constraints[1]" in str(refused.value.where)
