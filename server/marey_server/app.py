@@ -1,4 +1,4 @@
-"""Application: its construction, start and stop."""
+"""Tornado application of the server: construction, start and stop."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ async def listening(
 
 @asynccontextmanager
 async def showing_metrics(services: Services, sockets: Sequence[socket.socket]) -> AsyncIterator[None]:
-    """Answer requests for metrics and health at further sockets while the `async with` block runs."""
+    """Answer requests for metrics and health at `sockets`, too, while the `async with` block runs."""
     server = HTTPServer(
         Application(MONITORING, services),
         idle_connection_timeout=services.settings.header_timeout_s,

@@ -51,7 +51,10 @@ def serve(**settings: Any) -> None:
 
 
 def _serve_in_processes(given: dict[str, Any]) -> None:
-    """Run several server processes that share a port; they do not read the settings in `given` themselves."""
+    """Run several server processes that share a port, until SIGTERM or SIGINT.
+
+    The parent process passes the settings `given`, which come from the command line, to each server process.
+    """
     from marey_server.shared_port.parent import serve_in_processes
 
     chosen = read_settings(**given)
@@ -296,7 +299,7 @@ def move_blobs(**settings: Any) -> None:
 
 
 def _progress() -> Callable[[object], None]:
-    """Return a function that prints its argument to standard error, at most once per `PROGRESS_EVERY_S`."""
+    """Return a function that prints a line to standard error, but at most one line per `PROGRESS_EVERY_S`."""
     printed_s = time.monotonic()
 
     def show(state: object) -> None:

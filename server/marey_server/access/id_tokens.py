@@ -50,7 +50,10 @@ class SigningKey:
     algorithm: str | None
 
     def fits(self, algorithm: str, key_id: str | None) -> bool:
-        """Return whether the key can check a signature by `algorithm` whose header names the key `key_id`."""
+        """Return whether this key can check the signature of a token.
+
+        `algorithm` and `key_id` are given in the header of the token; `key_id` is None if the header names no key.
+        """
         return (
             self.key.key_type == _TYPES[algorithm[0]]
             and self.algorithm in (None, algorithm)
@@ -60,7 +63,7 @@ class SigningKey:
 
 @dataclass(frozen=True)
 class Expectation:
-    """Values that a valid token must have; clocks may differ by `leeway_s` seconds."""
+    """Values that the claims of a valid token must have; clocks may differ by `leeway_s` seconds."""
 
     issuer: str
     client_id: str
@@ -82,7 +85,10 @@ class Person:
 
 
 def read_keys(document: Mapping[str, Any]) -> tuple[SigningKey, ...]:
-    """Return the usable signing keys of a JSON Web Key Set; other keys are left out. Raises `ValueError`."""
+    """Return the usable signing keys of a JSON Web Key Set; other keys are left out.
+
+    Raises `ValueError` if the set is malformed, or has no usable key.
+    """
     keys = document.get("keys")
     if not isinstance(keys, list) or len(keys) > MOST_KEYS:
         raise ValueError(f"the member `keys` is not a list of at most {MOST_KEYS} keys")
@@ -93,7 +99,7 @@ def read_keys(document: Mapping[str, Any]) -> tuple[SigningKey, ...]:
 
 
 def _read_key(data: Any) -> SigningKey | None:
-    """Return a key, or None for a key of another type or purpose, a weak key or a malformed one."""
+    """Return a signing key from its JSON form; None if it is weak, malformed, or of another type or purpose."""
     if not isinstance(data, dict) or data.get("kty") not in _MEMBERS or data.get("use", "sig") != "sig":
         return None
     key_id, algorithm = data.get("kid"), data.get("alg")
@@ -138,7 +144,10 @@ def verify(token: str, keys: Sequence[SigningKey], expected: Expectation, now_s:
 
 
 def _key_of(token: str, keys: Sequence[SigningKey], registry: jws.JWSRegistry) -> RSAKey | ECKey:
-    """Return the one key that fits the header of a token."""
+    """Return the key that fits the algorithm and the key id in the header of a token.
+
+    Raises `UnknownSigningKey` if no key fits, and `InvalidIdToken` if several keys fit or the header is not valid.
+    """
     header = jws.extract_compact(token.encode("ascii"), registry=registry).headers()
     if not isinstance(header, dict):
         raise InvalidIdToken("the header is not a JSON object")

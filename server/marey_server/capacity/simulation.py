@@ -23,7 +23,11 @@ FIRST_HEARTBEAT_S = 1.0
 
 @dataclass(frozen=True)
 class RequestCosts:
-    """Costs of one request: how long it occupies a station of the server, and how much longer the caller waits."""
+    """Costs of one request, in seconds.
+
+    The request occupies a station of the server for `busy_s`. Then the worker waits `idle_s` more for the answer. A
+    station stands for a part of the server that processes one request at a time.
+    """
 
     busy_s: float = 0.0
     idle_s: float = 0.0
@@ -34,7 +38,7 @@ FREE = RequestCosts()
 
 @dataclass(frozen=True)
 class QueueCosts:
-    """Costs of the requests of workers, and the number of stations of the server.
+    """Costs of the requests of workers, and the number of stations that process requests at the same time.
 
     If `batch_s` is not 0, a station processes all waiting requests together, like writes with a common commit: the
     batch occupies the station for `batch_s` plus the `busy_s` of each request. The times of requests have a gamma
@@ -186,7 +190,7 @@ class _Simulation:
             self._at(self._now_s + busy_s, done)
 
     def _drawn(self, mean_s: float) -> float:
-        """Draw the time of a request with the given mean."""
+        """Draw the duration of a request, in seconds, from a distribution with the mean `mean_s`."""
         if not mean_s or not self._costs.variation:
             return mean_s
         shape = self._costs.variation**-2
@@ -305,6 +309,6 @@ class _Simulation:
 
 
 def _heartbeats(seconds: float, every_s: float) -> list[float]:
-    """Return the times of the heartbeats of an attempt that lasts `seconds`."""
+    """Return the times of the heartbeats of an attempt that lasts `seconds`, in seconds from its start."""
     later = itertools.takewhile(lambda beat_s: beat_s < seconds, itertools.count(every_s, every_s))
     return [beat_s for beat_s in (FIRST_HEARTBEAT_S, *later) if beat_s < seconds]

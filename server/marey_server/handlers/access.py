@@ -66,7 +66,7 @@ def sign_in(tx: Transaction, attempt: SignInTry, verified_hash: str, expires_in_
 
 
 def count_try(tx: Transaction, attempt: SignInTry) -> str | None:
-    """Count a try to sign in; return the hash that the password must match.
+    """Count a try to sign in; return the stored hash that the password must match.
 
     Return None if no active user with a password has this name. Raises `TooManyRequestsProblem`.
     """
@@ -127,8 +127,8 @@ class PasswordResource(Resource):
     async def count_code(self, code: SecretStr, try_of: Callable[[str, str, int], SignInTry]) -> SignInTry:
         """Count a try to use the code of a link or an invitation, even if the code is not valid, and return the try.
 
-        `try_of` returns the try for the code, the address of the client, and the number of tries per minute. Raises
-        `TooManyRequestsProblem`.
+        `try_of(code, address, limit)` makes the `SignInTry` from the code, the client's address, and the allowed number
+        of tries per minute. Raises `TooManyRequestsProblem`.
         """
         per_minute = self.services.settings.login_tries_per_minute
         attempt = try_of(code.get_secret_value(), limited_address(self.client_address), per_minute)
@@ -188,7 +188,7 @@ class TokenQuery(PageQuery):
     prefix: str | None = Field(
         None,
         max_length=16,
-        description="List only the token with this prefix, which is the text between the two `_` of its secret.",
+        description="List only the token with this prefix: the part `<prefix>` of `marey_<prefix>_<secret>`.",
     )
     ends_within_s: int | None = Field(
         None, ge=0, le=10 * 365 * 86400, description="List only tokens that expire within this number of seconds."

@@ -191,9 +191,9 @@ class ProjectImports(Resource):
         return [entries[place] for place in range(len(plans))]
 
     async def _import_all(self, project: str, works: Iterable[Work], aside: PutAside | None) -> dict[int, ImportEntry]:
-        """Read files in child processes while earlier files are stored; return the entries by place.
+        """Read files in child processes while earlier files are stored; return the entries by place in the import.
 
-        Files that `aside` takes are not stored.
+        Files of which the upward axis is not clear are recorded in `aside`, if it is given, and not stored.
         """
         entries: dict[int, ImportEntry] = {}
         reading = deque(works)
@@ -269,7 +269,7 @@ class ProjectImports(Resource):
 
 
 async def _ready(file: PreparedImport) -> PreparedImport:
-    """Return a file that was read before."""
+    """Return `file`, which was read before; this takes the place of a coroutine that reads a file."""
     return file
 
 

@@ -53,7 +53,7 @@ class WebFile:
 
 
 def built_files() -> dict[str, WebFile]:
-    """Return the built files by their path in the folder; nothing if the pages were not built.
+    """Return the built files by their path in the build folder; empty if the pages were not built.
 
     They are read again after each build, so that a developer need not restart the server.
     """
@@ -79,7 +79,10 @@ def _read(file: Path) -> WebFile:
 
 @dataclass(frozen=True, slots=True)
 class PackedPlayer:
-    """Page that plays motion, as reports contain it: compressed by zlib, in base64; and the digest of its script."""
+    """Page that plays motion, in the form in which reports contain it.
+
+    `content` is the HTML page, compressed by zlib, in base64. `script` is the digest of the page's script.
+    """
 
     content: str
     script: str

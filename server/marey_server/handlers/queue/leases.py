@@ -77,8 +77,9 @@ class Workers(Resource):
     async def get(self) -> Rendered:
         """List the workers, in one page.
 
-        The list contains workers that claimed jobs from this server process in the last 24 hours, until the process is
-        restarted, and all workers that run jobs. Workers that wait for jobs of another process are missing.
+        The list contains all workers that run jobs. It also contains the workers that claimed jobs from this server
+        process in the last 24 hours, but not before its last start. Idle workers that claim jobs from another process
+        of the server are missing.
         """
         heard, policy = self.services.worker_memory.heard(), self.services.queue_policy
         return await self.answer_with(lambda workers: Reply(Page(items=workers)), list_workers, heard, policy)

@@ -83,7 +83,10 @@ class OneStudyParticipant(Resource):
 
     @writes(access=Access.MAINTAINER)
     async def delete(self, project: str, kind: str, item: str, participant: str) -> Rendered:
-        """Delete consent and trials of a participant, named by id, who then counts as withdrawn; the link ends."""
+        """Delete the consent and the trials of a participant, who then counts as withdrawn.
+
+        `participant` in the address is the id of the participant. The participant's link is no longer valid.
+        """
         return await self.answer(conducting.withdraw_participant, project, kind_of(kind), item, participant)
 
 
@@ -95,7 +98,7 @@ class StudyProgressResource(Resource):
 
     @reads(access=Access.READER, answer=StudyProgress)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
-        """Return numbers of participants and trials of a study, without anything about single participants."""
+        """Return how many participants and trials a study has, without data of single participants."""
         return await self.answer(conducting.read_progress, project, kind_of(kind), item)
 
 

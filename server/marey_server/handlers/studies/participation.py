@@ -136,7 +136,8 @@ class ParticipationPart(Resource):
         Motions are numbered from 0, as in trials. The documents are the same as those of the clip and its skeleton.
         """
         if part not in get_args(ShownPart):
-            raise NotFoundProblem(f"A motion of a study has no part {part!r}.")
+            known = ", ".join(get_args(ShownPart))
+            raise NotFoundProblem(f"A motion of a study has no part {part!r}; the parts are {known}.")
         return await self.answer_with(lambda reply: reply, read_shown_part, clip, cast(ShownPart, part))
 
 
