@@ -37,7 +37,10 @@ def is_secure(name: str) -> bool:
 
 
 def sent_cookies(request: HTTPServerRequest, project: str) -> dict[str, str]:
-    """Return the tokens of sessions in a project that the browser has sent, by the name of their cookie."""
+    """Return the session tokens of a project that the browser has sent, by the name of the cookie.
+
+    There are at most two: the cookies for https and for http have different names.
+    """
     if "Cookie" not in request.headers:
         return {}
     sent: dict[str, Morsel[Any]] = dict(request.cookies)

@@ -97,7 +97,7 @@ Admission = tuple[str, Access, str | None, bool, bool, bool, bool, BodyTarget]
 
 
 def admission_of(caller: Caller, target: BodyTarget) -> Admission:
-    """Return the properties of a request by which the server decides whether the caller may send the body."""
+    """Return the key under which the decision is cached whether a caller may send the body of a request."""
     operation = caller.operation
     return (
         hash_secret(caller.token or ""), operation.access, operation.scope, operation.public, operation.attempts,
@@ -106,7 +106,7 @@ def admission_of(caller: Caller, target: BodyTarget) -> Admission:
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
-    """Refuse callers who may never perform the operation, regardless of its object.
+    """Refuse callers who may not perform the operation on any object, whatever their roles in projects are.
 
     Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
     """
@@ -244,8 +244,8 @@ def _require_role_again(idempotent: IdempotentRequest, tx: Transaction) -> None:
 def admit(tx: Transaction, target: BodyTarget) -> None:
     """Refuse a caller who lacks the role that the operation declares for the project.
 
-    If the operation belongs to an attempt of a job, only the token of this attempt is admitted. `run_plain` has checked
-    the credential before.
+    If the operation belongs to an attempt of a job, only the token of this attempt is admitted. The credential must
+    have been checked before in the same transaction, as `run_plain` does.
     """
     if target.project is not None:
         projects.require(tx, target.project)
@@ -254,7 +254,7 @@ def admit(tx: Transaction, target: BodyTarget) -> None:
 
 
 def run_plain(caller: Caller, function: Callable[[Transaction], T], tx: Transaction) -> T:
-    """Run a function on behalf of the caller and return its result."""
+    """Identify the caller in the transaction, run a function on the caller's behalf, and return its result."""
     caller.identify(tx)
     return function(tx)
 

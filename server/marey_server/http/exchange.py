@@ -123,10 +123,7 @@ class Exchange(RequestHandler):
         return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     def drop(self) -> None:
-        """Discard the received part of the body of a refused request.
-
-        Closes the connection if the body is too long.
-        """
+        """Close the connection if a refused request has sent too much of its body; shorter bodies are ignored."""
         if self.received_bytes > LINGER_BYTES:
             self.wire.close()
 
@@ -155,9 +152,9 @@ class Exchange(RequestHandler):
         await self.flush()
 
     async def refuse(self, error: ApiProblem) -> None:
-        """Answer before the body is read, then discard the body (closing the connection could lose the answer).
+        """Answer before the body is read; the body is then discarded, because closing could lose the answer.
 
-        From then on, the connection is idle: it is closed if there are too many connections.
+        From then on, the connection counts as idle: it is closed if there are too many connections.
         """
         self.refused = True
         self._write_problem(error)
@@ -175,7 +172,7 @@ class Exchange(RequestHandler):
 
     @property
     def stream(self) -> object:
-        """The stream of the request's connection, by which `Connections` identifies it."""
+        """The stream of the request's connection, which `Connections` uses as the key of the connection."""
         return self.wire.stream
 
     def is_awaited(self) -> bool:

@@ -48,7 +48,7 @@ def boundary_of(content_type: str) -> bytes:
 
 
 class MultipartReader:
-    """Splitter of a stream into parts; each part gives one `PartHead`, its bytes in pieces, and one `PartEnd`.
+    """Reader that splits a stream into parts: one `PartHead`, pieces of bytes and one `PartEnd` for each part.
 
     The package `python-multipart` parses the stream; this class limits the size of heads and the number of parts, and
     skips a preamble.

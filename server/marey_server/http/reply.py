@@ -1,8 +1,8 @@
 """Answers of handlers, and functions that encode answers as bytes; the functions can run in any thread.
 
-A reply is *settled* in its transaction, which loads the document. It is *rendered*, which means encoded, after the
-transaction. Encoding a long document takes longer than loading it, and other requests need the thread and the
-connection of the transaction.
+An answer is made in two steps. `settle` loads the document of the reply, in the transaction. `render` encodes the reply
+after the transaction, because encoding a long document takes longer than loading it, and other requests need the thread
+and the connection of the transaction.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Rendered:
 
 @dataclass(frozen=True, slots=True)
 class AnswerForm:
-    """Requested form of an answer: media type, entity tags that the client has, and status of success."""
+    """Form of the answer that a request asks for: media type, header If-None-Match, and the status of a success."""
 
     media: MediaType
     if_none_match: str | None

@@ -93,9 +93,10 @@ class _Opened:
 def _open_blob(
     tx: Transaction, digest: str, wanted: ByteRange | None, *, head: bool, redirect_bytes: int | None
 ) -> _Opened:
-    """Find the requested range of a blob, and read its first piece unless only the headers are requested.
+    """Find the requested range of a blob, and read the first piece of the range.
 
-    No piece is read if the blob is in object storage and has at least `redirect_bytes` bytes.
+    No piece is read if only the headers are requested (`head`), or if the blob is in object storage and has at least
+    `redirect_bytes` bytes. Raises `NotFoundProblem` if the caller may not read the blob.
     """
     size = blobs.require_readable(tx, digest)
     start, stop = wanted.within(size) if wanted is not None else (0, size)
@@ -125,11 +126,11 @@ class BlobSender(Resource):
         headers: Mapping[str, str] = MappingProxyType({}),
         may_redirect: bool = False,
     ) -> Rendered | None:
-        """Answer with the blob according to Range, If-Range and If-None-Match. Raises `NotFoundProblem`.
+        """Answer with the blob according to the headers Range, If-Range and If-None-Match.
 
-        By default, clients may cache the blob for a year; pass another `cache_control` if the URL does not
-        contain the digest. `headers` are sent with the bytes. With `may_redirect`, the answer for a large blob may
-        refer to object storage, which sends other headers.
+        By default, clients may cache the blob for a year; pass another `cache_control` if the URL does not contain the
+        digest. `headers` are sent with the bytes. With `may_redirect`, the answer for a large blob may refer to object
+        storage, which sends other headers. Raises `NotFoundProblem` if the caller may not read the blob.
         """
         etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
         wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)

@@ -29,7 +29,7 @@ MOST_SPANS = 64
 
 
 class RequestTrace:
-    """Spans of one request and the place of the request in a trace."""
+    """Spans of one request, and the request's context (trace and parent span) in a distributed trace."""
 
     def __init__(self, tracer: Tracer, callers: TraceCallers, header: str | None) -> None:
         self._tracer = tracer
@@ -42,9 +42,10 @@ class RequestTrace:
         self._started_ns = time.time_ns()
 
     def place(self, principal: Principal | None) -> TraceContext:
-        """Return the place of the request in its trace; the first call decides whether `principal` continues a trace.
+        """Return the trace context of the request.
 
-        So the first call must be made when the caller is known, or at the end of the request.
+        The first call decides whether the request continues the trace that `principal` has sent. So it must be made
+        when the caller is known, or at the end of the request.
         """
         if self._place is None:
             known = principal is not None and principal.kind != "anonymous"
@@ -117,7 +118,7 @@ class TracedTransaction(Generic[T]):
         self._runs = 0
 
     def __call__(self, tx: Transaction) -> T:
-        """Run the function; may be called several times, because transactions are repeated."""
+        """Run the function in a transaction. The transaction may be repeated, so several calls can belong to one span."""
         if not self._runs:
             now_ns = time.time_ns()
             self._span.attributes["marey.waited_ms"] = round((now_ns - self._span.started_ns) / 1e6, 3)
