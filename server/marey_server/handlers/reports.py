@@ -114,7 +114,7 @@ class ReportSender(StoredFileSender):
         return Reply(page, rev=digest, media_type=PAGE_TYPE, headers=headers)
 
     def origin(self, project: str, author: str | None, made_at: datetime) -> ReportOrigin:
-        """Return the origin of a report: project, author, time, and the address at which the caller reaches the server."""
+        """Return the origin of a report: project, author, time, and the address of this server for browsers."""
         address = self.services.settings.public_url or f"{self.request.protocol}://{self.request.host}"
         return ReportOrigin(project, address.rstrip("/"), author, made_at)
 

@@ -155,7 +155,7 @@ class CallingExchange(Exchange):
 
     @property
     def _child_user(self) -> str:
-        """User whose share of child processes this request uses; all callers without a user have one share in common."""
+        """User whose share of child processes this request uses; all callers without a user share one."""
         user = self.principal.user_id if self.principal is not None else None
         return user or UNKNOWN_CLIENTS
 

@@ -118,7 +118,10 @@ class TracedTransaction(Generic[T]):
         self._runs = 0
 
     def __call__(self, tx: Transaction) -> T:
-        """Run the function in a transaction. The transaction may be repeated, so several calls can belong to one span."""
+        """Run the function in a transaction.
+
+        This may be called several times, because a transaction may be repeated.
+        """
         if not self._runs:
             now_ns = time.time_ns()
             self._span.attributes["marey.waited_ms"] = round((now_ns - self._span.started_ns) / 1e6, 3)

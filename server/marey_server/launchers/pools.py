@@ -81,7 +81,10 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
 
 
 class Keeper(Protocol):
-    """Task of the server that starts and stops workers."""
+    """Interface of a task that starts and stops workers.
+
+    There is one for each pool, and one for jobs with their own pods.
+    """
 
     async def keep(self) -> None:
         """Adjust the workers at regular intervals, until the task is cancelled."""
@@ -93,21 +96,21 @@ class Keeper(Protocol):
 
 
 def _dispatcher(services: Services, address: str) -> Keeper:
-    """Return the dispatcher of jobs that need a pod of their own. Raises `LauncherUnusable`."""
+    """Return the task that starts pods for single jobs. Raises `LauncherUnusable` if its options are invalid."""
     settings = services.settings
     make = _load(EntryPoint("kubernetes", DISPATCHER, ENTRY_POINTS))
     return cast(Keeper, make(settings, services.database, settings.worker_url or address))
 
 
 def find_launcher(name: str) -> MakeLauncher:
-    """Return the function that makes launchers of a kind. Raises `LauncherUnusable`."""
+    """Return the function that makes launchers by the name of the launcher. Raises `LauncherUnusable`."""
     if name in BUILT_IN:
         found = EntryPoint(name, BUILT_IN[name], ENTRY_POINTS)
     else:
         others = {one.name: one for one in entry_points(group=ENTRY_POINTS)}
         if name not in others:
             known = ", ".join(sorted({*BUILT_IN, *others}))
-            raise LauncherUnusable(f"launcher: there is no launcher {name!r}, only: {known}")
+            raise LauncherUnusable(f"launcher: there is no launcher {name!r}; choose one of {known}")
         found = others[name]
     return cast(MakeLauncher, _load(found))
 
@@ -116,7 +119,7 @@ def _load(found: EntryPoint) -> Any:
     try:
         return found.load()
     except (ImportError, AttributeError) as error:
-        raise LauncherUnusable(f"launcher: {found.name} cannot be loaded: {error}") from error
+        raise LauncherUnusable(f"launcher: the launcher {found.name!r} cannot be loaded: {error}") from error
 
 
 def _launcher_of(pool: WorkerPool, services: Services, address: str) -> Launcher:

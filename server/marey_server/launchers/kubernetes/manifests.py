@@ -34,7 +34,7 @@ STOP_S = 45
 
 @dataclass(frozen=True)
 class Pool:
-    """Workers with the same properties, and the address of their server."""
+    """Workers with the same properties, and the facts that they need: address of the server, and form of their log."""
 
     name: str
     url: str
