@@ -53,10 +53,10 @@ ADVANCE_COVERAGE = "marey_server.motions.coverage:advance_coverage"
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """Skeleton and evaluation that a new stream refers to.
+    """References and documents that a request for a new stream names.
 
-    `skeleton` and `evaluation` are references to revisions. `rig` is the encoded skeleton with its joint mapping.
-    `measured` is the document of the evaluation (its part `evaluation`).
+    `skeleton` and `evaluation` are references to revisions (item and revision). `rig` is the encoded skeleton with its
+    joint mapping. `measured` is the document of the evaluation (its part `evaluation`).
     """
 
     skeleton: Tree | None = None
@@ -66,10 +66,7 @@ class Given:
 
 
 class BeginOrder(Message):
-    """Message that asks a child process to start a stream.
-
-    If the stream starts from an evaluation, `measured` is the encoded document of this evaluation.
-    """
+    """Message that asks a child process to start a stream; `measured` is the document of the evaluation as bytes."""
 
     request: CoverageStreamCreate
     skeleton: Tree | None
@@ -78,7 +75,7 @@ class BeginOrder(Message):
     measured: bytes | None
 
     def given(self) -> Given:
-        """Return the skeleton and the evaluation of the new stream, with the decoded document of the evaluation."""
+        """Return the references and documents in the message, with the decoded document of the evaluation."""
         return Given(
             self.skeleton, self.rig, self.evaluation, None if self.measured is None else unpack_tree(self.measured)
         )
@@ -99,7 +96,7 @@ class StreamOrder(Message):
 
 @dataclass(frozen=True, slots=True)
 class NextFrames:
-    """Digest of the frames of a request, and the packed message that asks a child process to add them."""
+    """Message, as bytes, that asks a child process to add the frames of a request, and the digest of these frames."""
 
     digest: str
     order: bytes
@@ -122,7 +119,7 @@ class AdvancedStream(Message):
 
 
 def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
-    """Return the skeleton and the evaluation that a request for a stream refers to, with their documents.
+    """Return the references and documents that a request for a new stream names.
 
     Raises `NotFoundProblem` if the skeleton or the evaluation does not exist.
     """
@@ -197,21 +194,24 @@ def _digest_of(frames: CoverageFrames) -> str:
 
 
 def begin_coverage(packed: bytes) -> bytes:
-    """Start the stream that a packed `BeginOrder` describes; return a packed `BegunStream`."""
+    """Start a stream, in a child process. `packed` is a `BeginOrder`, and the result a `BegunStream`, both as bytes."""
     order = BeginOrder.unpack(packed)
     return begin(order.request, order.given()).pack()
 
 
 def look_at_coverage(packed: bytes) -> bytes:
-    """Carry out a `StreamOrder` and return the computed members of `CoverageStreamState` as MessagePack."""
+    """Compute the coverage of a stream, in a child process. `packed` is a `StreamOrder` as bytes.
+
+    Return the computed members of `CoverageStreamState` as MessagePack.
+    """
     order = StreamOrder.unpack(packed)
     return encode_tree(_state(_online(order.state), order.settings), MSGPACK)
 
 
 def advance_coverage(packed: bytes) -> bytes:
-    """Carry out a `StreamOrder` with frames and return an `AdvancedStream`.
+    """Add frames to a stream, in a child process. `packed` is a `StreamOrder` with frames, as bytes.
 
-    Raises `InvalidProblem` if the frames do not fit the stream.
+    Return an `AdvancedStream` as bytes. Raises `InvalidProblem` if the frames do not fit the stream.
     """
     order = StreamOrder.unpack(packed)
     return advance(order, CoverageFrames.model_validate(unpack_tree(order.frames or b""))).pack()
@@ -276,7 +276,11 @@ def _online(state: bytes) -> OnlineCoverage:
 
 
 def _add_poses(online: OnlineCoverage, order: StreamOrder, frames: CoverageFrames) -> int:
-    """Add the poses of a request to the stream, and return the number of time windows that they complete."""
+    """Add the poses of a request to the stream.
+
+    Return the number of time windows of the coverage measure that these poses complete. Raises `InvalidProblem` if the
+    stream has no skeleton, or the poses do not fit its skeleton.
+    """
     from marey_motion.documents import clip_from_document
 
     if order.rig is None:
@@ -379,7 +383,7 @@ def _state(online: OnlineCoverage, settings: Tree) -> Tree:
 
 
 def _now(online: OnlineCoverage, settings: Tree) -> Tree:
-    """Return the members of `CoverageNow` for a stream: missing time, targets and performer."""
+    """Return the members of `CoverageNow` for a stream: missing seconds, motions to record next, and performer."""
     targets = online.targets(settings["target_count"], path_s=settings["path_s"])
     performer = _performer(online)
     return {

@@ -34,9 +34,9 @@ SearchableKey = tuple[str, str, str]
 
 @dataclass(frozen=True, slots=True)
 class FoundSearchable:
-    """Model that the caller may search, with its tree and the mapping of its skeleton, if they exist.
+    """Model that the caller may search, with its search tree and the joint mapping of its skeleton, if they exist.
 
-    A tree that belongs to another state of the model is not used.
+    `tree` is None if the stored tree belongs to another state of the model.
     """
 
     model: FoundModel
@@ -77,7 +77,7 @@ class LoadedSearchable:
 
 @dataclass(frozen=True, slots=True)
 class Searchable:
-    """Model that can be searched.
+    """Parsed model that can be searched.
 
     `stored` is true if the tree is stored with the model, and false if it was built for the search from random samples.
     `drawing_work` is the estimated computing time for drawing these samples, in nanoseconds. `log_likelihoods` are the
