@@ -45,7 +45,7 @@ FEWEST_CHILDREN = 2
 
 
 def main() -> int:
-    """Run a server process; return its exit status."""
+    """Run a server process from the order on standard input; return its exit status."""
     control = socket.socket(fileno=os.dup(0))
     with open(os.devnull) as nothing:
         os.dup2(nothing.fileno(), 0)  # so that no child process inherits the socket
@@ -94,7 +94,7 @@ async def serve_together(settings: Settings, order: StartOrder, control: socket.
 
 
 def share_of(settings: Settings) -> Settings:
-    """Return the settings of one process: limits for all processes together are divided by their number."""
+    """Return the settings of one process, with its share of each limit for all processes together."""
     count = settings.processes
     share = {
         "request_memory_bytes": settings.request_memory_bytes // count,
@@ -108,7 +108,7 @@ def share_of(settings: Settings) -> Settings:
 
 
 async def _follow(reader: asyncio.StreamReader, stop: asyncio.Event, keep_workers: asyncio.Event) -> None:
-    """Read the messages of the parent process, and stop this process when the parent has ended."""
+    """Read the messages of the parent process; when the parent has ended, stop this process."""
     while line := await reader.readline():
         if line == KEEP_WORKERS:
             keep_workers.set()

@@ -158,7 +158,8 @@ def _side_order(side: ComparedSide) -> SideOrder:
 def make_difference(packed: bytes) -> bytes:
     """Compare two revisions, in a child process. `packed` is a `DifferenceOrder` as bytes.
 
-    Return the document of the difference, encoded for the client. Raises `TooLargeProblem` if it would be too large.
+    Return the document of the difference, encoded for the client. Raises `TooLargeProblem` if the parts cannot be
+    compared.
     """
     from marey_motion.errors import MotionError
 
