@@ -1,4 +1,4 @@
-"""Messages that a worker's supervisor process and its child process exchange through a pipe.
+"""Messages between a worker's supervisor process and its child process, through a pipe.
 
 The child never gets a token or an address.
 
@@ -63,9 +63,10 @@ class ChildReply:
 
 @dataclass(frozen=True)
 class ReadParts:
-    """Request for parts of revisions; the answer contains encoded documents, and None if a document does not exist.
+    """Request for parts of revisions.
 
-    The answer may omit documents at the end of a long list, but not the first one.
+    The answer contains an encoded document for each part, or None if it does not exist. It may omit documents at the
+    end of a long list, but not the first one.
     """
 
     request: int

@@ -26,7 +26,7 @@ BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class ComputeThreads:
-    """Three lanes (threads with a queue).
+    """Threads of the server process, in three lanes (threads with a queue of computations).
 
     The first lane computes for requests. One client may use as many of its threads as there are processors, but at
     least two. The same limit applies to all clients without a known token together. One more thread is always left to

@@ -27,14 +27,14 @@ class Rigged(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """Revision of a skeleton, and the revision whose joint mapping is used."""
+    """Reference to a skeleton: a revision of its hierarchy, and the revision whose joint mapping is used."""
 
     skeleton: RevisionRef
     mapping: RevisionRef
 
     @classmethod
     def as_stored(cls, ref: RevisionRef) -> Rig:
-        """Return a `Rig` that uses the joint mapping of the same revision."""
+        """Return a `Rig` in which hierarchy and joint mapping come from the same revision."""
         return cls(ref, ref)
 
 
@@ -53,7 +53,9 @@ def read_rigged(context: Context, rig: Rig) -> Rigged:
 def plan_between(context: Context, source: Rig, target: Rig, scale: float | None) -> RetargetPlan:
     """Return the plan for retargeting from one skeleton to another.
 
-    Raises `MotionError` if a joint mapping cannot be used, or if joints or axes that the plan needs are missing.
+    `scale` is the number of metres that the target's pelvis moves per metre of the source's pelvis; None: it is
+    computed from the skeletons. Raises `MotionError` if a joint mapping cannot be used, or if joints or axes that the
+    plan needs are missing.
     """
 
     def plan() -> RetargetPlan:

@@ -71,7 +71,10 @@ def run(context: Context, params: AnalyseStudyParams) -> dict[str, Any]:
 
 
 def _judgements(study: StudyDocument, people: Sequence[JudgingParticipant]) -> Judgements:
-    """Return the answered trials; participants without any are left out."""
+    """Return the answered trials of all participants; participants who answered no trial are left out.
+
+    Raises `JobRefused` if nobody has answered a trial.
+    """
     answered = [[trial for trial in one.trials if trial.chosen is not None] for one in people]
     answers = [
         (who, trial.shown, trial.chosen)
@@ -87,7 +90,10 @@ def _judgements(study: StudyDocument, people: Sequence[JudgingParticipant]) -> J
 
 
 def _measured(context: Context, study: StudyDocument) -> tuple[list[PairDifferences], list[str]]:
-    """Measure all pairs of motions; if this is impossible, return an empty list and the reason."""
+    """Return the measured differences of all pairs of motions.
+
+    If they cannot be measured, return an empty list and the reason.
+    """
     try:
         clips = [_measure(context, one.revision) for one in study.motions]
         counts = np.array([clip.frame_count for clip in clips])
@@ -109,7 +115,7 @@ def _measure(context: Context, ref: RevisionRef) -> MeasuredClip:
 
 
 def _names(context: Context, study: StudyDocument) -> list[str]:
-    """Return a name of each motion for people: its label, or the name of the clip."""
+    """Return a name for each motion, as reports show it: its label, or else the name of the clip."""
     refs = [RevisionRef.model_validate(one.clip.model_dump()) for one in study.motions]
     return [one.label or context.item(Kind.CLIP, ref.item).name for one, ref in zip(study.motions, refs, strict=True)]
 

@@ -78,7 +78,7 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
 
 
 def _proposal(params: AnnotateParams) -> Propose:
-    """Return the function that proposes a layer for a clip."""
+    """Return the function that proposes segments and keyframes for a clip, as the parameters of the job request it."""
     wanted = params.proposal
     if isinstance(wanted, StepsProposal):
         return lambda clip, rigged: propose_steps(clip, _body(rigged), wanted)
@@ -88,7 +88,10 @@ def _proposal(params: AnnotateParams) -> Propose:
 
 
 def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
-    """Return the indices of joints that are given by their names or standard names. Raises `UnknownJoint`."""
+    """Return the indices of joints that are given by their own names or their standard names.
+
+    Raises `UnknownJoint` if neither the skeleton nor its joint mapping has such a joint.
+    """
     found = []
     for name in names:
         own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)

@@ -103,7 +103,7 @@ class _Retargeting:
         )
 
     def _info(self, stored: dict[str, Any] | None, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
-        """Return the part `info` of a result: the part `info` of the source with another origin and other checks."""
+        """Return the part `info` of a result: that of the source clip, with a new origin and new checks."""
         details = {
             "scale": plan.scale,
             "mapped": len(plan.pairs),

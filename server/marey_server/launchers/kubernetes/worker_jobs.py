@@ -37,7 +37,7 @@ class WorkerJobs:
         self._requests = asyncio.Semaphore(REQUESTS_AT_ONCE)
 
     async def refresh(self) -> None:
-        """Make sure that the copies of Jobs and pods are not outdated, and that no Job lacks its Secret."""
+        """Update the copies of Jobs and pods if they are too old, and create missing Secrets of Jobs."""
         await self.view.refresh()
         await self._supply_tokens()
         self._log_blocked()
