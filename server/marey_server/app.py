@@ -271,7 +271,9 @@ def _backing_of(settings: Settings) -> BlobBacking | ObjectBlobs:
     try:
         storage = ObjectStorage(settings.bucket)
     except ModuleNotFoundError as error:
-        raise DatabaseUnusable('a bucket needs an optional package; run pip install "marey[s3]"') from error
+        raise DatabaseUnusable(
+            'blobs in a bucket (the setting s3_bucket) need an optional package; run pip install "marey[s3]"'
+        ) from error
     return ObjectBlobs(storage, local, stores_objects=settings.blobs == "s3")
 
 

@@ -91,10 +91,10 @@ def read_keys(document: Mapping[str, Any]) -> tuple[SigningKey, ...]:
     """
     keys = document.get("keys")
     if not isinstance(keys, list) or len(keys) > MOST_KEYS:
-        raise ValueError(f"the member `keys` is not a list of at most {MOST_KEYS} keys")
+        raise ValueError(f"the member `keys` of the key set is not a list of at most {MOST_KEYS} keys")
     found = tuple(key for key in map(_read_key, keys) if key is not None)
     if not found:
-        raise ValueError("no key of the set can check signatures")
+        raise ValueError("no key of the set can check signatures with an accepted algorithm")
     return found
 
 
@@ -138,7 +138,7 @@ def verify(token: str, keys: Sequence[SigningKey], expected: Expectation, now_s:
         key = _key_of(token, keys, registry)
         claims = jwt.decode(token, key, ALGORITHMS, registry).claims
     except (JoseError, ValueError, TypeError, RecursionError) as error:
-        raise InvalidIdToken("the signature is not valid") from error
+        raise InvalidIdToken("the signature of the token is not valid") from error
     _check_claims(claims, expected, now_s)
     return claims
 
@@ -150,17 +150,19 @@ def _key_of(token: str, keys: Sequence[SigningKey], registry: jws.JWSRegistry) -
     """
     header = jws.extract_compact(token.encode("ascii"), registry=registry).headers()
     if not isinstance(header, dict):
-        raise InvalidIdToken("the header is not a JSON object")
+        raise InvalidIdToken("the header of the token is not a JSON object")
     algorithm, key_id = header.get("alg"), header.get("kid")
     if algorithm not in ALGORITHMS:
         raise InvalidIdToken("the token is not signed with an accepted algorithm")
     if key_id is not None and not isinstance(key_id, str):
-        raise InvalidIdToken("the key id (`kid`) in the header is not a string")
+        raise InvalidIdToken("the key id (`kid`) in the header of the token is not a string")
     fitting = [one.key for one in keys if one.fits(algorithm, key_id)]
     if not fitting:
         raise UnknownSigningKey("the token is signed with a key that the provider does not list")
     if len(fitting) > 1:
-        raise InvalidIdToken("several keys of the provider fit the header, so the key of the token is not clear")
+        raise InvalidIdToken(
+            "several keys of the provider fit the token; each key needs a key id (`kid`), which the token must name"
+        )
     return fitting[0]
 
 
@@ -177,15 +179,17 @@ def _check_claims(claims: dict[str, Any], expected: Expectation, now_s: int) -> 
     try:
         registry.validate(claims)
     except ExpiredTokenError:
-        raise InvalidIdToken("the token has expired; if it is new, the clocks of the machines differ") from None
+        raise InvalidIdToken(
+            "the token has expired; if it is new, the clocks of this server and of the provider differ"
+        ) from None
     except MissingClaimError as error:
         raise InvalidIdToken(f"the token has no claim {error.claim}") from None
     except InvalidClaimError as error:
-        raise InvalidIdToken(f"the claim {error.claim} does not have the expected value") from None
+        raise InvalidIdToken(f"the claim {error.claim} of the token does not have the expected value") from None
     if claims.get("nonce") != expected.nonce:
-        raise InvalidIdToken("the claim nonce does not have the expected value")
+        raise InvalidIdToken("the claim nonce of the token does not have the expected value")
     audiences = claims["aud"] if isinstance(claims["aud"], list) else [claims["aud"]]
     if ("azp" in claims or len(audiences) > 1) and claims.get("azp") != expected.client_id:
-        raise InvalidIdToken("the claim azp does not have the expected value")
+        raise InvalidIdToken("the claim azp of the token does not have the expected value")
     if not _SUBJECT.fullmatch(claims["sub"]):
-        raise InvalidIdToken("the claim sub does not consist of 1 to 255 printable ASCII characters")
+        raise InvalidIdToken("the claim sub of the token does not consist of 1 to 255 printable ASCII characters")

@@ -94,7 +94,7 @@ class ProjectImports(Resource):
         elif isinstance(piece, bytes) and self._field is not None:
             self._field += piece
             if sum(map(len, self.fields.values())) > MAX_FORM_BYTES:
-                raise TooLargeProblem(f"The form fields may have at most {MAX_FORM_BYTES} bytes together.")
+                raise TooLargeProblem(f"The form fields may have at most {MAX_FORM_BYTES} bytes in total.")
         elif self._file is not None:
             await self._take_file(*self._file)
             self._file = None

@@ -70,7 +70,9 @@ def parse_tags(header: str) -> list[str]:
             raise BadRequestProblem(f"Entity tags in a header must be separated by commas: {header[:200]}")
         position += 1
     if not tags:
-        raise BadRequestProblem("The header If-Match or If-None-Match contains no entity tag.")
+        raise BadRequestProblem(
+            "The header If-Match or If-None-Match contains no entity tag; send the ETag of the resource, or *."
+        )
     return tags
 
 
@@ -97,7 +99,7 @@ def write_precondition(if_match: str | None, if_none_match: str | None, *, may_c
         return ABSENT
     if if_match is None:
         hint = "If-Match with the ETag you read, or *" + (", or If-None-Match: * to create" if may_create else "")
-        raise PreconditionRequiredProblem(f"State which version of the resource the change is for: send {hint}.")
+        raise PreconditionRequiredProblem(f"Name the version of the resource that you want to change: send {hint}.")
     tags = parse_tags(if_match)
     if tags == ["*"]:
         return ANY_STATE

@@ -42,7 +42,8 @@ def boundary_of(content_type: str) -> bytes:
     boundary = parameters.get(b"boundary", b"")
     if not 0 < len(boundary) <= MAX_BOUNDARY_BYTES:
         raise BadRequestProblem(
-            f"The Content-Type contains no boundary of 1 to {MAX_BOUNDARY_BYTES} bytes.", code="bad-multipart"
+            f"The Content-Type multipart/form-data needs a boundary of 1 to {MAX_BOUNDARY_BYTES} bytes.",
+            code="bad-multipart",
         )
     return boundary
 

@@ -52,7 +52,7 @@ async def ask(call: Awaitable[T]) -> T:
         async with asyncio.timeout(ENGINE_S):
             return await call
     except TimeoutError:
-        raise EngineError(f"the engine did not answer within {ENGINE_S:.0f} s") from None
+        raise EngineError(f"the engine did not answer within {ENGINE_S:.0f} s to a request about workers") from None
 
 
 class ServerLead:

@@ -140,7 +140,7 @@ class SlurmLauncher:
             try:
                 self._prepare_logs()
             except OSError as error:
-                raise EngineError(f"the logs of workers cannot be kept: {error}") from error
+                raise EngineError(f"the logs of workers cannot be kept in the data folder: {error}") from error
             await self._run("sbatch", *self._submission(request, count, job_name), str(SCRIPT), *self._command(request))
         return names
 

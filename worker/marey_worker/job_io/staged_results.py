@@ -44,7 +44,8 @@ class StagedResults:
         Raises `JobRefused` if an earlier result has the same name, because this one would replace it.
         """
         if output.name in self.names:
-            raise JobRefused("same-name", f"two results of the job would have the name {output.name}; rename an input")
+            detail = f"two results of the job would have the name {output.name}; rename one of the inputs"
+            raise JobRefused("same-name", detail)
         self.names.add(output.name)
         self._ready.append(_encoder.submit(_with_encoded_arrays, output))
         self._ready_bytes += _array_bytes(output.parts)

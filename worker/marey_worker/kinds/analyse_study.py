@@ -98,7 +98,10 @@ def _measured(context: Context, study: StudyDocument) -> tuple[list[PairDifferen
         clips = [_measure(context, one.revision) for one in study.motions]
         counts = np.array([clip.frame_count for clip in clips])
         if (cells := int(counts.sum()) ** 2 // 2) > MOST_TABLE_CELLS:
-            raise MotionError(f"the motion maps of all pairs have {cells:,} cells; use shorter motions")
+            raise MotionError(
+                f"the motion maps of all pairs have {cells:,} cells together, and at most {MOST_TABLE_CELLS:,} are "
+                "possible; use shorter motions"
+            )
         return measure_pairs(clips, context.progress), []
     except MotionError as error:
         return [], [f"no metric was fitted: {error}"]

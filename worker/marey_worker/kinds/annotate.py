@@ -96,7 +96,9 @@ def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
     for name in names:
         own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)
         if own is None:
-            raise UnknownJoint("neither the skeleton nor its joint mapping has a joint of this name", where=name)
+            raise UnknownJoint(
+                f"neither the skeleton nor its joint mapping has a joint {name!r}; give the name of a joint", where=name
+            )
         found.append(rigged.skeleton.index_of(own))
     return tuple(found)
 

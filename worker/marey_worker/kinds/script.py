@@ -59,7 +59,9 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
         )
     if declared.image is not None and declared.image != os.environ.get(IMAGE_VARIABLE):
         raise JobRefused(
-            "wrong-image", f"the script needs the image {declared.image}, but this worker runs in another image"
+            "wrong-image",
+            f"the script needs the image {declared.image}, but this worker runs in another image; start a worker in "
+            "the needed image",
         )
     if landlock_version() == 0:
         raise JobRefused(
@@ -100,7 +102,8 @@ def examine() -> tuple[str, str, str]:
 def _require_program(declared: ScriptDeclaration, code: Path) -> None:
     program = code / declared.program
     if not program.resolve().is_relative_to(code.resolve()) or not program.is_file():
-        raise JobRefused("no-program", f"the commit {declared.commit} has no file {declared.program}")
+        detail = f"the commit {declared.commit} has no file {declared.program}, which the script is to run"
+        raise JobRefused("no-program", detail)
 
 
 def _order(

@@ -95,7 +95,8 @@ def collect(declared: ScriptDeclaration, folder: Path, target: Path) -> dict[str
             outputs = os.open(OUTPUTS, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=run)
         except OSError as error:
             raise JobRefused(
-                "unsafe-output", "the script has replaced or removed the folder `outputs`, in which outputs must be"
+                "unsafe-output",
+                "the script has replaced or removed the folder `outputs`; it must write its outputs into this folder",
             ) from error
         try:
             target.mkdir()

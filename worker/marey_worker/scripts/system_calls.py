@@ -46,7 +46,8 @@ def filter_system_calls() -> None:
     """
     machine = _MACHINES.get(platform.machine())
     if machine is None:
-        raise NotConfinedError(f"scripts run on {' and '.join(_MACHINES)}, not on {platform.machine()}")
+        known = " or ".join(_MACHINES)
+        raise NotConfinedError(f"scripts can run only on {known}; this machine is {platform.machine()}")
     code = b"".join(_steps(machine))
     steps = ctypes.create_string_buffer(code, len(code))
     program = struct.pack("@HP", len(code) // 8, ctypes.addressof(steps))

@@ -174,7 +174,7 @@ class Cluster:
                     raise _error(response.status, await _problem(response))
                 yield response
         except TimeoutError:
-            raise EngineError("the cluster does not answer in time") from None
+            raise EngineError("the Kubernetes cluster does not answer in time") from None
         except (aiohttp.ClientError, ConfigException, OSError, ValueError) as error:
             raise EngineError(f"no valid answer from the cluster: {type(error).__name__}: {error}") from error
 
@@ -198,7 +198,9 @@ async def _configuration(options: ClusterOptions) -> client.Configuration:
                 persist_config=False,
             )
     except (ConfigException, OSError) as error:
-        raise EngineError(f"the access to the cluster is not configured: {error}") from error
+        raise EngineError(
+            f"the access to the cluster is not configured: {error}; check the launcher option `kubeconfig`"
+        ) from error
     return configuration
 
 
