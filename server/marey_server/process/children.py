@@ -175,11 +175,11 @@ class Children:
         """
         with self._changed:
             if self._requests[caller] >= self.limits.requests_each:
-                raise _busy(f"{self._requests[caller]} of your requests already use a child process or wait for one")
+                raise _busy(self._requests[caller], own=True)
             if guest and self._guests[guest] >= self.limits.requests_of_guest:
-                raise _busy(f"{self._guests[guest]} of your requests already use a child process or wait for one")
+                raise _busy(self._guests[guest], own=True)
             if self._requests.total() >= self.limits.requests:
-                raise _busy(f"{self._requests.total()} requests already use a child process or wait for one")
+                raise _busy(self._requests.total(), own=False)
             self._requests[caller] += 1
             self._guests[guest] += 1
         try:
@@ -386,9 +386,10 @@ def _discard(child: ConnectedChild | None) -> None:
         child.kill(grace_s=0.0)
 
 
-def _busy(reason: str) -> UnavailableProblem:
+def _busy(count: int, *, own: bool) -> UnavailableProblem:
+    which = f"{count} of your requests" if own else f"{count} requests"
     return UnavailableProblem(
-        f"{reason}; try again in a few seconds.",
+        f"{which} already use the child processes of the server or wait for one; try again in a few seconds.",
         code="children-busy",
         headers={"Retry-After": str(ASK_AGAIN_S)},
     )
