@@ -149,7 +149,7 @@ async def listening(
 
     At the end of the block, no more connections are accepted. For `linger_s` seconds, requests on open connections are
     still answered, and the answers ask clients to close the connections. Everything is closed when the running requests
-    have ended, at the latest after `drain_s` more seconds. Raises `CannotListen`.
+    have ended, at the latest after `drain_s` more seconds. Raises `CannotListen` if the address cannot be used.
     """
     settings = app.services.settings
     if sockets is None:
@@ -351,7 +351,8 @@ async def warming(children: Children) -> AsyncIterator[None]:
 async def serving(settings: Settings) -> AsyncIterator[Running]:
     """Run a server with its database and workers while the `async with` block runs; then stop, workers first.
 
-    Workers of engines such as Slurm continue. Raises `CannotListen` and `LauncherUnusable`.
+    Workers of engines such as Slurm continue. Raises `CannotListen` if the address cannot be used, and
+    `LauncherUnusable` if workers cannot be started as the settings demand.
     """
     database = open_database(settings)
     async with (

@@ -156,7 +156,7 @@ BAD_RESULT = "bad-result"
 
 @dataclass(frozen=True)
 class Failed:
-    """Message that the job has failed."""
+    """Message that the job has failed: code and text of the reason, signature, and whether a retry may succeed."""
 
     code: str
     detail: str
@@ -197,7 +197,7 @@ def _plain(value: Any) -> str:
 
 
 def unpack(data: bytes) -> Any:
-    """Return the message that the bytes contain. Raises `BadMessage`."""
+    """Return the message that the bytes contain. Raises `BadMessage` if they contain no valid message."""
     try:
         name, fields = msgpack.unpackb(data, strict_map_key=True)
         return _FORMS[name].validate_python(fields)

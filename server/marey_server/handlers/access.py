@@ -68,7 +68,8 @@ def sign_in(tx: Transaction, attempt: SignInTry, verified_hash: str, expires_in_
 def count_try(tx: Transaction, attempt: SignInTry) -> str | None:
     """Count a try to sign in; return the stored hash that the password must match.
 
-    Return None if no active user with a password has this name. Raises `TooManyRequestsProblem`.
+    Return None if no active user with a password has this name. Raises `TooManyRequestsProblem` above the limit of
+    tries.
     """
     sign_ins.count(tx, attempt)
     return users.stored_hash(tx, attempt.name)
@@ -99,7 +100,8 @@ class PasswordResource(Resource):
         """Count a try to sign in and check its password.
 
         Return the try and the stored hash, or the try and None if the password does not match. The check takes the same
-        time for a user who does not exist. Raises `TooManyRequestsProblem` or `UnavailableProblem`.
+        time for a user who does not exist. Raises `TooManyRequestsProblem` above the limit of tries, and
+        `UnavailableProblem` if too many passwords are being checked.
         """
         services = self.services
         address = limited_address(self.client_address)
@@ -128,7 +130,7 @@ class PasswordResource(Resource):
         """Count a try to use the code of a link or an invitation, even if the code is not valid, and return the try.
 
         `try_of(code, address, limit)` makes the `SignInTry` from the code, the client's address, and the allowed number
-        of tries per minute. Raises `TooManyRequestsProblem`.
+        of tries per minute. Raises `TooManyRequestsProblem` above this number.
         """
         per_minute = self.services.settings.login_tries_per_minute
         attempt = try_of(code.get_secret_value(), limited_address(self.client_address), per_minute)

@@ -84,7 +84,7 @@ class Export(BlobSender):
         Clips and aligned clips can be returned as bvh, npz, predecessor and json. Skeletons, annotations, models with
         their trees, and graphs can be returned as predecessor and json; items of other kinds only as json. The format
         `predecessor` stands for the file formats of Marey's predecessor. If an item was imported from such a file and
-        not changed since, the answer is this file, unless `layout`, `form` or `end_index` is given.
+        is unchanged since the import, the answer is this file, unless `layout`, `form` or `end_index` is given.
 
         If the consent for a clip has ended, the export is refused (409, `consent-expired`). The last day of the consent
         is in the take record of the clip's newest revision; an aligned clip has the consent of its source clip.

@@ -80,7 +80,10 @@ class ItemsQuery(CountedPageQuery):
 
 
 def kind_of(plural: str) -> Kind:
-    """Return the kind named by a segment of the address. Raises `NotFoundProblem`."""
+    """Return the kind whose plural is a segment of the address, such as `clips`.
+
+    Raises `NotFoundProblem` if there is none.
+    """
     try:
         return Kind.from_plural(plural)
     except KeyError:

@@ -189,7 +189,10 @@ class Figure(StoredFileSender):
 def read_report_of(
     tx: Transaction, project: str, kind: Kind, item_id: str, number: int | None
 ) -> tuple[ReportDocument, Revision]:
-    """Return the report of an item, and the revision that it belongs to. Raises `NotFoundProblem`."""
+    """Return the report of an item, and the revision that it belongs to.
+
+    Raises `NotFoundProblem` if the item does not exist or has no report.
+    """
     part = items.read_part(tx, project, kind, item_id, "report", revision=number, arrays="none")
     tree: dict[str, Any] = part.tree
     report = _REPORT_OF[tree["schema"]].model_validate(tree)

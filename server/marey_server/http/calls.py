@@ -45,7 +45,8 @@ class Caller:
     def identify(self, tx: Transaction) -> None:
         """Find the credential's principal, check whether it may perform the operation, and set `tx.principal`.
 
-        The store enforces the role that the operation declares. Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
+        The store enforces the role that the operation declares. Raises `UnauthenticatedProblem` if the credential is
+        not valid or is missing, and `ForbiddenProblem` if the principal may not perform the operation.
         """
         self.principal = ANONYMOUS if self.token is None else tokens.resolve_token(tx, self.token)
         require_access(self.operation, self.principal)
@@ -108,7 +109,7 @@ def admission_of(caller: Caller, target: BodyTarget) -> Admission:
 def require_access(operation: Operation, principal: Principal) -> None:
     """Refuse callers who may not perform the operation on any object, whatever their roles in projects are.
 
-    Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
+    Raises `UnauthenticatedProblem` for an anonymous caller, and `ForbiddenProblem` for all others.
     """
     access = operation.access
     guests = access is Access.ANYONE or (access is Access.READER and operation.public)

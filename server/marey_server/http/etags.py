@@ -53,7 +53,10 @@ def without_digest(tag: str) -> str:
 
 
 def parse_tags(header: str) -> list[str]:
-    """Return the opaque values of a list of tags, weak or strong; `["*"]` for `*`. Raises `BadRequestProblem`."""
+    """Return the values of a list of entity tags without quotation marks, weak or strong; `["*"]` for `*`.
+
+    Raises `BadRequestProblem` if the list is malformed or empty.
+    """
     if header.strip() == "*":
         return ["*"]
     tags: list[str] = []

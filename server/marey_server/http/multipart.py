@@ -33,7 +33,11 @@ Piece = PartHead | bytes | PartEnd
 
 
 def boundary_of(content_type: str) -> bytes:
-    """Return the boundary of a Content-Type header. Raises `UnsupportedMediaTypeProblem` or `BadRequestProblem`."""
+    """Return the boundary of a Content-Type header.
+
+    Raises `UnsupportedMediaTypeProblem` for another media type, and `BadRequestProblem` if the boundary is missing or
+    too long.
+    """
     media_type, parameters = parse_options_header(content_type)
     if media_type != b"multipart/form-data":
         raise UnsupportedMediaTypeProblem(
@@ -83,7 +87,8 @@ class MultipartReader:
     def feed(self, data: bytes) -> list[Piece]:
         """Parse the next bytes; return the heads, pieces and ends of parts that were found in them.
 
-        Raises `BadRequestProblem` or `TooLargeProblem`.
+        Raises `BadRequestProblem` if the body is malformed, and `TooLargeProblem` for too many parts or a too long
+        head.
         """
         if self._preamble is not None:
             data = self._skip_preamble(self._preamble + data)
@@ -95,7 +100,7 @@ class MultipartReader:
         return pieces
 
     def finish(self) -> None:
-        """Check that the stream ended with the closing boundary. Raises `BadRequestProblem`."""
+        """Raise `BadRequestProblem` unless the stream ended with the closing boundary."""
         if not self._ended:
             raise BadRequestProblem("The multipart body ends before its closing boundary.", code="bad-multipart")
 

@@ -87,7 +87,10 @@ class PoolKeeper:
             log.warning("pool %s: %s", self._pool.name, getattr(error, "detail", error))
 
     async def adjust(self) -> None:
-        """Start or stop workers once, if this process is the leader. Raises `EngineError` and `ApiProblem`."""
+        """Start or stop workers once, if this process is the leader.
+
+        Raises `EngineError` if the engine refuses a request, and `ApiProblem` if the database cannot be used.
+        """
         if self._launcher.outlives_server and not await self._lead.take():
             self._size.forget()
             self._ended = None

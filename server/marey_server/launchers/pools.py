@@ -44,7 +44,7 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     """Run the workers of a server that listens on `address` while the `async with` block runs.
 
     At the end of the block, the workers on this machine are stopped. Workers of other engines continue, and the next
-    server finds them. Raises `LauncherUnusable`.
+    server finds them. Raises `LauncherUnusable` if the launcher does not exist, or its options are invalid.
     """
     settings = services.settings
     keepers: list[Keeper] = [
@@ -103,7 +103,10 @@ def _dispatcher(services: Services, address: str) -> Keeper:
 
 
 def find_launcher(name: str) -> MakeLauncher:
-    """Return the function that makes launchers by the name of the launcher. Raises `LauncherUnusable`."""
+    """Return the function that makes launchers, by the name of the launcher in the settings.
+
+    Raises `LauncherUnusable` if there is no such launcher, or if it cannot be loaded.
+    """
     if name in BUILT_IN:
         found = EntryPoint(name, BUILT_IN[name], ENTRY_POINTS)
     else:

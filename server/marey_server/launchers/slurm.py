@@ -75,7 +75,7 @@ END_REASONS: Mapping[str, EndReason] = {
 
 
 class SlurmOptions(BaseModel):
-    """Options of the launcher."""
+    """Options of the launcher `slurm`; none of them is required."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -251,7 +251,7 @@ class SlurmLauncher:
         return None
 
     async def _run(self, program: str, *arguments: str) -> str:
-        """Run a command of Slurm and return its output. Raises `EngineError`."""
+        """Run a command of Slurm and return its output. Raises `EngineError` if it fails or takes too long."""
         environment = clean_environment() | {
             "MAREY_LOG_FORM": self._context.log_form, "MAREY_LOG_LEVEL": self._context.log_level
         }  # fmt: skip

@@ -168,7 +168,10 @@ def read_annotation(order: bytes) -> bytes:
 def _imported(
     document: Mapping[str, Any], name: str, clip: str, revision: int, frame_count: int, given: AnnotationImport
 ) -> dict[str, Any]:
-    """Convert a document of the predecessor to the part `annotation` of an item. Raises `InvalidProblem`."""
+    """Convert a document of Marey's predecessor to the part `annotation` of an item.
+
+    Raises `InvalidProblem` if the document is not a valid annotation of the clip.
+    """
     with LOADING:
         from marey_motion import documents
         from marey_motion.errors import MotionError

@@ -48,7 +48,10 @@ class Message(BaseModel):
 
     @classmethod
     def unpack(cls, data: bytes) -> Self:
-        """Return the message that the bytes contain. Raises `BadMessage`."""
+        """Return the message that the bytes contain.
+
+        Raises `BadMessage` if they contain no valid message of this class.
+        """
         try:
             fields: Any = msgpack.unpackb(data)
             return cls.model_validate(fields)

@@ -248,7 +248,10 @@ def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
 
 
 def advance(order: StreamOrder, frames: CoverageFrames) -> AdvancedStream:
-    """Add frames to a stream; return its new state and the answer to the request. Raises `InvalidProblem`."""
+    """Add frames to a stream; return its new state and the answer to the request.
+
+    Raises `InvalidProblem` if the frames do not fit the stream.
+    """
     online = _online(order.state)
     before = online.counts.copy()
     windows = 0

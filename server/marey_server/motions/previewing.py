@@ -208,7 +208,10 @@ def _edited(source: PreviewSource, most_work: float) -> tuple[EditedClip, ...]:
 
 
 def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
-    """Return a clip and its skeleton; the joint mapping is parsed when a command needs it. Raises `MotionError`."""
+    """Return a clip and its skeleton; the joint mapping is parsed when a command needs it.
+
+    Raises `MotionError` if the motion or the skeleton is not valid.
+    """
     from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
     from marey_motion.editing.take import EditedBody
     from marey_motion.rigs import JointMapping, map_joints, require_trust

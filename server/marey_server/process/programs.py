@@ -1,4 +1,4 @@
-"""Start of programs beside the server: workers, the processes at a shared port, and the compilation of kernels."""
+"""Start of other programs by the server: workers, the processes that share a port, and the compilation of kernels."""
 
 from __future__ import annotations
 

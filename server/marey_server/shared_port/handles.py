@@ -39,7 +39,7 @@ class ProcessHandle:
 
     @classmethod
     async def start(cls, number: int, order: StartOrder) -> Self:
-        """Start a process, which inherits the sockets that `order` names. Raises `OSError`."""
+        """Start a process, which inherits the sockets that `order` names. Raises `OSError` if it cannot be started."""
         ours, theirs = socket.socketpair()
         with theirs:
             process = await programs.start_program(

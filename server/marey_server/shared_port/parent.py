@@ -34,7 +34,8 @@ async def serve_in_processes(settings: Settings, given: dict[str, Any]) -> None:
     """Run the processes of a server until SIGTERM or SIGINT; SIGHUP replaces all of them, one after another.
 
     The processes get the settings `given`. They read all other settings themselves, so that new processes use changed
-    settings. Raises `CannotListen` and `ProcessesFailed`.
+    settings. Raises `CannotListen` if the address cannot be used, and `ProcessesFailed` if the processes cannot be
+    started or end repeatedly.
     """
     configure_logging(settings.log_form, settings.log_level)
     sockets = listen(settings.host, settings.port)
@@ -90,7 +91,10 @@ class Parent:
         self.stopping = asyncio.Event()
 
     async def run(self) -> None:
-        """Run the processes until `stopping` is set. Raises `ProcessesFailed`."""
+        """Run the processes until `stopping` is set.
+
+        Raises `ProcessesFailed` if they cannot be started or end repeatedly.
+        """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stopping.set)
@@ -123,7 +127,7 @@ class Parent:
     async def _start_all(self) -> None:
         """Start all processes: first one process, which upgrades the database, and then the others.
 
-        Raises `ProcessesFailed`.
+        Raises `ProcessesFailed` if the first process ends, or a process cannot be started.
         """
         numbers = iter(self._changing)
         first = self._current[next(numbers)] = await self._start(1, first=True)

@@ -58,7 +58,10 @@ class CheckedResolver(Resolver):
     async def resolve(
         self, host: str, port: int, family: socket.AddressFamily = socket.AF_UNSPEC
     ) -> list[tuple[int, Any]]:
-        """Return the permitted addresses of a host, each with its family. Raises `AddressRefused` or `OSError`."""
+        """Return the permitted addresses of a host, each with its family.
+
+        Raises `AddressRefused` if no address of the host is permitted, and `OSError` if the name cannot be resolved.
+        """
         loop = asyncio.get_running_loop()
         found = await loop.run_in_executor(self._threads, _look_up, host, port, family)
         permitted = [(kind, address) for kind, address in found if may_connect(address[0], self._networks)]
@@ -124,7 +127,7 @@ class Sender:
 def _status(first_lines: Sequence[str]) -> int | None:
     """Return the status of an answer, or None if there is no answer.
 
-    It is in the last of the status lines; earlier lines belong to interim answers, such as 100 Continue.
+    The last of the status lines has this status; earlier lines belong to interim answers, such as 100 Continue.
     """
     with suppress(IndexError, ValueError):
         return int(first_lines[-1].split()[1])

@@ -209,7 +209,7 @@ class _Editing:
 
 
 def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:
-    """Return the commands to apply, and the item of the kind `edit` that contains them.
+    """Return the item of the kind `edit` that contains the commands, and the commands.
 
     The item is None if the parameters of the job contain the commands. Raises `JobRefused` if both an item and
     parameters give commands, or neither of them, or if the item is not valid.

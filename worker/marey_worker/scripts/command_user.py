@@ -64,7 +64,8 @@ def become(user: int) -> None:
 def look_as(user: int) -> None:
     """Let this process, which runs as root, read data in /proc that the kernel shows only to `user`.
 
-    In some containers, root may not read such data about other users. Raises `NotConfinedError`.
+    In some containers, root may not read such data about other users. Raises `NotConfinedError` if the rights cannot be
+    set.
     """
     rights = _rights("CapPrm")
     libc().setfsuid(user)  # removes the rights to files, which this process still needs

@@ -48,7 +48,7 @@ class Leases(Resource):
 
     @writes(access=Access.WORKER, scope="work", body=ClaimRequest, answer=LeaseList, reserved=True)
     async def post(self, body: ClaimRequest) -> Reply:
-        """Claim jobs; if there are none, wait for jobs up to `wait_s` seconds. A lease that is not renewed expires."""
+        """Claim jobs; if no job is available, wait up to `wait_s` seconds. A lease that is not renewed expires."""
         services = self.services
         loop = asyncio.get_running_loop()
         deadline = loop.time() + body.wait_s

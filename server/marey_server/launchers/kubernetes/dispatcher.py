@@ -100,7 +100,10 @@ class Dispatcher:
             log.warning("own pods: %s", getattr(error, "detail", error))
 
     async def adjust(self) -> None:
-        """Start and delete pods once, if this process is the leader. Raises `EngineError` and `ApiProblem`."""
+        """Start and delete pods once, if this process is the leader.
+
+        Raises `EngineError` if the cluster refuses a request, and `ApiProblem` if the database cannot be used.
+        """
         if not await self._leads():
             self._explained = None
             return
