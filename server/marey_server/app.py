@@ -134,7 +134,7 @@ def create_app(settings: Settings, database: Database, children: Children | None
 
 @dataclass(frozen=True)
 class Running:
-    """Server that accepts requests."""
+    """Server that accepts requests; `address` is the URL at which clients reach it."""
 
     app: Application
     address: str

@@ -163,7 +163,10 @@ def require_empty(**settings: Any) -> None:
 
 
 def backup(*, target: Path, **settings: Any) -> None:
-    """Copy an SQLite database in a consistent state, even while a server is writing to it."""
+    """Copy an SQLite database to the file `target`, in a consistent state even while a server is writing to it.
+
+    Raises `CommandFailed` if the file exists already.
+    """
     source = _sqlite_file(read_settings(**settings), must_exist=True)
     if target.exists():
         raise CommandFailed(f"the file {target} exists already; choose a file that does not exist")
@@ -324,7 +327,11 @@ def _shrink(file: Path) -> None:
 
 
 def admin_token(*, user: str | None = None, **settings: Any) -> None:
-    """Create a new token for an administrator, and write it to `admin.token` in the data folder."""
+    """Create a token for an administrator, and write it to `admin.token` in the data folder.
+
+    `user` is the name of the administrator; None: the one who was created first. Raises `CommandFailed` if there is no
+    such administrator.
+    """
     from marey_server.access.principal import SYSTEM
     from marey_server.app import connect_database
     from marey_server.errors import NotFoundProblem

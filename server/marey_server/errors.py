@@ -182,7 +182,7 @@ class PreconditionFailedProblem(ApiProblem):
 
 
 class PreconditionRequiredProblem(ApiProblem):
-    """Send If-Match with the state that you are changing."""
+    """Send the header If-Match with the ETag of the state that you want to change."""
 
     status = 428
     code = "precondition-required"

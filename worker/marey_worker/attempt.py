@@ -289,7 +289,7 @@ class RunningAttempt:
         return found[: max(1, sum(size <= ANSWER_LIMIT_BYTES for size in sizes))]
 
     def _cache_key(self, name: str) -> str:
-        """Return the key of a part in the cache: server, project and name.
+        """Return the key of a blob or a part in the cache: server, project and name.
 
         Names of parts are unique only on one server and in one project.
         """

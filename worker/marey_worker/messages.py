@@ -84,7 +84,7 @@ class ReadItem:
 
 @dataclass(frozen=True)
 class FindItems:
-    """Request for items by name, directly in a collection, or anywhere in the project if `collection` is None."""
+    """Request for the items with a name in one folder, or in the whole project if `collection` is None."""
 
     request: int
     kind: Kind
@@ -109,7 +109,7 @@ class ReadResults:
 
 @dataclass(frozen=True)
 class ReadJudgements:
-    """Request for the answers of the participants of a revision of a study; the reply has one tree for each."""
+    """Request for the answers of a study's participants at a revision; the reply has one tree for each participant."""
 
     request: int
     item: str

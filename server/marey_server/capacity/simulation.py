@@ -81,7 +81,11 @@ LUCKY = Misfortune()
 
 @dataclass
 class JobHistory:
-    """History of a simulated job; `end_s` is None if the job was never completed."""
+    """History of a simulated job: its starts, its end, and the numbers of its attempts and failures.
+
+    Times are in seconds from the start of the simulation. `end_s` is None if the job was never completed; `unstarted`
+    counts attempts whose worker died before the first heartbeat.
+    """
 
     starts_s: list[float] = field(default_factory=list)
     end_s: float | None = None
@@ -199,7 +203,7 @@ class _Simulation:
     # -- the queue --
 
     def _queue(self, number: int, run_at_s: float) -> None:
-        """Queue a job that may run from `run_at_s` on."""
+        """Queue the job with this number, which may run from `run_at_s` on."""
         if run_at_s > self._now_s:
             self._at(run_at_s, lambda: self._queue(number, run_at_s))
             return
@@ -283,7 +287,10 @@ class _Simulation:
         self._again(number, wait_s=self._policy.backoff_us(history.failures) / SECOND_US)
 
     def _lose(self, number: int, *, counted: bool) -> None:
-        """Take a job back from a dead worker at the end of its lease."""
+        """Take a job back from a dead worker at the end of its lease.
+
+        `counted` is true if the attempt counts, because it has sent a heartbeat.
+        """
         history = self._histories[number]
         if counted:
             history.attempts += 1
@@ -292,7 +299,7 @@ class _Simulation:
         self._again(number, wait_s=0.0)
 
     def _again(self, number: int, *, wait_s: float) -> None:
-        """Queue a job again after a failed or lost attempt, or end it as failed."""
+        """Queue a job again after a failed or lost attempt, or end it as failed if no attempts are left."""
         history = self._histories[number]
         over = history.attempts >= self._jobs[number].max_attempts or history.unstarted > self._policy.max_unstarted
         history.failed = over

@@ -46,7 +46,7 @@ MAX_LOGIN_BYTES = 4 * KIB
 
 
 def read_me(tx: Transaction) -> Me:
-    """Return the caller, who is a user or a job, with the scopes of the credential."""
+    """Return the caller, who is a user or an attempt of a job, with the scopes of the credential."""
     principal = tx.principal
     if principal.kind == "attempt" or principal.user_name is None:
         return Me(user=None, scopes=principal.scopes, job=principal.job_id)

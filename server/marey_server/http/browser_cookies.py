@@ -66,7 +66,11 @@ def _is_foreign(request: HTTPServerRequest) -> bool:
 
 
 def session_token(request: HTTPServerRequest, operation: Operation, project: str | None) -> str | None:
-    """Return the token of the browser's session, if the operation only reads the project of the session."""
+    """Return the token of the browser's session in a project, from the cookies of the request.
+
+    Return None if the browser has sent none, if another site has caused the request, or if the operation does more than
+    read the project.
+    """
     reads_project = operation.method == "GET" and operation.scope == "read" and operation.access.role is not None
     if project is None or not reads_project or _is_foreign(request):
         return None

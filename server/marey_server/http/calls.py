@@ -160,7 +160,10 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
 
 
 def _require_participation(access: Access, principal: Principal) -> None:
-    """Refuse operations for participants to all other callers, and all other operations to participants of studies."""
+    """Let only participants of studies perform the operations for participants, and no other operations.
+
+    Raises `ForbiddenProblem` for all other callers and operations.
+    """
     if access is Access.ANYONE:
         return
     if access is not Access.PARTICIPANT:

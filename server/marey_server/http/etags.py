@@ -42,7 +42,7 @@ ABSENT = Precondition(absent=True)
 
 
 def entity_tag(state: int | str, form: str) -> str:
-    """Return the ETag header for a state and a form."""
+    """Return the value of the header ETag for a state of a resource that is sent in the form `form`, such as `json`."""
     return f'"{state}.{form}"'
 
 
@@ -88,7 +88,7 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 
 
 def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
-    """Return the precondition of a write.
+    """Return the precondition of a write, from the headers If-Match and If-None-Match.
 
     Raises `PreconditionRequiredProblem` if the request has no precondition, and `BadRequestProblem` if the tags are
     malformed or too many. Raises `PreconditionFailedProblem` if no tag begins with the `rev` of a resource.

@@ -319,7 +319,7 @@ def _problem(status: int, code: str, title: str, detail: str, request_id: str) -
 
 
 def log_fault(error: BaseException, request_id: str, method: str, path: str, *, trace_id: str | None = None) -> None:
-    """Log an internal error with its traceback."""
+    """Log an internal error with its traceback; errors that refuse a request are not logged."""
     if isinstance(error, ApiProblem | HTTPError | StreamClosedError | UnauthenticatedProblem):
         return
     log.error("%s %s failed", method, path, exc_info=error, extra={"request_id": request_id, "trace_id": trace_id})

@@ -67,7 +67,7 @@ class Receiver:
             await self._flush()
 
     async def finish(self) -> Spool:
-        """Return the received body with its digest. The caller must close it."""
+        """Return the received body with its digest, as a `Spool` that the caller must close."""
         if len(self._pending) <= WRITTEN_AT_ONCE_BYTES:
             self._write(bytes(self._pending))
             self._pending.clear()

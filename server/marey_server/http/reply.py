@@ -37,7 +37,10 @@ MakeTree = Callable[[], Mapping[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Lasting:
-    """Document that never changes, identified by its digest; `load` reads it if no encoded form of it is cached."""
+    """Document that never changes, identified by its digest.
+
+    `load` reads the document. It is called only if the cache of answers has no encoded form of the document.
+    """
 
     digest: str
     load: Callable[[], Mapping[str, Any]]
@@ -105,7 +108,7 @@ class AnswerForm:
 def settle(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Reply:
     """Load the `Lasting` document of a reply, unless the client or the cache has it already; return the new reply.
 
-    Must be called in the transaction.
+    This must be called in the transaction of the request.
     """
     content = reply.content
     if not isinstance(content, Lasting):

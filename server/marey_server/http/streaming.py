@@ -108,7 +108,7 @@ def _open_blob(
 
 
 def attachment(file_name: str) -> str:
-    """Return the header Content-Disposition (RFC 6266) for a file name with any characters."""
+    """Return the value of the header Content-Disposition (RFC 6266) for a file name with any characters."""
     plain = "".join(sign if " " <= sign <= "~" and sign not in '"\\%' else "_" for sign in file_name)
     return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(file_name, safe='')}"
 

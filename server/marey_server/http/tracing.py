@@ -62,13 +62,16 @@ class RequestTrace:
         return place.header if place.sampled else None
 
     def transaction(self, run: Callable[[Transaction], T], system: str, *, writes: bool) -> TracedTransaction[T]:
-        """Return a call that runs `run` in a transaction of a database of the given kind, and records it."""
+        """Return a callable that runs `run` in a transaction, and records the transaction as a span.
+
+        `system` is the kind of database, such as `postgresql`; `writes` tells whether the transaction may write.
+        """
         return TracedTransaction(
             self, self._begin(DATABASE_WRITE if writes else DATABASE_READ, {"db.system.name": system}), run
         )
 
     def record_child(self, work: str, future: Future[T]) -> None:
-        """Record work in a child process, which ends when `future` is done."""
+        """Record the work of a child process as a span, which ends when `future` is done."""
         span = self._begin(CHILD, {"marey.work": work})
         future.add_done_callback(lambda done: self.end(span, None if done.cancelled() else done.exception()))
 
@@ -106,7 +109,7 @@ class RequestTrace:
 
 
 class TracedTransaction(Generic[T]):
-    """Function for a transaction, with the span that records it.
+    """Function that runs in a transaction, with the span that records the transaction.
 
     The span begins when a thread runs the function, not while the call waits for a thread.
     """

@@ -140,7 +140,7 @@ def annotation_order(clip: AnnotatedClip, given: AnnotationImport, content: byte
 
 
 def found_annotation(answer: bytes) -> dict[str, PreparedDocument]:
-    """Return the parts of the annotation that a child process has read."""
+    """Unpack the parts of the annotation from the answer of a child process."""
     return prepare_parts(Kind.ANNOTATION, {"annotation": unpack_tree(answer)})
 
 

@@ -62,7 +62,7 @@ class DifferenceSource:
 
 
 class SideOrder(Message):
-    """Revision on one side of a `DifferenceOrder`, with its documents as bytes."""
+    """Part of a `DifferenceOrder`: the revision on one side of the comparison, with its documents as bytes."""
 
     place: ComparedRevision
     parts: dict[str, bytes]

@@ -166,7 +166,7 @@ def look_order(stream: Stream) -> bytes:
 def next_frames(held: Stream, frames: CoverageFrames) -> NextFrames | Tree:
     """Return the message that asks a child process to add the frames of a request to a stream.
 
-    If the request repeats the last request, the stored answer to that request is returned instead. Raises
+    If the request repeats the previous request, the stored answer to that request is returned instead. Raises
     `CoverageOffset` if the frames do not start at the stream's offset.
     """
     digest = _digest_of(frames)
@@ -336,7 +336,7 @@ def body_of(rig: bytes) -> MatchingBody:
 
 
 def _load_kernels(body: MatchingBody | None) -> None:
-    """Load compiled code in advance, so that the first frames do not wait for it."""
+    """Load the compiled kernels that frames of this skeleton need, so that the first frames do not wait for them."""
     from marey_motion.clip import Clip
     from marey_motion.evaluation.online import OnlineCoverage
 

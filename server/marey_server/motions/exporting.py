@@ -130,8 +130,8 @@ def find_original(
 ) -> OriginalFile:
     """Return the file that an item was imported from. Items other than clips must be unchanged since the import.
 
-    Raises `NotFoundProblem` if the item was not imported from a file, or was changed since. Raises `ConflictProblem` if
-    the consent for the clip has ended, unless the caller has `permitted` the export.
+    Raises `NotFoundProblem` if the item was not imported from a file, or has changed since the import. Raises
+    `ConflictProblem` if the consent for the clip has ended, unless the export is `permitted`.
     """
     if kind is Kind.CLIP:
         info = items.read_part(tx, project, kind, item_id, "info", revision=revision, arrays="none").tree

@@ -293,8 +293,8 @@ def require_folder(tx: Transaction, project: str, folder: str) -> None:
 def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> list[ImportEntry]:
     """Store the original files and the items read from them; return one entry for each file.
 
-    A file that cannot be stored is refused and does not affect other files. The bytes are counted at the end, because
-    other requests of the user must wait from the count to the end of the transaction.
+    A file that cannot be stored is refused and does not affect other files. The sent bytes are counted last, because
+    other requests of the user must wait from this count to the end of the transaction.
     """
     row = projects.require(tx, project)
     hold_off_purges(tx, row.id)

@@ -191,7 +191,10 @@ def _alignment(part: Mapping[str, Any]) -> bytes:
 
 
 def _model(part: Mapping[str, Any], hierarchy: Mapping[str, Any], options: PredecessorOptions) -> bytes:
-    """Return the file of a model; without a layout, in the layout that can contain its time function exactly."""
+    """Return the file of a model in the layout that `options` name.
+
+    Without a layout, use the one that can contain the model's time function exactly, or else layout 3.
+    """
     from marey_motion.documents import skeleton_from_document
     from marey_motion.formats.predecessor.model_writer import write_predecessor_model
     from marey_motion.formats.predecessor.time_functions import PredecessorTime

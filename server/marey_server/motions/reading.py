@@ -45,7 +45,7 @@ class FileOrder(Message):
     notes_digest: str | None = None
 
     def file(self) -> FileToImport:
-        """Return the file with everything that is needed to import it."""
+        """Return the file with everything that is needed to import it, with the decoded skeleton."""
         given = None
         if self.skeleton is not None:
             item, revision, hierarchy = self.skeleton
@@ -77,7 +77,7 @@ class ReadDocument(Message):
         return cls(schema_name=document.schema, body=canonical_json(document.body), arrays=arrays)
 
     def document(self) -> PreparedDocument:
-        """Return the prepared document that the message contains."""
+        """Convert the message back to a prepared document."""
         return document_of_bytes(self.schema_name, self.body, self.arrays)
 
 
@@ -100,7 +100,7 @@ class ReadDraft(Message):
     same_skeleton: bool
 
     def documents(self) -> dict[str, PreparedDocument]:
-        """Return the parts as prepared documents."""
+        """Return the parts of the item as prepared documents, by name."""
         if self.kind is not Kind.SKELETON:
             return {part: read.document() for part, read in self.parts.items()}
         return {part: _SKELETONS.get_or_make(read.body, read.document) for part, read in self.parts.items()}

@@ -293,7 +293,7 @@ def _found_step(result: SearchResult, number: int, one: Searchable, found: Found
 
 
 def placement_of(start: StartPlacement) -> Placement:
-    """Return the start position and heading as a `Placement`, which moves canonical coordinates into the world."""
+    """Return the `Placement` that moves canonical coordinates to a start position and heading in the world."""
     from marey_motion.alignment.aligned import Placement
 
     return Placement(radians(start.heading_deg), start.x, start.z)

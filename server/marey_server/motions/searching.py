@@ -153,10 +153,10 @@ def _parse_packed(packed: bytes, seed: int, most_work: float) -> Searchable:
 
 
 def parse_searchable(loaded: LoadedSearchable, seed: int, most_work: float) -> Searchable:
-    """Return the parsed model with a tree.
+    """Return the parsed model with a tree; a missing tree is built from samples that are drawn with `seed`.
 
-    Raises `InvalidProblem` if numbers of the model are not valid, and `TooLargeProblem` if drawing samples for a
-    missing tree would take too long.
+    Raises `InvalidProblem` if numbers of the model are not valid, and `TooLargeProblem` if drawing the samples would
+    cost more than `most_work`, in nanoseconds of one thread.
     """
     from marey_motion.documents import mapping_from_document
     from marey_motion.errors import MotionError

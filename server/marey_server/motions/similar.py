@@ -319,7 +319,7 @@ def _damaged() -> NotFoundProblem:
 
 
 def _ranks(lists: list[ListedShard]) -> list[Any]:
-    """Number the clips of all shards in the order of their ids."""
+    """Return, for each shard, the rank of each of its clips in the order of the ids of all clips."""
     import numpy as np
 
     if not lists:
@@ -332,7 +332,7 @@ def _ranks(lists: list[ListedShard]) -> list[Any]:
 
 
 def _example(order: SimilarOrder) -> tuple[Example, float]:
-    """Compute the features of the example, and its frame rate."""
+    """Compute the features of the example; also return its frame rate in Hz."""
     from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
     from marey_motion.matching.body import MatchingBody
     from marey_motion.motion import Motion

@@ -79,10 +79,10 @@ class ChildLimits:
 
 @dataclass(eq=False)
 class ChildTask(Generic[T]):
-    """Call of a function in a child process.
+    """Call of a function, named `module:function`, in a child process.
 
     `make` creates the bytes that the function receives as its argument. `read` converts the bytes that the function
-    returns.
+    returns to the result of the task.
     """
 
     caller: str

@@ -97,7 +97,7 @@ class _OneMetric:
 
 
 class Metrics:
-    """Metrics for /metrics, in their own registry."""
+    """Prometheus metrics of this process, which `/metrics` shows, in a registry of their own."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()

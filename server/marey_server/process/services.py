@@ -214,7 +214,7 @@ class Services:
             numbered = await asyncio.wrap_future(self.database.submit_write(SYSTEM, events.number_events))
 
     def end_attempt(self, lost: AuthorLostProblem) -> None:
-        """End a job whose author may no longer run the job; if this fails, the job ends when its lease expires."""
+        """End the job of an attempt whose author may no longer run jobs; if this fails, the job ends with its lease."""
         with suppress(UnavailableProblem):
             self.database.submit_write(SYSTEM, end_for_lost_author, lost.job_id, lost.fence)
 

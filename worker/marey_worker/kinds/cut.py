@@ -29,7 +29,7 @@ from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: CutParams) -> dict[str, Any]:
-    """Create a clip from every selected segment, and an annotation if the clip has keyframes or margins.
+    """Create a clip from every selected segment; a clip with keyframes or margins also gets an annotation.
 
     Raises `JobRefused` if no segment is selected, if two pieces would have the same name, or if no annotation can be
     used.

@@ -142,9 +142,9 @@ Moving = dict[int, tuple[PinnedInput, MotionDocument]]
 
 
 def _read(context: Context, wanted: Collection[int]) -> tuple[Rig, Moving]:
-    """Return the skeleton of all clips, and the motions of the `wanted` ones by position.
+    """Return the skeleton of all clips, and the motions of the `wanted` clips by position.
 
-    Raises `JobRefused` if there are several skeletons.
+    Raises `JobRefused` if the clips have several skeletons.
     """
     pins = context.inputs["clips"]
     (rig,) = context.inputs.get("rig", ()) or (None,)
@@ -164,7 +164,10 @@ def _prepare(
     motions: Moving,
     refusals: Refusals,
 ) -> tuple[Prepared, dict[int, dict[str, str]]]:
-    """Measure clips, and cut loops out of them; also return the refusals of clips that cannot be compared."""
+    """Measure the clips to compare; if the parameters demand it, also cut one cycle out of each clip.
+
+    Return the measured clips, and the refusals of clips that cannot be compared, both by the position of the clip.
+    """
     rigged = read_rigged(context, rig)
     body, metric = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping), metric_of(document)
     prepared, refused = Prepared(), dict[int, dict[str, str]]()

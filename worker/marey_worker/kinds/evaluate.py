@@ -193,7 +193,10 @@ def facets_of(result: EvaluationResult, pins: Sequence[PinnedInput]) -> tuple[It
 def write_report(
     context: Context, database: MatchingDatabase, result: EvaluationResult, params: EvaluateParams
 ) -> dict[str, Any]:
-    """Draw all figures, write the page, and store both as files; return the document that refers to these files."""
+    """Draw all figures, write the report page, and store them as files.
+
+    Return the document that refers to these files.
+    """
     figures = draw_figures(result)
     played = play_trials(database, result)
     page = render_report(result, title=params.name, figures=figures, inputs=inputs_of(context), played=played)

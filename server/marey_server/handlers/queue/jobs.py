@@ -145,7 +145,7 @@ class ProjectJobs(Resource):
 
 
 def accepted(job: Job) -> Reply:
-    """Return the answer to a submission: the new job, its address and when to look again."""
+    """Return the answer to a submission: the new job, its address, and the time after which to look again."""
     headers = {} if job.state.terminal else {"Retry-After": "1"}
     return Reply(job, location=f"/jobs/{job.id}", headers=headers)
 

@@ -130,9 +130,10 @@ class StudyDifferencesResource(Resource):
 
     @reads(access=Access.MAINTAINER, query=DifferencesQuery, answer=StudyDifferences, public=False)
     async def get(self, project: str, kind: str, item: str, query: DifferencesQuery) -> Reply:
-        """Return how different the motions of a study look by the answers so far, without data of participants.
+        """Return how different the motions of a study look to the participants, according to the answers so far.
 
-        The job kind `analyse_study` computes the same differences, groups of the motions, and metrics.
+        The answer contains no data of single participants. The job kind `analyse_study` computes the same differences,
+        groups of the motions, and metrics.
         """
         collected = await self.look_up(
             judgements.collect_answers, project, kind_of(kind), item, revision=query.revision

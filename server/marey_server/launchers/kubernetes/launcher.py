@@ -39,7 +39,7 @@ def make_kubernetes_launcher(context: LaunchContext) -> KubernetesLauncher:
 
 
 class KubernetesLauncher:
-    """Launcher whose workers are pods. They continue when the server ends."""
+    """Launcher that runs workers as pods of a cluster. The pods continue when the server ends."""
 
     outlives_server = True
 

@@ -139,7 +139,7 @@ def _reason(pod: Document, ended: Document, signal: int) -> tuple[EndReason, str
 
 
 def blocked_reason(pod: Document) -> str | None:
-    """Return why a pod cannot start, such as a missing image or no suitable node, or None."""
+    """Return the reason why a pod cannot start, such as a missing image or no suitable node; None if it can start."""
     waiting = (_container_status(pod).get("state") or {}).get("waiting") or {}
     conditions = pod.get("status", {}).get("conditions") or ()
     unscheduled = (one for one in conditions if one["type"] == "PodScheduled" and one["status"] == "False")
@@ -151,7 +151,10 @@ def blocked_reason(pod: Document) -> str | None:
 
 
 def stuck_jobs(jobs: Mapping[str, Document], pods: Iterable[Document]) -> dict[str, str]:
-    """Return the Jobs that no node runs, by name, with the reason: their pods are blocked, or have not been created."""
+    """Return the reason for each Job that no node runs, by the name of the Job.
+
+    The reason is that the pods of the Job are blocked, or have not been created.
+    """
     pods_of = group_pods(pods)
     found: dict[str, str] = {}
     for name, job in jobs.items():
