@@ -64,7 +64,7 @@ class RequestTrace:
     def transaction(self, run: Callable[[Transaction], T], system: str, *, writes: bool) -> TracedTransaction[T]:
         """Return a callable that runs `run` in a transaction, and records the transaction as a span.
 
-        `system` is the kind of database, such as `postgresql`; `writes` tells whether the transaction may write.
+        `system` is the kind of database, such as `postgresql`; `writes` states whether the transaction may write.
         """
         return TracedTransaction(
             self, self._begin(DATABASE_WRITE if writes else DATABASE_READ, {"db.system.name": system}), run

@@ -135,7 +135,7 @@ class ChildTask(Generic[T]):
         self.count_stop(reason, self.function.partition(":")[2])
 
     def fail(self, error: Exception) -> None:
-        """End the task with an error, which whoever waits for its result gets."""
+        """End the task with an error, which is raised where the result is awaited."""
         with suppress(InvalidStateError):
             self.future.set_exception(error)
 
