@@ -66,7 +66,7 @@ class SimulatedJob:
 
 
 @dataclass(frozen=True)
-class Misfortune:
+class FailureRates:
     """Probabilities that an attempt fails at its end, and that its worker dies at a random time of the attempt.
 
     A dead worker is replaced at once, but its job waits for the end of the lease.
@@ -76,7 +76,7 @@ class Misfortune:
     death: float = 0.0
 
 
-LUCKY = Misfortune()
+NO_FAILURES = FailureRates()
 
 
 @dataclass
@@ -119,14 +119,14 @@ def simulate(
     costs: QueueCosts,
     *,
     seed: int = 0,
-    misfortune: Misfortune = LUCKY,
+    failure_rates: FailureRates = NO_FAILURES,
     policy: QueuePolicy = DEFAULT_POLICY,
 ) -> SimulatedRun:
     """Simulate the queue until no event is left; equal arguments give equal results.
 
     `workers` contains the labels of each worker. A job that no worker may run is never started.
     """
-    return _Simulation(jobs, workers, costs, random.Random(seed), misfortune, policy).run()  # noqa: S311 - no secret
+    return _Simulation(jobs, workers, costs, random.Random(seed), failure_rates, policy).run()  # noqa: S311 - no secret
 
 
 class _Simulation:
@@ -136,11 +136,11 @@ class _Simulation:
         workers: Sequence[frozenset[str]],
         costs: QueueCosts,
         draw: random.Random,
-        misfortune: Misfortune,
+        failure_rates: FailureRates,
         policy: QueuePolicy,
     ) -> None:
         self._jobs, self._workers, self._costs, self._draw = jobs, workers, costs, draw
-        self._misfortune = misfortune
+        self._failure_rates = failure_rates
         self._policy = replace(policy, random_unit=draw.random)
         self._now_s = 0.0
         self._events: list[tuple[float, int, Callable[[], None]]] = []
@@ -255,7 +255,7 @@ class _Simulation:
     def _start(self, worker: int, number: int, expires_s: float) -> None:
         history, work_s = self._histories[number], self._jobs[number].work_s
         history.starts_s.append(self._now_s)
-        dies = self._draw.random() < self._misfortune.death
+        dies = self._draw.random() < self._failure_rates.death
         lived_s = work_s * self._draw.random() if dies else work_s
         beats = list(_heartbeats(lived_s, self._policy.heartbeat_s))
         for beat_s in beats:
@@ -268,7 +268,7 @@ class _Simulation:
         self._at(renewed_s, lambda: self._lose(number, counted=bool(beats)))
 
     def _finish(self, worker: int, number: int) -> None:
-        failed = self._draw.random() < self._misfortune.failure
+        failed = self._draw.random() < self._failure_rates.failure
 
         def answered() -> None:
             self._end(number, failed=failed)
