@@ -168,7 +168,7 @@ async def listening(
     try:
         async with keeping_house(app.services), following_feed(app.services), delivering(app.services):
             yield Running(app, address, server)
-            await _part(app.services, connections, linger_s)
+            await _linger(app.services, connections, linger_s)
     finally:
         await _drain(app.services, server, connections)
 
@@ -207,9 +207,9 @@ def accept_connections(app: Application, server: HTTPServer, sockets: Sequence[s
     return connections
 
 
-async def _part(services: Services, connections: Connections, linger_s: float) -> None:
+async def _linger(services: Services, connections: Connections, linger_s: float) -> None:
     """Stop accepting connections; wait until clients have closed all connections, but at most `linger_s` seconds."""
-    services.parting = True
+    services.lingering = True
     connections.stop()
     deadline = time.monotonic() + linger_s
     while len(connections) and time.monotonic() < deadline:

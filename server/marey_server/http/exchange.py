@@ -137,7 +137,7 @@ class Exchange(RequestHandler):
         self.set_status(rendered.status)
         for name, value in rendered.headers.items():
             self.set_header(name, value)
-        if self.services.parting:
+        if self.services.lingering:
             self.set_header("Connection", "close")
         if rendered.status not in (204, 304):
             self.set_header("Content-Length", str(len(rendered.body) if whole_bytes is None else whole_bytes))

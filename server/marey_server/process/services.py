@@ -78,7 +78,7 @@ def _answer_cache(most_bytes: int) -> LruCache[tuple[str, str], bytes]:
 class Services:
     """Shared parts of a server process: database, threads, metrics, and whether the server is draining."""
 
-    parting = False
+    lingering = False
     """True if the process accepts no more connections; then its answers ask clients to close their connections."""
     tracer: Tracer | None
     """Sender of the spans of requests; None if no collector is configured."""
