@@ -287,7 +287,7 @@ async def serve(settings: Settings) -> None:
         showing_metrics(running.app.services, metrics_sockets),
         warming(running.app.services.children) if settings.warm_up else nullcontext(),
     ):
-        settle(running)
+        finish_start(running)
         note_ready()
         await stop.wait()
         note_stopping()
@@ -313,10 +313,11 @@ def stop_event() -> asyncio.Event:
     return stop
 
 
-def settle(running: Running, *, greet: bool = True) -> None:
-    """Print the greeting of a server that accepts connections, and exclude its objects from garbage collection.
+def finish_start(running: Running, *, greet: bool = True) -> None:
+    """Print the greeting of a server that has started, and exclude all objects so far from garbage collection.
 
-    Otherwise, each full garbage collection would examine the objects of all modules, and stop the server for 0.1 s.
+    Nearly all of these objects belong to modules. If a full garbage collection examined them, it would stop the server
+    for 0.1 s each time.
     """
     gc.freeze()
     if greet:

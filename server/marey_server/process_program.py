@@ -20,10 +20,10 @@ with loading_modules():
     from marey_server.app import (
         Running,
         create_app,
+        finish_start,
         listening,
         open_database,
         prepare_process,
-        settle,
         showing_metrics,
         stop_event,
         warming,
@@ -84,7 +84,7 @@ async def serve_together(settings: Settings, order: StartOrder, control: socket.
         workers = await stack.enter_async_context(AsyncExitStack())
         if order.first:
             await workers.enter_async_context(keeping_workers(app.services, running.address))
-        settle(running, greet=order.first)
+        finish_start(running, greet=order.first)
         writer.write(READY)
         if not order.first:
             await _keep_workers_when_told(workers, running, stop, keep_workers)
