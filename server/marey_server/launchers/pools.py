@@ -47,7 +47,7 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     server finds them. Raises `LauncherUnusable` if the launcher does not exist, or its options are invalid.
     """
     settings = services.settings
-    keepers: list[Keeper] = [
+    controllers: list[WorkerController] = [
         PoolKeeper(
             pool,
             _launcher_of(pool, services, address),
@@ -67,20 +67,20 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
         )
         await fixed.start(WorkerRequest(), settings.local_workers, key=FIXED_KEY)
     if settings.own_pods is not None:
-        keepers.append(_dispatcher(services, address))
+        controllers.append(_dispatcher(services, address))
     if (settings.pools or settings.own_pods) and settings.worker_url is None and settings.launcher != "local":
         log.info("workers in pools reach this server at %s; the setting worker_url names another address", address)
-    tasks = [asyncio.create_task(keeper.keep()) for keeper in keepers]
+    tasks = [asyncio.create_task(controller.keep()) for controller in controllers]
     try:
         yield
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await asyncio.gather(*(keeper.close() for keeper in keepers), *([fixed.close()] if fixed else []))
+        await asyncio.gather(*(controller.close() for controller in controllers), *([fixed.close()] if fixed else []))
 
 
-class Keeper(Protocol):
+class WorkerController(Protocol):
     """Interface of a task that starts and stops workers.
 
     There is one for each pool, and one for jobs with their own pods.
@@ -95,11 +95,11 @@ class Keeper(Protocol):
         ...
 
 
-def _dispatcher(services: Services, address: str) -> Keeper:
+def _dispatcher(services: Services, address: str) -> WorkerController:
     """Return the task that starts pods for single jobs. Raises `LauncherUnusable` if its options are invalid."""
     settings = services.settings
     make = _load(EntryPoint("kubernetes", DISPATCHER, ENTRY_POINTS))
-    return cast(Keeper, make(settings, services.database, settings.worker_url or address))
+    return cast(WorkerController, make(settings, services.database, settings.worker_url or address))
 
 
 def find_launcher(name: str) -> MakeLauncher:
