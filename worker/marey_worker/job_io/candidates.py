@@ -20,7 +20,7 @@ from marey_schemas.wording import counted
 from marey_worker.context import Context
 from marey_worker.job_io.evaluated_set import EvaluatedSet
 from marey_worker.job_io.matching_clips import ClipSet, build_clips, read_motions, uid_of
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
 
 class Unusable(NamedTuple):
@@ -87,10 +87,10 @@ def _build(context: Context, group: _Group, database: MatchingDatabase) -> Match
     otherwise, from the joint mapping of the group's skeleton.
     """
     newest = max(map(_skeleton_of, group.motions), key=lambda ref: ref.revision)
-    rigged = read_rigged(context, Rig.as_stored(newest))
+    mapped = read_mapped(context, Rig.as_stored(newest))
     body = database.body
-    if not same_hierarchy(rigged.skeleton, body.skeleton, tolerance_m=SAME_OFFSET_M):
-        body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+    if not same_hierarchy(mapped.skeleton, body.skeleton, tolerance_m=SAME_OFFSET_M):
+        body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
     return build_clips(context, ClipSet(tuple(group.pins)), group.motions, body, database.options, database.normaliser)
 
 

@@ -33,7 +33,7 @@ from marey_schemas.queue.job_params import EvaluateParams
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_schemas.wording import NAMES_SHOWN, counted, first_reason
 from marey_worker.context import Context, JobRefused
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
 MOST_KEPT = 1
 """Greatest number of cached databases; the database of an hour of motion takes a few hundred megabytes."""
@@ -152,8 +152,8 @@ def build_set(
     trim is outside its clip. Raises `MotionError` if the clips cannot be used for motion matching.
     """
     motions = list(read_motions(context, wanted.clips))
-    rigged = read_rigged(context, common_rig(context, wanted, [skeleton_of(motion) for _, motion in motions]))
-    body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+    mapped = read_mapped(context, common_rig(context, wanted, [skeleton_of(motion) for _, motion in motions]))
+    body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
     return build_clips(context, wanted, motions, body, options, normaliser)
 
 

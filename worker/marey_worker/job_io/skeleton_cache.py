@@ -18,7 +18,7 @@ from marey_worker.context import Context
 MOST_KEPT = 512
 
 
-class Rigged(NamedTuple):
+class MappedSkeleton(NamedTuple):
     """Skeleton with its joint mapping and axes."""
 
     skeleton: Skeleton
@@ -38,11 +38,11 @@ class Rig(NamedTuple):
         return cls(ref, ref)
 
 
-_skeletons: LruCache[Rig, Rigged] = LruCache(max_entries=MOST_KEPT)
+_skeletons: LruCache[Rig, MappedSkeleton] = LruCache(max_entries=MOST_KEPT)
 _plans: LruCache[tuple[Rig, Rig, float | None], RetargetPlan] = LruCache(max_entries=MOST_KEPT)
 
 
-def read_rigged(context: Context, rig: Rig) -> Rigged:
+def read_mapped(context: Context, rig: Rig) -> MappedSkeleton:
     """Return a skeleton with its joint mapping, or a guessed mapping if it has none.
 
     Raises `MotionError` if the mapping contradicts the skeleton, or maps too few joints to be trusted.
@@ -59,17 +59,17 @@ def plan_between(context: Context, source: Rig, target: Rig, scale: float | None
     """
 
     def plan() -> RetargetPlan:
-        return plan_retarget(*read_rigged(context, source), *read_rigged(context, target), scale=scale)
+        return plan_retarget(*read_mapped(context, source), *read_mapped(context, target), scale=scale)
 
     return _plans.get_or_make((source, target, scale), plan)
 
 
-def _read(context: Context, rig: Rig) -> Rigged:
+def _read(context: Context, rig: Rig) -> MappedSkeleton:
     hierarchy = context.document(Kind.SKELETON, rig.skeleton.item, rig.skeleton.revision, "hierarchy")
     skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
     stored = context.document(Kind.SKELETON, rig.mapping.item, rig.mapping.revision, "mapping", required=False)
     if stored is None:
         mapping = require_trust(map_joints(skeleton))
-        return Rigged(skeleton, mapping, guess_axes(skeleton, mapping))
+        return MappedSkeleton(skeleton, mapping, guess_axes(skeleton, mapping))
     mapping, axes = documents.mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)
-    return Rigged(skeleton, require_trust(mapping), axes)
+    return MappedSkeleton(skeleton, require_trust(mapping), axes)

@@ -31,7 +31,7 @@ from marey_worker.job_io.chosen_metric import read_metric
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import require_different
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 from marey_worker.job_io.staged_results import StagedResults
 
 MIRRORED_NAME = " mirrored"
@@ -79,8 +79,8 @@ class _Job:
         clips = self._of_one_skeleton(list(self._read()))
         rig = self._rig(clips)
         with refusing_motion_errors():
-            rigged = read_rigged(self._context, rig)
-            body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+            mapped = read_mapped(self._context, rig)
+            body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
             examples = list(self._examples(clips, body))
             self._require_examples(examples, clips)
             aligned = align_clips(

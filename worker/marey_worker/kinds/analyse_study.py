@@ -36,7 +36,7 @@ from marey_schemas.studies.conducting import JudgingParticipant
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import store_document, store_file
 from marey_worker.job_io.matching_clips import refusing_motion_errors
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 from marey_worker.job_io.stored_reports import inputs_of
 
 
@@ -110,9 +110,9 @@ def _measured(context: Context, study: StudyDocument) -> tuple[list[PairDifferen
 def _measure(context: Context, ref: RevisionRef) -> MeasuredClip:
     document = MotionDocument.model_validate(context.document(Kind.CLIP, ref.item, ref.revision, "motion"))
     info = context.document(Kind.CLIP, ref.item, ref.revision, "info", required=False) or {}
-    rigged = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(document.skeleton.model_dump())))
-    body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
-    clip = documents.clip_from_document(document, rigged.skeleton)
+    mapped = read_mapped(context, Rig.as_stored(RevisionRef.model_validate(document.skeleton.model_dump())))
+    body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
+    clip = documents.clip_from_document(document, mapped.skeleton)
     _, measured = measure_clip(clip, body, METRIC_RATE_HZ, loop=LOOP_TAG in info.get("tags", ()))
     return measured
 

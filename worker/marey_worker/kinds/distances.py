@@ -40,7 +40,7 @@ from marey_worker.job_io.matching_clips import (
     skeleton_of,
 )
 from marey_worker.job_io.refusals import Refusals
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 from marey_worker.job_io.stored_reports import inputs_of, stored_figure
 
 Prepared = dict[int, ComparableClip]
@@ -168,14 +168,14 @@ def _prepare(
 
     Return the measured clips, and the refusals of clips that cannot be compared, both by the position of the clip.
     """
-    rigged = read_rigged(context, rig)
-    body, metric = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping), metric_of(document)
+    mapped = read_mapped(context, rig)
+    body, metric = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping), metric_of(document)
     prepared, refused = Prepared(), dict[int, dict[str, str]]()
     infos = context.documents([pin for pin, _ in motions.values()], "info", required=False)
     for done, ((number, (pin, motion)), (_, info)) in enumerate(zip(motions.items(), infos, strict=True)):
         context.progress(done, len(motions), f"measuring {pin.name}")
         try:
-            clip = documents.clip_from_document(motion, rigged.skeleton)
+            clip = documents.clip_from_document(motion, mapped.skeleton)
             loop = is_loop(pin, info, params.loops)
             prepared[number] = prepare_comparison(
                 clip, body, metric, document.frame_rate_hz, name=pin.path, cycles=params.cycles, loop=loop

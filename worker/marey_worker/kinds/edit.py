@@ -25,7 +25,7 @@ from marey_schemas.wording import first_reason
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 from marey_worker.job_io.staged_results import StagedResults
 
 
@@ -159,7 +159,7 @@ class _Editing:
             rig = Rig(used, mapping)
 
             def find_mapping(_skeleton: Skeleton) -> Any:
-                return read_rigged(self._context, rig).mapping
+                return read_mapped(self._context, rig).mapping
 
             self._bodies[used] = EditedBody(skeleton, find_mapping)
         return self._bodies[used]

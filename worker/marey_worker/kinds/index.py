@@ -37,7 +37,7 @@ from marey_schemas.queue.job_params import IndexParams
 from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
 KEPT_SHARE = 0.5
 """Least share of a full shard whose poses are still needed; the poses of shards with less are copied to new shards."""
@@ -167,8 +167,8 @@ def _add_clips(context: Context, writer: _Writer, pins: Sequence[PinnedInput]) -
         context.progress(done, len(pins), f"clip {done + 1} of {len(pins)}, {pin.name}")
         motion = MotionDocument.model_validate(tree)
         try:
-            rigged = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(motion.skeleton.model_dump())))
-            body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+            mapped = read_mapped(context, Rig.as_stored(RevisionRef.model_validate(motion.skeleton.model_dump())))
+            body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
             clip = documents.clip_from_document(motion, body.skeleton)
             features = clip_features(Motion.of(clip), body, clip.frame_rate_hz)
         except MotionError as error:

@@ -38,7 +38,7 @@ from marey_schemas.wording import counted
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import store_document, store_file
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
-from marey_worker.job_io.skeleton_cache import Rig, Rigged, read_rigged
+from marey_worker.job_io.skeleton_cache import MappedSkeleton, Rig, read_mapped
 from marey_worker.job_io.stored_reports import inputs_of, stored_figure
 
 
@@ -117,8 +117,8 @@ class _Measuring:
 
     def _measured(self, pin: PinnedInput, tree: Any, info: Mapping[str, Any] | None) -> tuple[QualityRow, ClipQuality]:
         motion = MotionDocument.model_validate(present(pin, tree))
-        rigged, body = self._body(motion)
-        clip = documents.clip_from_document(motion, rigged.skeleton)
+        mapped, body = self._body(motion)
+        clip = documents.clip_from_document(motion, mapped.skeleton)
         quality = measure_quality(clip, body, self._options, self._contacts_of(pin, clip.frame_count))
         row = QualityRow(
             item=pin.item,
@@ -155,14 +155,14 @@ class _Measuring:
             labelled[segment.start : segment.end] |= CONTACT_LABELS[segment.label]
         return labelled
 
-    def _body(self, motion: MotionDocument) -> tuple[Rigged, QualityBody]:
+    def _body(self, motion: MotionDocument) -> tuple[MappedSkeleton, QualityBody]:
         used = RevisionRef.model_validate(motion.skeleton.model_dump())
         edited = self._rigs.get(used.item)
         rig = Rig(used, edited.ref if edited else used)
-        rigged = read_rigged(self._context, rig)
+        mapped = read_mapped(self._context, rig)
         if rig not in self._bodies:
-            self._bodies[rig] = QualityBody.of(rigged.skeleton, rigged.mapping, rigged.axes)
-        return rigged, self._bodies[rig]
+            self._bodies[rig] = QualityBody.of(mapped.skeleton, mapped.mapping, mapped.axes)
+        return mapped, self._bodies[rig]
 
 
 def _read_contacts(context: Context) -> dict[tuple[str, int], list[SegmentDocument]] | None:

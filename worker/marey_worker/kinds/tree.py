@@ -17,7 +17,7 @@ from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
 
 def run(context: Context, params: TreeParams) -> dict[str, Any]:
@@ -35,7 +35,7 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
     model = context.document(Kind.MODEL, pin.item, pin.revision, "model")
     options = TreeOptions.of(params)
     with refusing_motion_errors():
-        skeleton, mapping, _axes = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(model["skeleton"])))
+        skeleton, mapping, _axes = read_mapped(context, Rig.as_stored(RevisionRef.model_validate(model["skeleton"])))
         primitive = primitive_from_tree(model, skeleton)
         known = [name for name in END_EFFECTORS if name in mapping.joints]
         context.progress(1, 2, "grouping samples")
