@@ -52,7 +52,7 @@ ADVANCE_COVERAGE = "marey_server.motions.coverage:advance_coverage"
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class StreamInputs:
     """References and documents that a request for a new stream names.
 
     `skeleton` and `evaluation` are references to revisions (item and revision). `rig` is the encoded skeleton with its
@@ -74,9 +74,9 @@ class BeginOrder(Message):
     evaluation: Tree | None
     measured: bytes | None
 
-    def given(self) -> Given:
+    def inputs(self) -> StreamInputs:
         """Return the references and documents in the message, with the decoded document of the evaluation."""
-        return Given(
+        return StreamInputs(
             self.skeleton, self.rig, self.evaluation, None if self.measured is None else unpack_tree(self.measured)
         )
 
@@ -118,7 +118,7 @@ class AdvancedStream(Message):
     state: bytes
 
 
-def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
+def read_stream_inputs(tx: Transaction, project: str, request: CoverageStreamCreate) -> StreamInputs:
     """Return the references and documents that a request for a new stream names.
 
     Raises `NotFoundProblem` if the skeleton or the evaluation does not exist.
@@ -134,7 +134,7 @@ def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> 
         part = items.read_part(tx, project, Kind.EVALUATION, request.evaluation, "evaluation")
         evaluation = {"item": request.evaluation, "revision": part.revision}
         measured = part.tree
-    return Given(skeleton, rig, evaluation, measured)
+    return StreamInputs(skeleton, rig, evaluation, measured)
 
 
 def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tree | None:
@@ -144,14 +144,14 @@ def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tre
         return None
 
 
-def begin_order(request: CoverageStreamCreate, given: Given) -> bytes:
+def begin_order(request: CoverageStreamCreate, inputs: StreamInputs) -> bytes:
     """Return the packed message that asks a child process to start a stream."""
     return BeginOrder(
         request=request,
-        skeleton=given.skeleton,
-        rig=given.rig,
-        evaluation=given.evaluation,
-        measured=None if given.measured is None else pack_tree(given.measured),
+        skeleton=inputs.skeleton,
+        rig=inputs.rig,
+        evaluation=inputs.evaluation,
+        measured=None if inputs.measured is None else pack_tree(inputs.measured),
     ).pack()
 
 
@@ -196,7 +196,7 @@ def _digest_of(frames: CoverageFrames) -> str:
 def begin_coverage(packed: bytes) -> bytes:
     """Start a stream, in a child process. `packed` is a `BeginOrder`, and the result a `BegunStream`, both as bytes."""
     order = BeginOrder.unpack(packed)
-    return begin(order.request, order.given()).pack()
+    return begin(order.request, order.inputs()).pack()
 
 
 def look_at_coverage(packed: bytes) -> bytes:
@@ -217,7 +217,7 @@ def advance_coverage(packed: bytes) -> bytes:
     return advance(order, CoverageFrames.model_validate(unpack_tree(order.frames or b""))).pack()
 
 
-def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
+def begin(request: CoverageStreamCreate, inputs: StreamInputs) -> BegunStream:
     """Start a coverage stream, and return its state. Raises `InvalidProblem` if the skeleton cannot be used."""
     from marey_motion.evaluation.online import OnlineCoverage
     from marey_schemas.options.evaluation import COVERAGE_LEAST_S, Grid
@@ -225,19 +225,19 @@ def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
     asked = request.model_dump(include={"speeds_m_s", "turn_rates_deg_s"}, exclude_none=True)
     grid = Grid(**asked)
     least_s, seconds = request.least_s or COVERAGE_LEAST_S, None
-    if given.evaluation is not None:
+    if inputs.evaluation is not None:
         with refusing("evaluation"):
-            found = MeasuredCoverage.model_validate(given.measured)
+            found = MeasuredCoverage.model_validate(inputs.measured)
         grid = found.options.grid
         least_s, seconds = found.options.coverage_least_s, found.coverage.seconds
     with refusing("evaluation"):  # a grid that the request gives has been checked
         online = OnlineCoverage(request.frame_rate_hz, grid, least_s=least_s, seconds=seconds)
     with refusing("skeleton"):
-        _load_kernels(None if given.rig is None else body_of(given.rig))
+        _load_kernels(None if inputs.rig is None else body_of(inputs.rig))
     settings = {
         "frame_rate_hz": request.frame_rate_hz,
-        "skeleton": given.skeleton,
-        "evaluation": given.evaluation,
+        "skeleton": inputs.skeleton,
+        "evaluation": inputs.evaluation,
         "speeds_m_s": np.unique(grid.speeds_m_s).tolist(),
         "turn_rates_deg_s": np.unique(grid.turn_rates_deg_s).tolist(),
         "least_s": least_s,
