@@ -224,7 +224,7 @@ class RunningAttempt:
         if sent and time.monotonic() > self._log_due:
             self._log_sending = self._log_sender.submit(self._try_to_send_log)
             self._log_due = time.monotonic() + LOG_EVERY_S
-        return self._watch.verdict(child)
+        return self._watch.reason_to_stop(child)
 
     def _serve(self, request: Request, child: ChildProcess) -> None:
         """Carry out one request of the child in a separate thread, and answer it."""

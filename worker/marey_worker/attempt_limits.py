@@ -75,7 +75,7 @@ class Watch:
     started: float
     weighed: float = 0.0
 
-    def verdict(self, child: ChildProcess | None) -> Stop | None:
+    def reason_to_stop(self, child: ChildProcess | None) -> Stop | None:
         """Return the reason to stop the attempt now, or None if there is none.
 
         `child` is the child process that computes, or None after it has computed all results.
