@@ -87,7 +87,7 @@ async def serve_together(settings: Settings, order: StartOrder, control: socket.
         finish_start(running, greet=order.first)
         writer.write(READY)
         if not order.first:
-            await _keep_workers_when_told(workers, running, stop, keep_workers)
+            await _run_workers_when_asked(workers, running, stop, keep_workers)
         await stop.wait()
         log.info("server process %d is stopping", os.getpid())
     following.cancel()
@@ -115,10 +115,10 @@ async def _follow(reader: asyncio.StreamReader, stop: asyncio.Event, keep_worker
     stop.set()
 
 
-async def _keep_workers_when_told(
+async def _run_workers_when_asked(
     workers: AsyncExitStack, running: Running, stop: asyncio.Event, keep_workers: asyncio.Event
 ) -> None:
-    """Wait until the parent lets this process run the workers, or until the process must stop."""
+    """Wait until the parent asks this process to run the workers, and run them; return if the process must stop before."""
     waiting = [asyncio.create_task(event.wait()) for event in (stop, keep_workers)]
     await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
     for task in waiting:
