@@ -64,7 +64,7 @@ class Endpoints:
     """True if the provider always sends its issuer (parameter `iss`, RFC 9207) when it sends a browser back."""
 
 
-class Remembered(Generic[T]):
+class CachedDocument(Generic[T]):
     """Cached document of the provider, read when it is first needed. Concurrent requests cause a single read."""
 
     def __init__(self, load: Callable[[], Awaitable[T]]) -> None:
@@ -104,8 +104,8 @@ class IdentityProvider:
         assert settings.oidc_issuer is not None
         self.issuer = settings.oidc_issuer
         self._settings = settings
-        self._endpoints = Remembered(self._discover)
-        self._keys = Remembered(self._fetch_keys)
+        self._endpoints = CachedDocument(self._discover)
+        self._keys = CachedDocument(self._fetch_keys)
         self._places = asyncio.Semaphore(MOST_AT_ONCE)
 
     @property
