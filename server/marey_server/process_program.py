@@ -118,7 +118,10 @@ async def _follow(reader: asyncio.StreamReader, stop: asyncio.Event, keep_worker
 async def _run_workers_when_asked(
     workers: AsyncExitStack, running: Running, stop: asyncio.Event, keep_workers: asyncio.Event
 ) -> None:
-    """Wait until the parent asks this process to run the workers, and run them; return if the process must stop before."""
+    """Wait until the parent asks this process to run the workers, and then run them.
+
+    Return without running them if the process must stop first.
+    """
     waiting = [asyncio.create_task(event.wait()) for event in (stop, keep_workers)]
     await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
     for task in waiting:

@@ -163,7 +163,7 @@ def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> 
     return PreparedImport(name, tuple(sources), drafts, found.checks, found.frames, graph=graph, axis=found.axis)
 
 
-class PutAside:
+class UnclearFiles:
     """Files of an import that do not clearly show which axis points up.
 
     They wait until all other files have been read, because another file with the same skeleton may show the axis.
