@@ -165,7 +165,7 @@ class Supervisor:
         return _OpenClaim(self._claims.with_present_token(), uuid.uuid4().hex)
 
     def _claim(self, opened: _OpenClaim) -> tuple[Lease, ...]:
-        """Claim a job, and return its lease; return nothing if there is no job for this worker.
+        """Claim a job; return its lease, or an empty tuple if there is no job for this worker.
 
         If the answer to an earlier claim was lost, the same id is sent again, and the server returns the same job.
         """

@@ -143,7 +143,7 @@ class _Connection(IOStream):
         return super().read_until(delimiter, max_bytes)
 
     def read_bytes(self, num_bytes: int, partial: bool = False) -> Awaitable[bytes]:
-        """Read at most `num_bytes` bytes of a body."""
+        """Read `num_bytes` bytes of a body, or fewer if `partial` is true."""
         self._reads_head = False
         return super().read_bytes(num_bytes, partial)
 

@@ -54,7 +54,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Addresses in the discovery document of a provider, and the ways in which it expects and sends values."""
+    """Facts from the discovery document of a provider.
+
+    `authorization`, `token` and `keys` are addresses. `secret_in_body` is true if the server must send its client
+    secret in the body of a request and not in a header.
+    """
 
     authorization: str
     token: str

@@ -127,7 +127,7 @@ class OperatorMetrics(Observer):
         self.database_bytes.set(figures.database_bytes)
 
     def count_ended(self, state: str, reason: str | None) -> None:
-        """Count a job that has ended in the state `state`; `reason` is the code of its failure, if any."""
+        """Count a job that has ended in the state `state`; `reason` is the reason of its failure, if it has failed."""
         self.jobs_ended.labels(state, reason or "none").inc()
 
     def count_requeued(self, outcome: str) -> None:

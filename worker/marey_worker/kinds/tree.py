@@ -24,7 +24,7 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
     """Build a search tree over samples of a model, and stage it as a part of the model; other parts are unchanged.
 
     Raises `JobRefused` if the tree cannot be built, if the model was moved or renamed while the job waited, or if the
-    job names a folder or name for the result that is not that of the model.
+    job names a folder for the result, because the result is stored with the model.
     """
     started = time.monotonic()
     (pin,) = context.inputs["model"]

@@ -168,7 +168,10 @@ def _take_precedence() -> None:
 
 
 def _die_with_parent() -> None:
-    """Let the kernel kill this process when its parent ends. This also works across namespaces of processes."""
+    """Let the kernel kill this process when its parent ends.
+
+    Unlike `die_with_parent`, this works in a new namespace of processes, in which the parent has no process id.
+    """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 

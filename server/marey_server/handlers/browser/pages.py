@@ -130,8 +130,8 @@ class ViewQuery(AnyQuery):
     """Parameters in the address of the page that shows clips."""
 
     clip: str | None = Field(None, description="The clip: `project/item`, or `project/item@revision`.")
-    beside: str | None = Field(None, description="Another clip, to be shown on the same clock.")
-    frame: str | None = Field(None, description="Number of the frame of the clip to begin with, from 0.")
+    beside: str | None = Field(None, description="Second clip, which is shown with the first one at the same time.")
+    frame: str | None = Field(None, description="Frame of the first clip to begin with, counted from 0.")
     camera: str | None = Field(
         None, description="Yaw and pitch of the camera in degrees, and its distance in body heights, as in `35,12,2.6`."
     )

@@ -219,7 +219,7 @@ def _lister(api: client.ApiClient, kind: Kind) -> Callable[..., Awaitable[aiohtt
 
 
 async def _problem(response: aiohttp.ClientResponse) -> Manifest:
-    """Return the JSON document in the cluster's answer to a failed request, or the answer's text if it is no JSON."""
+    """Return the JSON document in the cluster's answer to a failed request, or else one with the answer's text."""
     text = await response.text(errors="replace")
     try:
         found = json.loads(text)
