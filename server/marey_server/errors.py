@@ -102,7 +102,7 @@ class MethodNotAllowedProblem(ApiProblem):
 
 
 class NotAcceptableProblem(ApiProblem):
-    """No offered media type is accepted."""
+    """The header Accept allows none of the media types of this resource."""
 
     status = 406
     code = "not-acceptable"

@@ -33,7 +33,7 @@ class AuditQuery(PageQuery):
 
     @property
     def filter(self) -> AuditFilter:
-        """The filter for the store."""
+        """The query parameters as the `AuditFilter` by which the store selects entries."""
         return AuditFilter(self.kind, self.actor, self.subject, self.since, self.until)
 
 

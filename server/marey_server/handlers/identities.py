@@ -189,7 +189,7 @@ class CallbackQuery(Request):
 
 
 class SignInCallback(BrowserResource):
-    """Return of a browser from the identity provider."""
+    """Address to which the identity provider sends a browser back."""
 
     path = CALLBACK_PATH
     tag = "Access"

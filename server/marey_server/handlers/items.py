@@ -62,7 +62,7 @@ class ItemsQuery(CountedPageQuery):
     fields: CommaSeparated | None = Field(None, description="Members of each item to return; absent: all.")
 
     def filters(self) -> ItemFilters:
-        """Return the filters for the store."""
+        """Convert the query parameters to the `ItemFilters` by which the store selects items."""
         return ItemFilters(
             collection=self.collection,
             directly_in=self.directly_in,

@@ -36,7 +36,7 @@ class SampleQuery(Request):
 
 
 class SampleFileQuery(SampleQuery):
-    """Query parameters of samples that are sent as files: as in `SampleQuery`, and the file format and unit."""
+    """Query parameters of samples that are sent as files: those of `SampleQuery`, the file format, and its unit."""
 
     format: MotionFormat = Field(
         DEFAULT_FORMAT, description="File format; several files are returned in one ZIP archive."

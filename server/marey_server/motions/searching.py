@@ -64,7 +64,7 @@ class SearchedModels(Message):
 
 @dataclass(frozen=True, slots=True)
 class LoadedSearchable:
-    """Documents of a model that can be searched."""
+    """Documents of a model to be searched, with its search tree and joint mapping, if they exist."""
 
     model: LoadedModel
     tree: dict[str, Any] | None

@@ -80,7 +80,7 @@ class _FeedPosition:
     async def announce_news(self) -> None:
         """Wake the requests that wait for an event that was recorded after the last call.
 
-        Also wake the workers that wait for jobs of a kind of which a retry has become due.
+        Also wake the workers that wait for a kind of job, if a retry of such a job has become due.
         """
         await self._services.number_events()
         if self._last is None:
@@ -94,7 +94,7 @@ class _FeedPosition:
         await self._announce_due()
 
     async def _announce_due(self) -> None:
-        """Wake the workers that wait for jobs of a kind of which a retry has become due.
+        """Wake the workers that wait for a kind of job, if a retry of such a job has become due.
 
         Finding due retries reads the whole queue, so this is done at most every `LOOK_EVERY_S` seconds.
         """

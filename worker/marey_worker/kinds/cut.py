@@ -102,9 +102,10 @@ class _Cutting:
     def _clip_of(self, clip: RevisionRef) -> Item | PinnedInput:
         """Return the annotated clip with its name and folder.
 
-        Without an input `clips`, these are the present ones; `NoSuchThing` is raised if the clip does not exist. With
-        an input `clips`, they are those at the time of submission: results are cached for jobs with the same inputs, so
-        later changes must not affect the results. Then `MotionError` is raised if the clip is not among the inputs.
+        Without an input `clips`, the clip has its present name and folder; `NoSuchThing` is raised if it does not
+        exist. With an input `clips`, the clip has the name and folder that it had at the time of submission, because
+        results are cached for jobs with the same inputs. Then `MotionError` is raised if the clip is not among the
+        inputs.
         """
         if not self._clips:
             return self._context.item(Kind.CLIP, clip.item)

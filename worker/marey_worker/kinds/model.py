@@ -89,7 +89,7 @@ def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[MotionDoc
 def _common_skeleton(pins: Sequence[PinnedInput], motions: Sequence[MotionDocument]) -> RevisionRef:
     """Return the skeleton that all clips have, at the newest revision in use.
 
-    Raises `JobRefused` if there are several.
+    Raises `JobRefused` if the clips have several skeletons.
     """
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for motion in motions]
     for pin, ref in zip(pins, used, strict=True):

@@ -72,8 +72,8 @@ class GuardedCommand:
 class CommandEnd:
     """End of a command: its exit status (128 plus the number of a signal), or the reason why the guard stopped it.
 
-    `tail` is the end of its output. `isolated` states whether the command had namespaces of its own, and `bounded`
-    whether the kernel limited the number of its processes.
+    `tail` is the last part of the command's output. `isolated` states whether the command had namespaces of its own,
+    and `bounded` whether the kernel limited the number of its processes.
     """
 
     status: int | None

@@ -96,7 +96,7 @@ class JobsQuery(CountedPageQuery):
     )
 
     def filters(self) -> JobFilters:
-        """Return the filters for the store."""
+        """Convert the query parameters to the `JobFilters` by which the store selects jobs."""
         return JobFilters(self.state, self.kind, self.parent, self.author)
 
 

@@ -1,4 +1,4 @@
-"""Documents of the objects that run workers: Job, Secret of its token, and the Deployment of a fixed pool."""
+"""Manifests of the objects that run workers: a Job, the Secret with its token, and a Deployment of a fixed pool."""
 
 from __future__ import annotations
 
