@@ -44,8 +44,8 @@ class RequestTrace:
     def place(self, principal: Principal | None) -> TraceContext:
         """Return the trace context of the request.
 
-        The first call decides whether the request continues the trace that `principal` has sent. So it must be made
-        when the caller is known, or at the end of the request.
+        The first call decides whether the request continues the trace that `principal` has sent. So the first call
+        must be made when the caller is known, or at the end of the request.
         """
         if self._place is None:
             known = principal is not None and principal.kind != "anonymous"

@@ -145,7 +145,7 @@ def found_annotation(answer: bytes) -> dict[str, PreparedDocument]:
 
 
 def read_annotation(order: bytes) -> bytes:
-    """Read the file of an annotation, in a child process. `packed` is an `AnnotationOrder` as bytes.
+    """Read the file of an annotation, in a child process. `order` is an `AnnotationOrder` as bytes.
 
     Return the part `annotation` as bytes. Raises `InvalidProblem` if the file is not a valid annotation of the clip.
     """

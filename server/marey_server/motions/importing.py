@@ -102,7 +102,7 @@ def plan(names: Sequence[str]) -> tuple[list[PlannedFile], list[int]]:
 def planned_entry(planned: PlannedFile) -> PreparedImport | None:
     """Return the entry in the answer for a file that needs no order of its own, or None if the file is to be read.
 
-    The first are files that are read together with another file, and files whose names are refused.
+    Files that are read together with another file need no order, and neither do files whose names are refused.
     """
     with LOADING:
         from marey_motion.importing.files import planned_entry

@@ -169,7 +169,7 @@ def load_kernels() -> None:
 
 
 def read_file(order: bytes) -> bytes:
-    """Read a file, in a child process. `packed` is a `FileOrder`, and the result a `ReadFile`, both as bytes.
+    """Read a file, in a child process. `order` is a `FileOrder`, and the result a `ReadFile`, both as bytes.
 
     Raises `InvalidProblem` if a document of the file cannot be stored.
     """
@@ -185,7 +185,7 @@ def read_file(order: bytes) -> bytes:
 
 
 def find_mapping(order: bytes) -> bytes:
-    """Find the joint mapping and the axes of a skeleton, in a child process. `packed` is a `MappingOrder` as bytes.
+    """Find the joint mapping and the axes of a skeleton, in a child process. `order` is a `MappingOrder` as bytes.
 
     Return the part `mapping` as a `ReadDocument`, as bytes.
     """

@@ -254,7 +254,7 @@ class Children:
     # -- the thread of one child --
 
     def _work(self, number: int) -> None:
-        """Run tasks in one child until the pool is closed; replace a child that has ended at once."""
+        """Run tasks in one child until the pool is closed. A child that has ended is replaced at once."""
         child, orders = self._started(), 0
         while (task := self._next_task(number)) is not None:
             if child is None or not child.alive:

@@ -146,7 +146,7 @@ class _Cutting:
             )
 
     def _why_nothing(self, todo: Sequence[_AnnotatedClip]) -> str:
-        """Return the reason why no segment is cut out, without annotations that were refused."""
+        """Return the reason why no segment is cut out. The text does not mention refused annotations."""
         if not todo:
             layer = self._params.layer
             return "no annotation can be used" if layer is None else f"no annotation of the layer {layer!r} can be used"

@@ -55,7 +55,7 @@ class PodPlace:
 
 
 def own_pod_labels(options: ClusterOptions) -> dict[str, str]:
-    """Return the labels that all Kubernetes Jobs with a queue job of their own have."""
+    """Return the labels of all Kubernetes Jobs that run one job of the queue."""
     return job_labels(OWN_PODS, options)
 
 
