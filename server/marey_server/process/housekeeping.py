@@ -206,7 +206,7 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 
 
 async def _forget_tries(services: Services, holder: str) -> None:
-    """Delete expired counts of sign-in attempts, and browser sign-ins that were not completed in time.
+    """Delete expired counts of tries to sign in, and browser sign-ins that were not completed in time.
 
     The deletion takes little time, because there are few rows: each sign-in adds three rows, and passwords are hashed
     one by one.
