@@ -20,7 +20,7 @@ from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import BadRequestProblem, ForbiddenProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Access, Operation
-from marey_server.http.reply import AnswerCache, AnswerForm, Loaded, Rendered, Reply, render, settle
+from marey_server.http.reply import AnswerCache, AnswerForm, LoadedDocument, Rendered, Reply, load_content, render
 from marey_server.store import idempotency, projects
 from marey_server.store.credentials import tokens
 from marey_server.store.idempotency import StoredAnswer
@@ -212,8 +212,8 @@ def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
         stored = idempotency.begin(tx, idempotent.key, idempotent.fingerprint)
         if stored is not None:
             return _repeated(tx, call.caller, idempotent, stored)
-    reply = settle(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
-    if isinstance(reply.content, Loaded):
+    reply = load_content(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
+    if isinstance(reply.content, LoadedDocument):
         return reply
     rendered = render(reply, call.form, call.answers)
     if idempotent is not None:

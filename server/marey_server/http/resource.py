@@ -58,7 +58,7 @@ from marey_server.http.declarations import Access, Bytes, Declared, Document, Op
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.receiving import PauseLimit
-from marey_server.http.reply import AnswerForm, Loaded, Rendered, Reply, render
+from marey_server.http.reply import AnswerForm, LoadedDocument, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
 from marey_server.store.transaction import Transaction
 
@@ -144,7 +144,7 @@ class Resource(CallingExchange):
         Until the document is rendered, its memory counts towards the limits on the memory of requests.
         """
         rendering, answers = self.services.compute_threads.rendering, self.services.answers
-        loaded_bytes = reply.content.size_bytes if isinstance(reply.content, Loaded) else 0
+        loaded_bytes = reply.content.size_bytes if isinstance(reply.content, LoadedDocument) else 0
         self.holding.grow(loaded_bytes)
         rendered = await asyncio.wrap_future(rendering.submit(self.client, render, reply, self.answer_form, answers))
         self.holding.shrink(loaded_bytes)
