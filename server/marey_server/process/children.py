@@ -329,10 +329,10 @@ class Children:
         finally:
             timer.cancel()
             task.assign(None)
-        self._settle(task, outcome)
+        self._report_outcome(task, outcome)
         return not task.stopped and not outcome.out_of_memory
 
-    def _settle(self, task: ChildTask[Any], outcome: ChildAnswer) -> None:
+    def _report_outcome(self, task: ChildTask[Any], outcome: ChildAnswer) -> None:
         if outcome.out_of_memory:
             task.count_end("memory")
             task.fail(self._too_much_memory())
