@@ -201,7 +201,7 @@ class RunningAttempt:
                 data = child.receive(WATCH_EVERY_S)
                 message = None if data is None else unpack(data)
             except EOFError:
-                return self._death(child)
+                return self._end_of_child(child)
             except (BadMessage, OSError) as error:
                 child.kill(grace_s=0.0)
                 return Failed("bad-message", str(error), "bad-message", retryable=True)
@@ -295,7 +295,7 @@ class RunningAttempt:
         """
         return f"{self._server} {self._lease.project} {name}"
 
-    def _death(self, child: ChildProcess) -> Failed | Stop:
+    def _end_of_child(self, child: ChildProcess) -> Failed | Stop:
         status = child.wait()
         # An engine such as Slurm sends SIGTERM to all processes of a worker at once; the child may end first.
         if status == -signal.SIGTERM and self._watch.stopping.wait(STOPPING_S):
