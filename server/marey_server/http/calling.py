@@ -90,8 +90,8 @@ class CallingExchange(Exchange):
         with suppress(UnauthenticatedProblem):
             token = bearer_token(self.request.headers.get("Authorization"))
         if token is not None and (key := self.services.client_key(token)) is not None:
-            return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.departure)
-        return Client(limited_address(self.client_address), known=False, is_gone=self.departure)
+            return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.client_gone)
+        return Client(limited_address(self.client_address), known=False, is_gone=self.client_gone)
 
     def log_exception(self, typ: Any, value: Any, tb: Any) -> None:  # noqa: ARG002
         """Log an internal error with its traceback; errors that refuse a request (`ApiProblem`) are not logged."""
@@ -126,7 +126,7 @@ class CallingExchange(Exchange):
         `make()` returns the argument of the function as bytes; `read` converts the returned bytes to the result. If the
         client closes the connection, the child is killed and `ClientGoneProblem` is raised.
         """
-        if self.departure.gone:
+        if self.client_gone.value:
             raise ClientGoneProblem(CLIENT_GONE)
         count_stop = self.services.metrics.count_stopped_child
         task = self.services.children.submit(self._child_user, function, make, read, count_stop)
@@ -137,7 +137,7 @@ class CallingExchange(Exchange):
             return await asyncio.wrap_future(task.future)
         except asyncio.CancelledError:
             task.abandon()
-            if self.departure.gone:
+            if self.client_gone.value:
                 raise ClientGoneProblem(CLIENT_GONE) from None
             raise
         finally:

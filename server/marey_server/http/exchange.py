@@ -51,17 +51,17 @@ _SECURITY_HEADERS = {
 log = logging.getLogger(__name__)
 
 
-class Departure:
-    """Function without arguments that returns whether the client of a request has closed the connection.
+class ClientGone:
+    """Whether the client of a request has closed the connection; also a function that returns this.
 
     The request refers to this object, but this object does not refer to the request. Otherwise, the two would form a
     reference cycle, which only the garbage collector frees.
     """
 
-    gone = False
+    value = False
 
     def __call__(self) -> bool:
-        return self.gone
+        return self.value
 
 
 class Exchange(RequestHandler):
@@ -79,7 +79,7 @@ class Exchange(RequestHandler):
         self.received_bytes = 0
         self.problem_code: str | None = None
         self.refused = self.performing = False
-        self.departure = Departure()
+        self.client_gone = ClientGone()
 
     def _begin_trace(self) -> RequestTrace | None:
         tracer = self.services.tracer
@@ -177,7 +177,7 @@ class Exchange(RequestHandler):
 
     def is_awaited(self) -> bool:
         """Return whether the client is still connected and the server is not stopping."""
-        return not self.departure.gone and not self.services.draining.is_set()
+        return not self.client_gone.value and not self.services.draining.is_set()
 
     async def pause(self, seconds: float) -> bool:
         """Wait for `seconds` and return False, or return True as soon as the server is stopping."""
@@ -253,7 +253,7 @@ class Exchange(RequestHandler):
     def on_connection_close(self) -> None:
         """Record that the client has closed the connection."""
         super().on_connection_close()
-        self.departure.gone = True
+        self.client_gone.value = True
         if not self.performing:  # a method that runs ends by itself, and a draining server waits for it
             self.services.in_flight.discard(self)
 
