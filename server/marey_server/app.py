@@ -45,7 +45,7 @@ from marey_server.process.children import Children
 from marey_server.process.computing import compute_on_one_thread_each
 from marey_server.process.data_folder import BLOB_FOLDER, prepare_data_folder
 from marey_server.process.feed import following_feed
-from marey_server.process.housekeeping import keeping_house
+from marey_server.process.housekeeping import running_housekeeping
 from marey_server.process.notices import note_ready, note_stopping
 from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Services
@@ -166,7 +166,7 @@ async def listening(
     connections = accept_connections(app, server, sockets)
     address = address_of(sockets)
     try:
-        async with keeping_house(app.services), following_feed(app.services), delivering(app.services):
+        async with running_housekeeping(app.services), following_feed(app.services), delivering(app.services):
             yield Running(app, address, server)
             await _linger(app.services, connections, linger_s)
     finally:

@@ -52,7 +52,7 @@ FIRST_GARBAGE_S = 60.0
 
 
 @asynccontextmanager
-async def keeping_house(services: Services) -> AsyncIterator[None]:
+async def running_housekeeping(services: Services) -> AsyncIterator[None]:
     """Run the periodic work while the `async with` block runs; then end the leadership of this process."""
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
