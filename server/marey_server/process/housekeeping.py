@@ -59,7 +59,7 @@ async def running_housekeeping(services: Services) -> AsyncIterator[None]:
     merges = WaitingMerges(services.database)
     with wakeups.listen([OUTPUTS_TO_COMMIT]) as listener:  # all the time, so that no job is missed during a commit
         chores = (
-            (tick_s, tick_s, _reap),
+            (tick_s, tick_s, _reclaim_leases),
             (tick_s, tick_s, _share_results),
             (tick_s, tick_s, partial(_merge_waiting, merges=merges)),
             (tick_s, tick_s, _submit_scheduled),
@@ -106,15 +106,15 @@ async def _repeat(services: Services, holder: str, first_s: float, every_s: floa
         await asyncio.sleep(every_s)
 
 
-async def _reap(services: Services, holder: str) -> None:
+async def _reclaim_leases(services: Services, holder: str) -> None:
     """Reclaim every expired lease, page by page, if this process is the leader.
 
     Nothing is reclaimed during the grace period after a start or an interruption, in which workers renew their leases.
     """
     try:
-        leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
-        if leads and may_reap:
-            await _reap_pages(services)
+        leads, may_reclaim = await _write(services, _look_round, holder, services.start_grace)
+        if leads and may_reclaim:
+            await _reclaim_pages(services)
     except UnavailableProblem:
         services.start_grace.restart()
         raise
@@ -128,7 +128,7 @@ def _look_round(tx: Transaction, holder: str, grace: StartGrace) -> tuple[bool, 
     return _leads(tx, holder), grace.over(tx.now_us)
 
 
-async def _reap_pages(services: Services) -> None:
+async def _reclaim_pages(services: Services) -> None:
     if await _write(services, reaper.correct_times, services.queue_policy):
         log.warning("the database's clock was set back; times of leases were corrected")
     page = await _write(services, reaper.reap_page, services.queue_policy)
