@@ -96,7 +96,8 @@ def _open_blob(
     """Find the requested range of a blob, and read the first piece of the range.
 
     No piece is read if only the headers are requested (`head`), or if the blob is in object storage and has at least
-    `redirect_bytes` bytes. Raises `NotFoundProblem` if the caller may not read the blob.
+    `redirect_bytes` bytes. Raises `NotFoundProblem` if the caller may not read the blob, and
+    `RangeNotSatisfiableProblem` if no byte of the blob is in the range.
     """
     size = blobs.require_readable(tx, digest)
     start, stop = wanted.within(size) if wanted is not None else (0, size)

@@ -115,7 +115,10 @@ def _goals(wanted: Compared) -> dict[str, Goal]:
 def _drawn(
     found: Sequence[RunToCompare], curves: Mapping[str, Mapping[str, Curve]], wanted: Compared
 ) -> tuple[str, ...]:
-    """Return the fields whose curves are returned: the requested ones, or those of most runs; at most `MOST_DRAWN`."""
+    """Return the fields whose curves are returned, at most `MOST_DRAWN`.
+
+    These are the requested fields, or else the fields that most runs have.
+    """
     counts = Counter(field for run in found for field in curves.get(run.curves_blob or "", {}))
     fields = wanted.fields or [field for field, _ in counts.most_common()]
     return tuple(field for field in fields if field in counts)[:MOST_DRAWN]

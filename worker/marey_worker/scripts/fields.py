@@ -72,7 +72,10 @@ def _read_lines(name: str, file: Path) -> LoggedFields:
 
 
 def _parse_line(where: str, line: bytes, default_step: int) -> tuple[int, dict[str, Any]]:
-    """Return the step of a line, or `default_step` if the line has none, and its values by field."""
+    """Return the step of a line, or `default_step` if the line has none, and its values by field.
+
+    Raises `JobRefused` if the line is not a valid JSON object of fields.
+    """
     if len(line) > MOST_LINE_BYTES:
         raise _refusal(f"{where} must have at most {MOST_LINE_BYTES:,} bytes")
     try:
