@@ -89,9 +89,8 @@ def main() -> None:
     parser.add_argument("--server", help="address of the server; default: from MAREY_SERVER or the stored login")
     parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time; default: 1")
     parser.add_argument(
-        "--kind", action="append", default=[],
-        help="run only jobs of this kind; may be repeated; default: all kinds that this worker can run",
-    )  # fmt: skip
+        "--kind", action="append", default=[], help="run only jobs of this kind; may be repeated; default: all kinds"
+    )
     parser.add_argument(
         "--label", action="append", default=[], type=_label, metavar="NAME=VALUE",
         help="label of the worker, such as site=lyon; jobs can require labels; may be repeated; default: none",
@@ -101,10 +100,9 @@ def main() -> None:
         "--cache", type=Path, help="folder in which downloaded inputs are cached; default: marey/inputs below ~/.cache"
     )
     parser.add_argument(
-        "--token-file",
-        type=Path,
+        "--token-file", type=Path,
         help="file that contains a token with the scope `work`; default: MAREY_TOKEN or the stored login",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--attached",
         action="store_true",

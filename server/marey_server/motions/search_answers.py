@@ -120,7 +120,7 @@ def answer_search(packed: bytes) -> bytes:
 
 
 def write_search(packed: bytes) -> bytes:
-    """Search models and write the found motions to a file, in a child process. `packed` is a `SearchFileOrder` as bytes.
+    """Search models and write found motions to a file, in a child process. `packed` is a `SearchFileOrder` as bytes.
 
     Return a `ComputedFile` as bytes.
     """
