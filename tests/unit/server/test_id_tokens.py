@@ -189,7 +189,7 @@ def test_only_usable_public_keys_are_taken_from_the_list() -> None:
     assert [(one.key_id, one.key.is_private) for one in kept] == [("first", False)]
     wrongs: list[dict[str, Any]] = [{}, {"keys": {}}, {"keys": unusable}, {"keys": [public] * 65}]
     for wrong in wrongs:
-        with pytest.raises(ValueError, match=r"member `keys` is not|no key of the set"):
+        with pytest.raises(ValueError, match=r"member `keys` of the key set is not|no key of the set"):
             read_keys(wrong)
 
 
