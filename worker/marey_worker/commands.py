@@ -104,10 +104,9 @@ def main() -> None:
         help="file that contains a token with the scope `work`; default: MAREY_TOKEN or the stored login",
     )  # fmt: skip
     parser.add_argument(
-        "--attached",
-        action="store_true",
+        "--attached", action="store_true",
         help="read the token from standard input, and stop the worker when standard input closes",
-    )
+    )  # fmt: skip
     given = parser.parse_args()
     try:
         credential = resolve(given.server, given.token_file, {} if given.attached else None)
