@@ -1,4 +1,4 @@
-"""Application: its construction, start and stop."""
+"""Tornado application of the server: construction, start and stop."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from marey_server.process.children import Children
 from marey_server.process.computing import compute_on_one_thread_each
 from marey_server.process.data_folder import BLOB_FOLDER, prepare_data_folder
 from marey_server.process.feed import following_feed
-from marey_server.process.housekeeping import keeping_house
+from marey_server.process.housekeeping import running_housekeeping
 from marey_server.process.notices import note_ready, note_stopping
 from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Services
@@ -134,7 +134,7 @@ def create_app(settings: Settings, database: Database, children: Children | None
 
 @dataclass(frozen=True)
 class Running:
-    """Server that accepts requests."""
+    """Server that accepts requests; `address` is the URL at which clients reach it."""
 
     app: Application
     address: str
@@ -149,7 +149,7 @@ async def listening(
 
     At the end of the block, no more connections are accepted. For `linger_s` seconds, requests on open connections are
     still answered, and the answers ask clients to close the connections. Everything is closed when the running requests
-    have ended, at the latest after `drain_s` more seconds. Raises `CannotListen`.
+    have ended, at the latest after `drain_s` more seconds. Raises `CannotListen` if the address cannot be used.
     """
     settings = app.services.settings
     if sockets is None:
@@ -166,16 +166,16 @@ async def listening(
     connections = accept_connections(app, server, sockets)
     address = address_of(sockets)
     try:
-        async with keeping_house(app.services), following_feed(app.services), delivering(app.services):
+        async with running_housekeeping(app.services), following_feed(app.services), delivering(app.services):
             yield Running(app, address, server)
-            await _part(app.services, connections, linger_s)
+            await _linger(app.services, connections, linger_s)
     finally:
         await _drain(app.services, server, connections)
 
 
 @asynccontextmanager
 async def showing_metrics(services: Services, sockets: Sequence[socket.socket]) -> AsyncIterator[None]:
-    """Answer requests for metrics and health at further sockets while the `async with` block runs."""
+    """Answer requests for metrics and health at `sockets`, too, while the `async with` block runs."""
     server = HTTPServer(
         Application(MONITORING, services),
         idle_connection_timeout=services.settings.header_timeout_s,
@@ -207,9 +207,9 @@ def accept_connections(app: Application, server: HTTPServer, sockets: Sequence[s
     return connections
 
 
-async def _part(services: Services, connections: Connections, linger_s: float) -> None:
+async def _linger(services: Services, connections: Connections, linger_s: float) -> None:
     """Stop accepting connections; wait until clients have closed all connections, but at most `linger_s` seconds."""
-    services.parting = True
+    services.lingering = True
     connections.stop()
     deadline = time.monotonic() + linger_s
     while len(connections) and time.monotonic() < deadline:
@@ -271,7 +271,9 @@ def _backing_of(settings: Settings) -> BlobBacking | ObjectBlobs:
     try:
         storage = ObjectStorage(settings.bucket)
     except ModuleNotFoundError as error:
-        raise DatabaseUnusable('a bucket needs an optional package; run pip install "marey[s3]"') from error
+        raise DatabaseUnusable(
+            'blobs in a bucket (the setting s3_bucket) need an optional package; run pip install "marey[s3]"'
+        ) from error
     return ObjectBlobs(storage, local, stores_objects=settings.blobs == "s3")
 
 
@@ -285,7 +287,7 @@ async def serve(settings: Settings) -> None:
         showing_metrics(running.app.services, metrics_sockets),
         warming(running.app.services.children) if settings.warm_up else nullcontext(),
     ):
-        settle(running)
+        finish_start(running)
         note_ready()
         await stop.wait()
         note_stopping()
@@ -311,10 +313,11 @@ def stop_event() -> asyncio.Event:
     return stop
 
 
-def settle(running: Running, *, greet: bool = True) -> None:
-    """Print the greeting of a server that accepts connections, and exclude its objects from garbage collection.
+def finish_start(running: Running, *, greet: bool = True) -> None:
+    """Print the greeting of a server that has started, and exclude all objects so far from garbage collection.
 
-    Otherwise, each full garbage collection would examine the objects of all modules, and stop the server for 0.1 s.
+    Nearly all of these objects belong to modules. If a full garbage collection examined them, it would stop the server
+    for 0.1 s each time.
     """
     gc.freeze()
     if greet:
@@ -349,7 +352,8 @@ async def warming(children: Children) -> AsyncIterator[None]:
 async def serving(settings: Settings) -> AsyncIterator[Running]:
     """Run a server with its database and workers while the `async with` block runs; then stop, workers first.
 
-    Workers of engines such as Slurm continue. Raises `CannotListen` and `LauncherUnusable`.
+    Workers of engines such as Slurm continue. Raises `CannotListen` if the address cannot be used, and
+    `LauncherUnusable` if workers cannot be started as the settings demand.
     """
     database = open_database(settings)
     async with (

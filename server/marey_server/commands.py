@@ -51,7 +51,10 @@ def serve(**settings: Any) -> None:
 
 
 def _serve_in_processes(given: dict[str, Any]) -> None:
-    """Run several server processes that share a port; they do not read the settings in `given` themselves."""
+    """Run several server processes that share a port, until SIGTERM or SIGINT.
+
+    The parent process passes the settings `given`, which come from the command line, to each server process.
+    """
     from marey_server.shared_port.parent import serve_in_processes
 
     chosen = read_settings(**given)
@@ -160,7 +163,10 @@ def require_empty(**settings: Any) -> None:
 
 
 def backup(*, target: Path, **settings: Any) -> None:
-    """Copy an SQLite database in a consistent state, even while a server is writing to it."""
+    """Copy an SQLite database to the file `target`, in a consistent state even while a server is writing to it.
+
+    Raises `CommandFailed` if the file exists already.
+    """
     source = _sqlite_file(read_settings(**settings), must_exist=True)
     if target.exists():
         raise CommandFailed(f"the file {target} exists already; choose a file that does not exist")
@@ -296,7 +302,7 @@ def move_blobs(**settings: Any) -> None:
 
 
 def _progress() -> Callable[[object], None]:
-    """Return a function that prints its argument to standard error, at most once per `PROGRESS_EVERY_S`."""
+    """Return a function that prints a line to standard error, but at most one line per `PROGRESS_EVERY_S`."""
     printed_s = time.monotonic()
 
     def show(state: object) -> None:
@@ -321,7 +327,11 @@ def _shrink(file: Path) -> None:
 
 
 def admin_token(*, user: str | None = None, **settings: Any) -> None:
-    """Create a new token for an administrator, and write it to `admin.token` in the data folder."""
+    """Create a token for an administrator, and write it to `admin.token` in the data folder.
+
+    `user` is the name of the administrator; None: the one who was created first. Raises `CommandFailed` if there is no
+    such administrator.
+    """
     from marey_server.access.principal import SYSTEM
     from marey_server.app import connect_database
     from marey_server.errors import NotFoundProblem

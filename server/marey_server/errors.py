@@ -102,7 +102,7 @@ class MethodNotAllowedProblem(ApiProblem):
 
 
 class NotAcceptableProblem(ApiProblem):
-    """No offered media type is accepted."""
+    """The header Accept allows none of the media types of this resource."""
 
     status = 406
     code = "not-acceptable"
@@ -182,7 +182,7 @@ class PreconditionFailedProblem(ApiProblem):
 
 
 class PreconditionRequiredProblem(ApiProblem):
-    """Send If-Match with the state that you are changing."""
+    """Send the header If-Match with the ETag of the state that you want to change."""
 
     status = 428
     code = "precondition-required"

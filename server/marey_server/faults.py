@@ -42,7 +42,7 @@ _faults: list[_Fault] = []
 
 
 def plan(texts: str) -> None:
-    """Replace the planned faults by those in `texts`, which has the form of the variable `MAREY_FAULT`."""
+    """Replace the planned faults by those in `texts`, a text of the form that the variable `MAREY_FAULT` has."""
     _faults[:] = [_Fault(text) for text in texts.split(",") if text]
 
 

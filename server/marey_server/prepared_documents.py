@@ -35,7 +35,7 @@ _POINTER_LENGTH = 512
 
 @dataclass(frozen=True, slots=True)
 class PreparedDocument:
-    """Checked and encoded document; checking and encoding take longer than storing it, and need no database."""
+    """Document that was checked and encoded. Both take longer than storing it, and need no database."""
 
     digest: str
     schema: str
@@ -88,7 +88,7 @@ def _of_canonical(schema: str, canonical: bytes, array_of: Callable[[str, Tree],
 
 
 def decoded_tree(content: PreparedDocument) -> Tree:
-    """Return the tree that a document was prepared from."""
+    """Return the document with its arrays decoded, as a tree."""
     tree: Tree = json.loads(canonical_json(content.body))
     for pointer, (_, data) in content.arrays.items():
         holder, key = place_of(tree, pointer)
@@ -98,7 +98,10 @@ def decoded_tree(content: PreparedDocument) -> Tree:
 
 
 def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
-    """Return `content` as a document prepared for `schema`; a prepared document is returned unchanged."""
+    """Return `content` as a document that is prepared for `schema`; a prepared document is returned unchanged.
+
+    Raises `InvalidProblem` if the content is not valid, or the prepared document has another schema.
+    """
     if not isinstance(content, PreparedDocument):
         return prepare_document(content, schema=schema)
     if schema not in (None, OPEN_SCHEMA, content.schema):
@@ -107,12 +110,12 @@ def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
 
 
 def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
-    """Return the document with another JSON body and the same arrays and files."""
+    """Return a copy of a prepared document with another JSON body; arrays and files stay the same."""
     return replace(content, digest=digest_of_body(body), body=body)
 
 
 def digest_of_body(body: Tree) -> str:
-    """Return the digest of a document, given as JSON text with references in place of arrays."""
+    """Return the digest of a document in which references replace the arrays."""
     return digest_of(canonical_json(body))
 
 

@@ -20,10 +20,10 @@ with loading_modules():
     from marey_server.app import (
         Running,
         create_app,
+        finish_start,
         listening,
         open_database,
         prepare_process,
-        settle,
         showing_metrics,
         stop_event,
         warming,
@@ -45,7 +45,7 @@ FEWEST_CHILDREN = 2
 
 
 def main() -> int:
-    """Run a server process; return its exit status."""
+    """Run a server process from the order on standard input; return its exit status."""
     control = socket.socket(fileno=os.dup(0))
     with open(os.devnull) as nothing:
         os.dup2(nothing.fileno(), 0)  # so that no child process inherits the socket
@@ -84,17 +84,17 @@ async def serve_together(settings: Settings, order: StartOrder, control: socket.
         workers = await stack.enter_async_context(AsyncExitStack())
         if order.first:
             await workers.enter_async_context(keeping_workers(app.services, running.address))
-        settle(running, greet=order.first)
+        finish_start(running, greet=order.first)
         writer.write(READY)
         if not order.first:
-            await _keep_workers_when_told(workers, running, stop, keep_workers)
+            await _run_workers_when_asked(workers, running, stop, keep_workers)
         await stop.wait()
         log.info("server process %d is stopping", os.getpid())
     following.cancel()
 
 
 def share_of(settings: Settings) -> Settings:
-    """Return the settings of one process: limits for all processes together are divided by their number."""
+    """Return the settings of one process, with its share of each limit for all processes together."""
     count = settings.processes
     share = {
         "request_memory_bytes": settings.request_memory_bytes // count,
@@ -108,17 +108,20 @@ def share_of(settings: Settings) -> Settings:
 
 
 async def _follow(reader: asyncio.StreamReader, stop: asyncio.Event, keep_workers: asyncio.Event) -> None:
-    """Read the messages of the parent process, and stop this process when the parent has ended."""
+    """Read the messages of the parent process; when the parent has ended, stop this process."""
     while line := await reader.readline():
         if line == KEEP_WORKERS:
             keep_workers.set()
     stop.set()
 
 
-async def _keep_workers_when_told(
+async def _run_workers_when_asked(
     workers: AsyncExitStack, running: Running, stop: asyncio.Event, keep_workers: asyncio.Event
 ) -> None:
-    """Wait until the parent lets this process run the workers, or until the process must stop."""
+    """Wait until the parent asks this process to run the workers, and then run them.
+
+    Return without running them if the process must stop first.
+    """
     waiting = [asyncio.create_task(event.wait()) for event in (stop, keep_workers)]
     await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
     for task in waiting:

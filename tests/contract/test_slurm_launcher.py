@@ -223,7 +223,7 @@ def test_without_accounting_the_end_of_a_forgotten_task_is_unknown(
 def test_logs_that_cannot_be_kept_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     commands(tmp_path, monkeypatch, squeue="exit 0", sbatch="exit 0")
     (tmp_path / "worker-logs").touch()
-    with pytest.raises(EngineError, match="the logs of workers cannot be kept"):
+    with pytest.raises(EngineError, match="the logs of workers cannot be kept in the data folder"):
         asyncio.run(SlurmLauncher(context_of(tmp_path)).start(REQUEST, 1, key="b"))
 
 

@@ -312,7 +312,7 @@ def test_a_provider_that_fails_later_ends_the_sign_in(
     assert "access_denied" in denied.text
     provider.error = ""
     provider.claims["aud"] = "another client"
-    assert "the claim aud does not have the expected value" in Person(house).finish().text
+    assert "the claim aud of the token does not have the expected value" in Person(house).finish().text
 
 
 @ON_SQLITE

@@ -1,6 +1,6 @@
-"""Execution of one attempt of a job: a child process computes, and this process supervises it.
+"""Execution of one attempt of a job.
 
-This process also answers the requests of the child.
+A child process computes. This process, the supervisor, watches the child and answers its requests.
 """
 
 from __future__ import annotations
@@ -103,7 +103,11 @@ def environment() -> dict[str, str]:
 
 
 class RunningAttempt:
-    """Execution of one job from the claim to the end of the attempt."""
+    """One attempt of a job, from the claim to the report of its end.
+
+    `server` is the address of the server, which is part of the keys in the cache. `stopping` is set when the worker is
+    asked to stop.
+    """
 
     def __init__(
         self,
@@ -152,7 +156,7 @@ class RunningAttempt:
         """Wait until all results are stored, and report the end of the job to the server.
 
         `end` is the result of `run`. The child may run the next job in the meantime. If results cannot be stored, a
-        failure or a stop is reported instead of a success. Returns the end of the job, even if it cannot be reported.
+        failure or a stop is reported instead of a success. Return the end of the job, even if it cannot be reported.
         """
         try:
             with self._trace.stage(COMPLETE):
@@ -190,14 +194,14 @@ class RunningAttempt:
     def _attend(self, child: ChildProcess) -> Done | Failed | Stop:
         """Answer the requests of the child until it reports its result or failure, and return this message.
 
-        Returns a failure if the child dies, and the reason to stop if the job must be stopped.
+        Return a failure if the child dies, and the reason to stop if the job must be stopped.
         """
         while True:
             try:
                 data = child.receive(WATCH_EVERY_S)
                 message = None if data is None else unpack(data)
             except EOFError:
-                return self._death(child)
+                return self._end_of_child(child)
             except (BadMessage, OSError) as error:
                 child.kill(grace_s=0.0)
                 return Failed("bad-message", str(error), "bad-message", retryable=True)
@@ -211,15 +215,16 @@ class RunningAttempt:
                 return stop
 
     def _check(self, child: ChildProcess | None) -> Stop | None:
-        """Send new output every `LOG_EVERY_S` seconds in a separate thread; return the reason to stop now, or None.
+        """Return the reason to stop the attempt now, or None if there is none.
 
-        If the server does not answer, only the thread that sends the log waits; inputs and results are not delayed.
+        Also start to send new output to the job's log, at most every `LOG_EVERY_S` seconds. A separate thread sends it,
+        so that inputs and results are not delayed if the server does not answer.
         """
         sent = self._log_sending is None or self._log_sending.done()
         if sent and time.monotonic() > self._log_due:
             self._log_sending = self._log_sender.submit(self._try_to_send_log)
             self._log_due = time.monotonic() + LOG_EVERY_S
-        return self._watch.verdict(child)
+        return self._watch.reason_to_stop(child)
 
     def _serve(self, request: Request, child: ChildProcess) -> None:
         """Carry out one request of the child in a separate thread, and answer it."""
@@ -284,13 +289,13 @@ class RunningAttempt:
         return found[: max(1, sum(size <= ANSWER_LIMIT_BYTES for size in sizes))]
 
     def _cache_key(self, name: str) -> str:
-        """Return the key of a part in the cache: server, project and name.
+        """Return the key of a blob or a part in the cache: server, project and name.
 
         Names of parts are unique only on one server and in one project.
         """
         return f"{self._server} {self._lease.project} {name}"
 
-    def _death(self, child: ChildProcess) -> Failed | Stop:
+    def _end_of_child(self, child: ChildProcess) -> Failed | Stop:
         status = child.wait()
         # An engine such as Slurm sends SIGTERM to all processes of a worker at once; the child may end first.
         if status == -signal.SIGTERM and self._watch.stopping.wait(STOPPING_S):
@@ -314,11 +319,10 @@ class RunningAttempt:
         return done
 
     def _report(self, end: Done | Failed | Stop) -> Done | Failed | Stop:
-        """Report the end of the job to the server, and return it.
+        """Report the end of the job to the server, and return the end that was reported.
 
-        If the results of a success cannot be published, a failure is reported and returned instead.
-
-        Heartbeats continue, because the server may be unreachable for a while.
+        If the results of a success cannot be published, a failure is reported and returned instead. Heartbeats continue
+        in the meantime, because the server may be unreachable for a while.
         """
         if end is Stop.LEASE_LOST:
             log.warning("%s: %s", self._lease.job, self._watch.explain(end))
@@ -368,7 +372,7 @@ class RunningAttempt:
         )
 
     def _try_to_send_log(self) -> None:
-        """Send new output. A failure is only logged, so that no result is lost because of it."""
+        """Send new output to the job's log; if this fails, only log the failure, so that no result is lost."""
         try:
             self._job_log.send()
         except LeaseLost:
@@ -384,7 +388,7 @@ def _not_stored(staging: Future[ChildReply | None]) -> bool:
 
 
 def send_reply(child: ChildProcess, carried_out: Future[ChildReply | None]) -> None:
-    """Send the child the reply to a request that was carried out, or a refusal if the reply cannot be encoded."""
+    """Send the child the reply to its request, or a refusal if the reply cannot be encoded."""
     if carried_out.cancelled() or (reply := carried_out.result()) is None:
         return
     try:

@@ -47,7 +47,10 @@ def claim_from(transport: Transport, request: ClaimRequest) -> LeaseList:
 
 
 class AttemptApi:
-    """Client of the endpoints of one attempt at a job, with the attempt's token. Every method may raise `LeaseLost`."""
+    """Client for the requests of one attempt of a job, with the attempt's token.
+
+    Every method may raise `LeaseLost`.
+    """
 
     def __init__(self, transport: Transport, lease: Lease) -> None:
         self._transport = transport.with_token(lease.attempt_token)
@@ -62,9 +65,9 @@ class AttemptApi:
         return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress)), sender))
 
     def append_log(self, offset: int, piece: bytes) -> LogAnswer:
-        """Append `piece` to the attempt's log, and return the length of the log.
+        """Append `piece` to the attempt's log, and return the length of the log, as the server knows it.
 
-        `offset` must be the length of the log so far; otherwise, nothing is appended.
+        `offset` is the length of the log before. If it is wrong, nothing is appended.
         """
         headers = {"Upload-Offset": str(offset)}
         try:
@@ -87,9 +90,10 @@ class AttemptApi:
         self._post("fail", as_json(request))
 
     def read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
-        """Read documents as undecoded MessagePack with block-encoded arrays; None if a document does not exist.
+        """Return documents as undecoded MessagePack with block-encoded arrays, and None for each missing document.
 
-        Documents at the end of a long list may be omitted, but not the first one.
+        The result is in the order of `places`. Documents at the end of a long list may be omitted, but not the first
+        one.
         """
         path = f"/projects/{self._project}/parts"
         body = as_json(PartsRequest(parts=tuple(places)))
@@ -103,7 +107,7 @@ class AttemptApi:
             return self._transport.get(Item, f"/projects/{self._project}/{kind.plural}/{item}")
 
     def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
-        """Return the items with this name that are directly in a collection, or anywhere if `collection` is None."""
+        """Return the items with this name in one folder, or in the whole project if `collection` is None."""
         asked = f"{name}*" if name.endswith("*") else name  # a final asterisk asks for names that begin so
         query = {"name": asked, "directly_in": collection}
         with _dead_token_is_lost_lease():
@@ -116,7 +120,7 @@ class AttemptApi:
             return [one.result or {} for one in pages(self._transport, TaskResult, f"/jobs/{self._job}/results")]
 
     def read_judgements(self, study: str, revision: int) -> list[dict[str, Any]]:
-        """Return the answers of the participants who saw a revision of a study, as one tree for each participant."""
+        """Return the answers of participants who saw a revision of a study, one tree for each participant."""
         with _dead_token_is_lost_lease():
             path = f"{self._url}/judgements/{study}"
             people = pages(self._transport, JudgingParticipant, path, {"revision": revision})
@@ -142,7 +146,7 @@ class AttemptApi:
 
 @contextmanager
 def _dead_token_is_lost_lease() -> Iterator[None]:
-    """Raise `LeaseLost` if the token is refused, because an attempt's token becomes invalid when its lease is lost."""
+    """Convert a refusal of the token to `LeaseLost`, because an attempt's token becomes invalid with its lease."""
     try:
         yield
     except Unauthenticated as error:

@@ -38,11 +38,11 @@ class LogUploader:
 
     @property
     def size_bytes(self) -> int:
-        """The number of bytes printed so far."""
+        """The number of bytes that the job has printed so far."""
         return self.path.stat().st_size
 
     def send(self) -> None:
-        """Send new output unless the log on the server is full. Raises the client's errors and `OSError`."""
+        """Send new output unless the log on the server is full. Raises `OSError`, and errors of the client library."""
         with self._sending, self.path.open("rb") as file:
             while not self._full:
                 file.seek(self._sent)
@@ -66,7 +66,7 @@ class Stop(Enum):
 
 @dataclass
 class Watch:
-    """Limits of one attempt: lease, time and memory."""
+    """Watch over the limits of one attempt: lease, time, memory, and size of the log."""
 
     lease: Lease
     keeper: LeaseKeeper
@@ -75,10 +75,10 @@ class Watch:
     started: float
     weighed: float = 0.0
 
-    def verdict(self, child: ChildProcess | None) -> Stop | None:
+    def reason_to_stop(self, child: ChildProcess | None) -> Stop | None:
         """Return the reason to stop the attempt now, or None if there is none.
 
-        `child` is None after the child process has computed all results.
+        `child` is the child process that computes, or None after it has computed all results.
         """
         if self.keeper.lost.is_set():
             return Stop.LEASE_LOST
@@ -97,7 +97,7 @@ class Watch:
         return None
 
     def explain(self, stop: Stop) -> str:
-        """Return the reason for stopping in words, with the limit that was exceeded."""
+        """Return a text that gives the reason for stopping, with the limit that was exceeded."""
         resources = self.lease.resources
         return {
             Stop.LEASE_LOST: "the lease was lost",
@@ -110,10 +110,10 @@ class Watch:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder with all that is in it; links are removed, not followed.
+    """Remove a folder with its content, if it exists; links are removed, not followed.
 
-    Nothing may write to the folder any more. Folders are moved to the top before they are emptied, because a script can
-    nest them deeper than a path can be long. Does nothing if there is no folder. Raises `OSError`.
+    No process may write to the folder any more. Before a subfolder is emptied, it is moved to the top, because a script
+    can nest folders deeper than a path can be long. Raises `OSError` if something cannot be removed.
     """
     prefix = secrets.token_hex(8)
     waiting, count = [folder] if folder.is_dir() else [], 0

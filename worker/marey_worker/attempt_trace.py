@@ -30,7 +30,7 @@ class AttemptTrace:
         self._lock = threading.Lock()
 
     def _begin(self, lease: Lease, tracer: Tracer) -> SpanScope | None:
-        """Record the wait of the job, and begin the span of the attempt."""
+        """Record the job's time in the queue, and begin the span of the attempt; None if nothing is recorded."""
         submitted = None if lease.trace is None else TraceContext.parse(lease.trace.traceparent)
         if lease.trace is None or submitted is None or not submitted.sampled:
             return None
@@ -48,9 +48,10 @@ class AttemptTrace:
 
     @contextmanager
     def stage(self, declaration: SpanDeclaration) -> Iterator[None]:
-        """Record a stage of the attempt while the `with` block runs.
+        """Record a stage of the attempt, such as `COMPUTE`, while the `with` block runs.
 
-        Transfers belong to the stage `COMPUTE`, even if they begin later: the child does not wait for uploads.
+        Downloads and uploads belong to the stage `COMPUTE`, even if they begin later: the child does not wait for
+        uploads.
         """
         if self._scope is None:
             yield
@@ -62,7 +63,7 @@ class AttemptTrace:
 
     @contextmanager
     def transfer(self, request: Request) -> Iterator[None]:
-        """Record a request of the child process while the `with` block runs. Any thread may call this."""
+        """Record a download or upload for the child process, while the `with` block runs. Any thread may call this."""
         computing = self._computing
         if computing is None:
             yield
@@ -78,7 +79,7 @@ class AttemptTrace:
             yield
 
     def end(self, end: Done | Failed | Stop) -> None:
-        """Send the span of the attempt, which has ended."""
+        """End the span of the attempt with the outcome `end`, and send it."""
         if self._scope is None or self._span is None or self._scope.emit is None:
             return
         attributes = self._span.attributes

@@ -1,4 +1,4 @@
-"""Child process of a worker, which computes.
+"""Child process of a worker, which computes jobs.
 
 It runs one job after another, so that modules and compiled kernels are loaded only once.
 """
@@ -65,10 +65,10 @@ def main() -> None:
 
 
 class Garbage:
-    """Collector of cyclic garbage, called after each job; it skips the objects of loaded modules.
+    """Garbage collector that is called after each job, and skips the objects of loaded modules.
 
-    Modules own nearly all objects and live as long as the process; searching these objects would take 0.1 s
-    after every job.
+    Modules own nearly all objects and live as long as the process; searching these objects would take 0.1 s after every
+    job.
     """
 
     def __init__(self) -> None:
@@ -76,7 +76,10 @@ class Garbage:
         self.collect()
 
     def collect(self) -> None:
-        """Free cyclic garbage; if modules were loaded since the last call, exclude all current objects from now on."""
+        """Free cyclic garbage.
+
+        If modules were loaded since the last call, exclude all existing objects from later searches.
+        """
         gc.collect()
         if len(sys.modules) != self._modules:
             self._modules = len(sys.modules)
@@ -120,7 +123,7 @@ def run_job(run: Run, pipe: Connection) -> End:
 
 
 def _packed(end: End) -> bytes:
-    """Encode the end of a job; a result that cannot be sent is a failure."""
+    """Encode the message about the end of a job; if its result cannot be sent, encode a failure instead."""
     try:
         return pack(end)
     except UNPACKABLE as error:

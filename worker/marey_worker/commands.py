@@ -45,7 +45,7 @@ def work(
     job: str | None = None,
     task: int | None = None,
 ) -> None:
-    """Run a worker until SIGTERM or SIGINT, then exit; the exit status is not 0 if a job was running at that time.
+    """Run a worker until SIGTERM or SIGINT, and exit; the status is not 0 if a job was running at that time.
 
     With `job`, the worker runs only this job, or the task of this job with the position `task`, and then ends.
 
@@ -84,25 +84,29 @@ def work(
 
 
 def main() -> None:
-    """Run the command line of `python -m marey_worker`; `marey serve` starts workers with it."""
+    """Run the command line of `python -m marey_worker`, with which launchers start workers."""
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
     parser.add_argument("--server", help="address of the server; default: from MAREY_SERVER or the stored login")
     parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time; default: 1")
-    parser.add_argument("--kind", action="append", default=[], help="run only jobs of this kind; may be repeated")
+    parser.add_argument(
+        "--kind", action="append", default=[], help="run only jobs of this kind; may be repeated; default: all kinds"
+    )
     parser.add_argument(
         "--label", action="append", default=[], type=_label, metavar="NAME=VALUE",
-        help="label of the worker, which jobs can require; may be repeated",
+        help="label of the worker, such as site=lyon; jobs can require labels; may be repeated; default: none",
     )  # fmt: skip
     parser.add_argument("--name", help="name of the worker, shown to people; default: host name and process id")
     parser.add_argument(
         "--cache", type=Path, help="folder in which downloaded inputs are cached; default: marey/inputs below ~/.cache"
     )
-    parser.add_argument("--token-file", type=Path, help="file that contains a token with the scope `work`")
     parser.add_argument(
-        "--attached",
-        action="store_true",
+        "--token-file", type=Path,
+        help="file that contains a token with the scope `work`; default: MAREY_TOKEN or the stored login",
+    )  # fmt: skip
+    parser.add_argument(
+        "--attached", action="store_true",
         help="read the token from standard input, and stop the worker when standard input closes",
-    )
+    )  # fmt: skip
     given = parser.parse_args()
     try:
         credential = resolve(given.server, given.token_file, {} if given.attached else None)

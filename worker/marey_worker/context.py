@@ -46,7 +46,7 @@ STAGED_AT_ONCE = 2
 
 
 class JobRefused(Exception):
-    """The job cannot succeed, even if it is retried. `code` is a stable identifier of the reason."""
+    """Error of a job that cannot succeed, even if it is retried. `code` is a stable identifier of the reason."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(detail)
@@ -55,11 +55,14 @@ class JobRefused(Exception):
 
 
 class RequestRefused(Exception):
-    """The supervisor could not carry out a request of the job."""
+    """Error of a request of the job that the supervisor could not carry out."""
 
 
 class Unreadable(RequestRefused):
-    """A requested object cannot be read, even if the job is retried. `code` is a stable identifier of the reason."""
+    """Error of an object that cannot be read, even if the job is retried.
+
+    `code` is a stable identifier of the reason.
+    """
 
     def __init__(self, detail: str, code: str) -> None:
         super().__init__(detail)
@@ -67,14 +70,17 @@ class Unreadable(RequestRefused):
 
 
 class NoSuchThing(Unreadable):
-    """A requested object does not exist, or the job may not read it; `code` names its kind, as in `no-skeleton`."""
+    """Error of an object that does not exist, or that the job may not read.
+
+    `code` names its kind, as in `no-skeleton`.
+    """
 
     def __init__(self, detail: str, code: str = "not-found") -> None:
         super().__init__(detail, code)
 
 
 class FileTooLarge(Unreadable):
-    """A stored file is too large for the memory limit of the job."""
+    """Error of a stored file that is too large for the memory limit of the job."""
 
     def __init__(self, detail: str) -> None:
         super().__init__(
@@ -85,7 +91,7 @@ class FileTooLarge(Unreadable):
 
 
 class Task(NamedTuple):
-    """Position of a task among the tasks of its job, counted from 0, and the number of these tasks."""
+    """Position of a task among the tasks of its parent job, counted from 0, and the number of these tasks."""
 
     position: int
     size: int
@@ -118,9 +124,9 @@ class Context:
     # -- reading --
 
     def document(self, kind: Kind, item: str, revision: int, part: str, *, required: bool = True) -> Any:
-        """Return a part of a revision, with arrays as numpy arrays.
+        """Return a part of a revision as a tree, with its arrays as numpy arrays.
 
-        If the part does not exist, returns None if `required` is false; otherwise raises `NoSuchThing`.
+        If the part does not exist, return None if `required` is false; otherwise, raise `NoSuchThing`.
         """
         ((_, document),) = self._read_ahead([(None, PartPlace(kind=kind, item=item, revision=revision, part=part))])
         if document is None and required:
@@ -131,10 +137,10 @@ class Context:
     def documents(
         self, pins: Iterable[PinnedInput], part: str, *, required: bool = True
     ) -> Iterator[tuple[PinnedInput, Any]]:
-        """Yield each input with its part named `part`.
+        """Yield each input together with its part named `part`.
 
-        If the part does not exist, None is yielded in its place if `required` is false; otherwise, `NoSuchThing` is
-        raised. While the caller uses one input, the parts of the next inputs are read.
+        If the part does not exist, yield None in place of the part if `required` is false; otherwise, raise
+        `NoSuchThing`. While the caller uses one input, the parts of the next inputs are read.
         """
         for pin, (document,) in self.documents_of_each(pins, part):
             if document is None and required:
@@ -145,7 +151,7 @@ class Context:
     def documents_of_each(
         self, pins: Iterable[PinnedInput], *parts: str
     ) -> Iterator[tuple[PinnedInput, tuple[Any, ...]]]:
-        """Yield each input with several of its parts, and None for each part that does not exist.
+        """Yield each input together with several of its parts, and with None for each part that does not exist.
 
         While the caller uses one input, the parts of the next inputs are read.
         """
@@ -164,7 +170,7 @@ class Context:
         return Item.model_validate(self._value(asked, f"no-{kind}"))
 
     def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
-        """Return the items with this name that are directly in a collection, or anywhere if `collection` is None."""
+        """Return the items with this name in one folder, or in the whole project if `collection` is None."""
         found = self._ask(lambda request: FindItems(request, kind, name, collection))
         return [Item.model_validate(item) for item in found]
 
@@ -193,9 +199,9 @@ class Context:
     # -- writing --
 
     def stage(self, outputs: Sequence[StagedOutput]) -> None:
-        """Stage results. All of them become visible together when the job completes.
+        """Stage results, all of which become visible together when the job completes.
 
-        Raises `RequestRefused` if earlier results could not be stored. The method does not wait until results are
+        The method does not wait until the results are stored. Raises `RequestRefused` if earlier results could not be
         stored. The supervisor waits for the last results of a job while this process runs the next job.
         """
         self._stage(encode_outputs(outputs))
@@ -229,13 +235,13 @@ class Context:
         self._pipe.send_bytes(pack(ProgressMade(Progress(done=done, total=total, note=storable(note, LONGEST_NOTE)))))
 
     def log(self, text: str) -> None:
-        """Write a line to the job's log; `print` does the same."""
+        """Write a line to the job's log, as `print` does."""
         print(text, flush=True)  # noqa: T201 - the log is this process's output
 
     # -- the pipe --
 
     def _read_ahead(self, wanted: Iterable[tuple[T, PartPlace]]) -> Iterator[tuple[T, Any]]:
-        """Yield each object with its document, or None if the document does not exist.
+        """Yield each object with the document of its part, or with None if the document does not exist.
 
         Several requests are sent before the first answer arrives.
         """
@@ -266,7 +272,7 @@ class Context:
         return request
 
     def _value(self, request: int, missing: str = "not-found") -> Any:
-        """Wait for the answer to a request, and return its value.
+        """Wait for the answer to the request with this number, and return its value.
 
         Raises `NoSuchThing` with the code `missing` if the requested object does not exist. Raises `FileTooLarge` if
         the object is too large for the job. Raises `RequestRefused` if the request failed for another reason.
@@ -284,13 +290,13 @@ class Context:
         return reply.value
 
     def _unreadable(self, error: Unreadable) -> Unreadable:
-        """Note that the result depends on an object that cannot be read; return the error to raise."""
+        """Mark the result as not shareable, because an object cannot be read; return `error`, to be raised."""
         self.shareable = False
         return error
 
 
 def encode_outputs(outputs: Sequence[StagedOutput]) -> bytes:
-    """Return a `StageRequest` for the outputs in MessagePack; arrays that are already encoded are copied unchanged."""
+    """Encode a `StageRequest` with the outputs as MessagePack; arrays that are already encoded are copied unchanged."""
     request = StageRequest(outputs=tuple(outputs))
     fields = request.model_dump(by_alias=True, exclude={"outputs": {"__all__": {"parts"}}})["outputs"]
     whole = [{**each, "parts": output.parts} for each, output in zip(fields, outputs, strict=True)]

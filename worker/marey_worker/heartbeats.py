@@ -36,9 +36,9 @@ JITTER = 0.2
 class LeaseKeeper:
     """Thread that sends the heartbeats of one attempt.
 
-    `lost` and `cancelled` are set when the server reports that the lease is lost or the job was cancelled. If the
-    server does not answer, heartbeats are retried and the job continues; `confirm` checks the lease before results are
-    published.
+    `lost` is set when the server reports that the lease is lost, and `cancelled` when it reports that the job was
+    cancelled. If the server does not answer, heartbeats are retried and the job continues; `confirm` checks the lease
+    before results are published.
     """
 
     def __init__(self, api: AttemptApi, lease: Lease) -> None:
@@ -66,10 +66,10 @@ class LeaseKeeper:
         self._stopped.set()
 
     def confirm(self, *, patiently: bool) -> None:
-        """Send a heartbeat before the end of a job is reported, unless a recent one shows that the lease is valid.
+        """Make sure that the lease is valid, before the end of the job is reported.
 
-        With `patiently`, the heartbeat is retried for up to 10 minutes. Raises `LeaseLost` if the lease is lost, or the
-        client's error if the server does not answer.
+        A heartbeat is sent unless a recent one has succeeded. With `patiently`, it is retried for up to 10 minutes.
+        Raises `LeaseLost` if the lease is lost, or the client's error if the server does not answer.
         """
         self._confirming = True
         if self.lost.is_set() or time.monotonic() - self._answered > CONFIRM_AFTER * self._ttl_s:

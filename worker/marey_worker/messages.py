@@ -1,4 +1,4 @@
-"""Messages that a worker's supervisor process and its child process exchange through a pipe.
+"""Messages between a worker's supervisor process and its child process, through a pipe.
 
 The child never gets a token or an address.
 
@@ -63,9 +63,10 @@ class ChildReply:
 
 @dataclass(frozen=True)
 class ReadParts:
-    """Request for parts of revisions; the answer contains encoded documents, and None if a document does not exist.
+    """Request for parts of revisions.
 
-    The answer may omit documents at the end of a long list, but not the first one.
+    The answer contains an encoded document for each part, or None if it does not exist. It may omit documents at the
+    end of a long list, but not the first one.
     """
 
     request: int
@@ -83,7 +84,7 @@ class ReadItem:
 
 @dataclass(frozen=True)
 class FindItems:
-    """Request for items by name, directly in a collection, or anywhere in the project if `collection` is None."""
+    """Request for the items with a name in one folder, or in the whole project if `collection` is None."""
 
     request: int
     kind: Kind
@@ -108,7 +109,7 @@ class ReadResults:
 
 @dataclass(frozen=True)
 class ReadJudgements:
-    """Request for the answers of the participants of a revision of a study; the reply has one tree for each."""
+    """Request for the answers of a study's participants at a revision; the reply has one tree for each participant."""
 
     request: int
     item: str
@@ -155,7 +156,7 @@ BAD_RESULT = "bad-result"
 
 @dataclass(frozen=True)
 class Failed:
-    """Message that the job has failed."""
+    """Message that the job has failed: code and text of the reason, signature, and whether a retry may succeed."""
 
     code: str
     detail: str
@@ -196,7 +197,7 @@ def _plain(value: Any) -> str:
 
 
 def unpack(data: bytes) -> Any:
-    """Return the message that the bytes contain. Raises `BadMessage`."""
+    """Return the message that the bytes contain. Raises `BadMessage` if they contain no valid message."""
     try:
         name, fields = msgpack.unpackb(data, strict_map_key=True)
         return _FORMS[name].validate_python(fields)

@@ -1,8 +1,8 @@
 """Worker that runs one job, in a pod that was started for this job.
 
-A cluster may start several pods for one job. While another worker holds the job, this worker waits. If the lease of the
-other worker expires, this worker claims the job with a newer fence. It ends when the job has ended, whichever worker
-ran the job.
+A cluster may start several pods for one job. While another worker holds the job's lease, this worker waits. If that
+lease expires, this worker claims the job with a newer fence. It ends when the job has ended, whichever worker ran the
+job.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ STAND_BY_S = 5.0
 
 @dataclass(frozen=True)
 class NamedJob:
-    """Job that a worker was started for: the job `id`, or the task with the position `task` of this job."""
+    """Job for which a worker was started: the job `id`, or, if `task` is given, its task with this position."""
 
     id: str
     task: int | None = None
@@ -57,11 +57,11 @@ class OneJobWorker:
         self._stopping = threading.Event()
 
     def stop(self) -> None:
-        """Return the job to the queue if it runs here, and let `run` return."""
+        """Stop the worker: if it runs the job, the job returns to the queue; then `run` returns."""
         self._stopping.set()
 
     def run(self) -> int:
-        """Run the job, or wait until another worker has ended it; return the exit status.
+        """Run the job, or wait until another worker has ended it; return the exit status of the worker.
 
         0: the job has ended, or an attempt has succeeded; 1: the attempt has failed, and the queue decides about a
         retry; `INTERRUPTED_STATUS`: the worker was stopped, whether it held the job or not, because the pod must not
@@ -92,7 +92,7 @@ class OneJobWorker:
         return INTERRUPTED_STATUS if self._stopping.is_set() else 0
 
     def _obtain(self) -> Lease | None:
-        """Wait for the lease of the job; None if the job has ended, or if this worker was stopped."""
+        """Wait until this worker gets the lease of the job; None if the job has ended or the worker was stopped."""
         failures, claim_id = 0, uuid.uuid4().hex
         while not self._stopping.is_set():
             try:

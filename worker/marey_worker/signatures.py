@@ -1,4 +1,4 @@
-"""Signatures of failures, by which equal failures are recognised.
+"""Signatures of failures: texts that are equal for failures with the same cause.
 
 After two attempts with the same signature, a job is not retried.
 """
@@ -17,7 +17,7 @@ STAGING = "staging"
 
 
 def of_exception(error: BaseException) -> str:
-    """Return the signature of an exception: its type, and a digest of type and traceback. The text is not included."""
+    """Return the signature of an exception: its type, and a digest of its type and traceback, but not of its text."""
     frames = traceback.extract_tb(error.__traceback__)
     places = [f"{frame.filename.rpartition('/')[2]}:{frame.name}:{frame.lineno}" for frame in frames]
     digest = hashlib.sha256("\n".join([type(error).__qualname__, *places]).encode()).hexdigest()
@@ -25,12 +25,12 @@ def of_exception(error: BaseException) -> str:
 
 
 def of_exit(status: int) -> str:
-    """Return the signature of a process that ended unexpectedly."""
+    """Return the signature of a process that ended unexpectedly with `status`; negative: the number of a signal."""
     return f"exit:{_signal_name(-status) if status < 0 else status}"
 
 
 def describe_exit(status: int) -> str:
-    """Return a text that states how a process ended unexpectedly."""
+    """Return a text about a process that ended unexpectedly with `status`; negative: the number of a signal."""
     if status == -signal.SIGKILL:
         return "the process that ran the job was killed (SIGKILL); most likely the machine ran out of memory"
     if status < 0:

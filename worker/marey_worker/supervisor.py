@@ -1,4 +1,4 @@
-"""Supervisor of a worker: slots that claim and run jobs until the worker is stopped."""
+"""Supervisor of a worker: claims jobs and runs them in slots, until the worker is stopped."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ CHILD_MODULE = "marey_worker.child"
 class WorkerOptions:
     """Options of a worker.
 
-    `kinds` and `labels` select the jobs of the worker; `slots` is the number of concurrent jobs; `threads` is the total
-    number of threads of all slots. `cache` is the folder of cached inputs, and `cache_bytes` is its greatest size.
+    `kinds` and `labels` select the jobs that the worker claims; `slots` is the number of jobs that run at the same
+    time. `threads` is the total number of threads of all slots. `cache` is the folder of cached inputs, and
+    `cache_bytes` its greatest size.
     """
 
     name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
@@ -94,7 +95,7 @@ class Supervisor:
         self._refusal: MareyError | None = None
 
     def stop(self) -> None:
-        """Stop claiming jobs, return running jobs to the queue, and let `run` return."""
+        """Stop the worker: no more jobs are claimed, running jobs return to the queue, and `run` returns."""
         self._stopping.set()
 
     def run(self) -> int:
@@ -119,7 +120,7 @@ class Supervisor:
     # -- one slot --
 
     def _work(self) -> None:
-        """Claim and run jobs in one slot until the worker is stopped. An unexpected error stops the whole worker."""
+        """Claim and run jobs in one slot until the worker is stopped; an unexpected error stops the whole worker."""
         try:
             self._claim_and_run()
         except Exception:
@@ -164,7 +165,7 @@ class Supervisor:
         return _OpenClaim(self._claims.with_present_token(), uuid.uuid4().hex)
 
     def _claim(self, opened: _OpenClaim) -> tuple[Lease, ...]:
-        """Claim a job.
+        """Claim a job; return its lease, or an empty tuple if there is no job for this worker.
 
         If the answer to an earlier claim was lost, the same id is sent again, and the server returns the same job.
         """
@@ -212,7 +213,7 @@ class Supervisor:
 
 @dataclass(frozen=True)
 class _OpenClaim:
-    """Claim that is repeated with the same token and the same id until it is answered.
+    """Claim that is sent with the same token and the same id until it is answered.
 
     The server repeats its answer only for the token with which the claim was first sent. So a repeated claim uses this
     token, even if the worker has a newer token by then.

@@ -50,7 +50,10 @@ class SigningKey:
     algorithm: str | None
 
     def fits(self, algorithm: str, key_id: str | None) -> bool:
-        """Return whether the key can check a signature by `algorithm` whose header names the key `key_id`."""
+        """Return whether this key can check the signature of a token.
+
+        `algorithm` and `key_id` are given in the header of the token; `key_id` is None if the header names no key.
+        """
         return (
             self.key.key_type == _TYPES[algorithm[0]]
             and self.algorithm in (None, algorithm)
@@ -60,7 +63,7 @@ class SigningKey:
 
 @dataclass(frozen=True)
 class Expectation:
-    """Values that a valid token must have; clocks may differ by `leeway_s` seconds."""
+    """Values that the claims of a valid token must have; clocks may differ by `leeway_s` seconds."""
 
     issuer: str
     client_id: str
@@ -82,18 +85,21 @@ class Person:
 
 
 def read_keys(document: Mapping[str, Any]) -> tuple[SigningKey, ...]:
-    """Return the usable signing keys of a JSON Web Key Set; other keys are left out. Raises `ValueError`."""
+    """Return the usable signing keys of a JSON Web Key Set; other keys are left out.
+
+    Raises `ValueError` if the set is malformed, or has no usable key.
+    """
     keys = document.get("keys")
     if not isinstance(keys, list) or len(keys) > MOST_KEYS:
-        raise ValueError(f"the member `keys` is not a list of at most {MOST_KEYS} keys")
+        raise ValueError(f"the member `keys` of the key set is not a list of at most {MOST_KEYS} keys")
     found = tuple(key for key in map(_read_key, keys) if key is not None)
     if not found:
-        raise ValueError("no key of the set can check signatures")
+        raise ValueError("no key of the set can check signatures with an accepted algorithm")
     return found
 
 
 def _read_key(data: Any) -> SigningKey | None:
-    """Return a key, or None for a key of another type or purpose, a weak key or a malformed one."""
+    """Return a signing key from its JSON form; None if it is weak, malformed, or of another type or purpose."""
     if not isinstance(data, dict) or data.get("kty") not in _MEMBERS or data.get("use", "sig") != "sig":
         return None
     key_id, algorithm = data.get("kid"), data.get("alg")
@@ -132,26 +138,31 @@ def verify(token: str, keys: Sequence[SigningKey], expected: Expectation, now_s:
         key = _key_of(token, keys, registry)
         claims = jwt.decode(token, key, ALGORITHMS, registry).claims
     except (JoseError, ValueError, TypeError, RecursionError) as error:
-        raise InvalidIdToken("the signature is not valid") from error
+        raise InvalidIdToken("the signature of the token is not valid") from error
     _check_claims(claims, expected, now_s)
     return claims
 
 
 def _key_of(token: str, keys: Sequence[SigningKey], registry: jws.JWSRegistry) -> RSAKey | ECKey:
-    """Return the one key that fits the header of a token."""
+    """Return the key that fits the algorithm and the key id in the header of a token.
+
+    Raises `UnknownSigningKey` if no key fits, and `InvalidIdToken` if several keys fit or the header is not valid.
+    """
     header = jws.extract_compact(token.encode("ascii"), registry=registry).headers()
     if not isinstance(header, dict):
-        raise InvalidIdToken("the header is not a JSON object")
+        raise InvalidIdToken("the header of the token is not a JSON object")
     algorithm, key_id = header.get("alg"), header.get("kid")
     if algorithm not in ALGORITHMS:
         raise InvalidIdToken("the token is not signed with an accepted algorithm")
     if key_id is not None and not isinstance(key_id, str):
-        raise InvalidIdToken("the key id (`kid`) in the header is not a string")
+        raise InvalidIdToken("the key id (`kid`) in the header of the token is not a string")
     fitting = [one.key for one in keys if one.fits(algorithm, key_id)]
     if not fitting:
         raise UnknownSigningKey("the token is signed with a key that the provider does not list")
     if len(fitting) > 1:
-        raise InvalidIdToken("several keys of the provider fit the header, so the key of the token is not clear")
+        raise InvalidIdToken(
+            "several keys of the provider fit the token; each key needs a key id (`kid`), which the token must name"
+        )
     return fitting[0]
 
 
@@ -168,15 +179,17 @@ def _check_claims(claims: dict[str, Any], expected: Expectation, now_s: int) -> 
     try:
         registry.validate(claims)
     except ExpiredTokenError:
-        raise InvalidIdToken("the token has expired; if it is new, the clocks of the machines differ") from None
+        raise InvalidIdToken(
+            "the token has expired; if it is new, the clocks of this server and of the provider differ"
+        ) from None
     except MissingClaimError as error:
         raise InvalidIdToken(f"the token has no claim {error.claim}") from None
     except InvalidClaimError as error:
-        raise InvalidIdToken(f"the claim {error.claim} does not have the expected value") from None
+        raise InvalidIdToken(f"the claim {error.claim} of the token does not have the expected value") from None
     if claims.get("nonce") != expected.nonce:
-        raise InvalidIdToken("the claim nonce does not have the expected value")
+        raise InvalidIdToken("the claim nonce of the token does not have the expected value")
     audiences = claims["aud"] if isinstance(claims["aud"], list) else [claims["aud"]]
     if ("azp" in claims or len(audiences) > 1) and claims.get("azp") != expected.client_id:
-        raise InvalidIdToken("the claim azp does not have the expected value")
+        raise InvalidIdToken("the claim azp of the token does not have the expected value")
     if not _SUBJECT.fullmatch(claims["sub"]):
-        raise InvalidIdToken("the claim sub does not consist of 1 to 255 printable ASCII characters")
+        raise InvalidIdToken("the claim sub of the token does not consist of 1 to 255 printable ASCII characters")

@@ -23,7 +23,7 @@ def labels_key(labels: Mapping[str, str]) -> str:
     pairs = _checked_pairs(labels)
     key = ",".join(pairs)
     if len(key) > LONGEST_KEY:
-        raise _refusal(f"The labels have {len(key)} characters together; at most {LONGEST_KEY} are allowed.")
+        raise _refusal(f"The labels have {len(key)} characters in total; at most {LONGEST_KEY} are allowed.")
     return key
 
 

@@ -82,7 +82,7 @@ def literal_address(host: str) -> str | None:
 
 
 def is_protected(url: str) -> bool:
-    """Return whether requests to a URL cannot be read in transit: https, or http to an address of this machine."""
+    """Return whether a URL is safe from eavesdropping: https, or http with an address of this machine."""
     try:
         parts = urlsplit(url)
         host, _ = parts.hostname, parts.port  # which is a number only if the URL is well formed

@@ -146,27 +146,27 @@ def secret_matches(secret: str, secret_hash: str) -> bool:
 
 
 def split_user_token(text: str) -> tuple[str, str] | None:
-    """Return prefix and secret of a user's token, or None if `text` is no such token."""
+    """Split the token of a user into its prefix and its secret; return None for any other text."""
     return _split(text, _USER)
 
 
 def split_invitation(text: str) -> tuple[str, str] | None:
-    """Return prefix and secret of the code of an invitation, or None if `text` is no such code."""
+    """Split the code of an invitation into its prefix and its secret; return None for any other text."""
     return _split(text, CODE_PREFIX)
 
 
 def split_study_link(text: str) -> tuple[str, str] | None:
-    """Return prefix and secret of the code of a link to a study, or None if `text` is no such code."""
+    """Split the code of a study link into its prefix and its secret; return None for any other text."""
     return _split(text, LINK_PREFIX)
 
 
 def split_participant_token(text: str) -> tuple[str, str] | None:
-    """Return prefix and secret of the token of a participant, or None if `text` is no such token."""
+    """Split the token of a study's participant into its prefix and its secret; return None for any other text."""
     return _split(text, PARTICIPANT_PREFIX)
 
 
 def split_view_code(text: str) -> tuple[str, str] | None:
-    """Return prefix and secret of the code of a link to a project, or None if `text` is no such code."""
+    """Split the code of a link to a project into its prefix and its secret; return None for any other text."""
     return _split(text, VIEW_PREFIX)
 
 
@@ -178,7 +178,7 @@ def _split(text: str, start: str) -> tuple[str, str] | None:
 
 
 def attempt_secret(text: str) -> str | None:
-    """Return the secret of an attempt's token, with or without a seal, or None if `text` is no such token."""
+    """Return the secret in the token of an attempt, with or without a seal; return None for any other text."""
     return text[len(_ATTEMPT) :].partition("_")[0] or None if text.startswith(_ATTEMPT) else None
 
 

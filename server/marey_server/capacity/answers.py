@@ -1,4 +1,4 @@
-"""Answers for the command line, as plain values: computed needs, predicted jobs per second, and a file of costs."""
+"""Computations for capacity planning whose results are plain values, such as dictionaries of numbers."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ JOBS_PER_WORKER = 100
 
 
 class NotComputable(Exception):
-    """Error of costs or amounts that are not valid; the text gives the reason."""
+    """Error of costs or amounts from which nothing can be computed; the text gives the reason."""
 
 
 def capacity(*, costs: Path | None = None, **demand: Any) -> dict[str, Any]:
-    """Return the needs of an amount of work, and the costs from which they were computed.
+    """Return what the processing of planned clips needs: the load of each part of the installation, and bytes to store.
 
-    Raises `NotComputable` if the file of costs or an amount is not valid.
+    The result also has the date and machine of the measured costs. `costs` is a file of costs, by default that of this
+    package. `demand` contains the fields of `PlannedWork`. Raises `NotComputable` if the file or an amount is not
+    valid.
     """
     try:
         measured = MeasuredCosts.read(costs or MEASURED)
@@ -44,20 +46,20 @@ def capacity(*, costs: Path | None = None, **demand: Any) -> dict[str, Any]:
 
 
 def fit_idle(job: dict[str, float], workers: int, per_s: float, work_s: float, seed: int = 0) -> dict[str, float]:
-    """Return the costs of a job with the value of `idle` that fits a measurement of jobs per second best.
+    """Return `job` with the value of `idle` for which the simulation predicts the measured throughput best.
 
-    `workers` workers completed `per_s` jobs per second in the measurement, and `work_s` is the computation time of a
-    job in seconds. Raises `NotComputable` if the costs are not valid.
+    `job` contains the fields of `JobCosts`. In the measurement, `workers` workers completed `per_s` jobs per second,
+    each with a computation time of `work_s` seconds. Raises `NotComputable` if the costs are not valid.
     """
     candidates = [job | {"idle": step / IDLE_STEPS} for step in range(IDLE_STEPS)]
     return min(candidates, key=lambda costs: abs(predict(costs, (workers,), work_s, seed)[workers] - per_s))
 
 
 def predict(job: dict[str, float], workers: tuple[int, ...], work_s: float, seed: int = 0) -> dict[int, float]:
-    """Return the jobs per second that a simulation predicts, by the number of workers that run a backlog of jobs.
+    """Return the jobs per second that a simulation predicts for each number of workers in `workers`.
 
-    `job` contains the fields of `JobCosts`; `work_s` is the computation time of a job in seconds. Raises
-    `NotComputable` if the fields are not valid.
+    In the simulation, jobs are always waiting. `job` contains the fields of `JobCosts`; `work_s` is the computation
+    time of a job in seconds. Raises `NotComputable` if the fields are not valid.
     """
     try:
         costs = JobCosts.model_validate(job).in_queue()

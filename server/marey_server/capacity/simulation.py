@@ -23,7 +23,11 @@ FIRST_HEARTBEAT_S = 1.0
 
 @dataclass(frozen=True)
 class RequestCosts:
-    """Costs of one request: how long it occupies a station of the server, and how much longer the caller waits."""
+    """Costs of one request, in seconds.
+
+    The request occupies a station of the server for `busy_s`. Then the worker waits `idle_s` more for the answer. A
+    station stands for a part of the server that processes one request at a time.
+    """
 
     busy_s: float = 0.0
     idle_s: float = 0.0
@@ -34,7 +38,7 @@ FREE = RequestCosts()
 
 @dataclass(frozen=True)
 class QueueCosts:
-    """Costs of the requests of workers, and the number of stations of the server.
+    """Costs of the requests of workers, and the number of stations that process requests at the same time.
 
     If `batch_s` is not 0, a station processes all waiting requests together, like writes with a common commit: the
     batch occupies the station for `batch_s` plus the `busy_s` of each request. The times of requests have a gamma
@@ -62,7 +66,7 @@ class SimulatedJob:
 
 
 @dataclass(frozen=True)
-class Misfortune:
+class FailureRates:
     """Probabilities that an attempt fails at its end, and that its worker dies at a random time of the attempt.
 
     A dead worker is replaced at once, but its job waits for the end of the lease.
@@ -72,12 +76,16 @@ class Misfortune:
     death: float = 0.0
 
 
-LUCKY = Misfortune()
+NO_FAILURES = FailureRates()
 
 
 @dataclass
 class JobHistory:
-    """History of a simulated job; `end_s` is None if the job was never completed."""
+    """History of a simulated job: its starts, its end, and the numbers of its attempts and failures.
+
+    Times are in seconds from the start of the simulation. `end_s` is None if the job was never completed; `unstarted`
+    counts attempts whose worker died before the first heartbeat.
+    """
 
     starts_s: list[float] = field(default_factory=list)
     end_s: float | None = None
@@ -111,14 +119,14 @@ def simulate(
     costs: QueueCosts,
     *,
     seed: int = 0,
-    misfortune: Misfortune = LUCKY,
+    failure_rates: FailureRates = NO_FAILURES,
     policy: QueuePolicy = DEFAULT_POLICY,
 ) -> SimulatedRun:
     """Simulate the queue until no event is left; equal arguments give equal results.
 
     `workers` contains the labels of each worker. A job that no worker may run is never started.
     """
-    return _Simulation(jobs, workers, costs, random.Random(seed), misfortune, policy).run()  # noqa: S311 - no secret
+    return _Simulation(jobs, workers, costs, random.Random(seed), failure_rates, policy).run()  # noqa: S311 - no secret
 
 
 class _Simulation:
@@ -128,11 +136,11 @@ class _Simulation:
         workers: Sequence[frozenset[str]],
         costs: QueueCosts,
         draw: random.Random,
-        misfortune: Misfortune,
+        failure_rates: FailureRates,
         policy: QueuePolicy,
     ) -> None:
         self._jobs, self._workers, self._costs, self._draw = jobs, workers, costs, draw
-        self._misfortune = misfortune
+        self._failure_rates = failure_rates
         self._policy = replace(policy, random_unit=draw.random)
         self._now_s = 0.0
         self._events: list[tuple[float, int, Callable[[], None]]] = []
@@ -186,7 +194,7 @@ class _Simulation:
             self._at(self._now_s + busy_s, done)
 
     def _drawn(self, mean_s: float) -> float:
-        """Draw the time of a request with the given mean."""
+        """Draw the duration of a request, in seconds, from a distribution with the mean `mean_s`."""
         if not mean_s or not self._costs.variation:
             return mean_s
         shape = self._costs.variation**-2
@@ -195,7 +203,7 @@ class _Simulation:
     # -- the queue --
 
     def _queue(self, number: int, run_at_s: float) -> None:
-        """Queue a job that may run from `run_at_s` on."""
+        """Queue the job with this number, which may run from `run_at_s` on."""
         if run_at_s > self._now_s:
             self._at(run_at_s, lambda: self._queue(number, run_at_s))
             return
@@ -247,7 +255,7 @@ class _Simulation:
     def _start(self, worker: int, number: int, expires_s: float) -> None:
         history, work_s = self._histories[number], self._jobs[number].work_s
         history.starts_s.append(self._now_s)
-        dies = self._draw.random() < self._misfortune.death
+        dies = self._draw.random() < self._failure_rates.death
         lived_s = work_s * self._draw.random() if dies else work_s
         beats = list(_heartbeats(lived_s, self._policy.heartbeat_s))
         for beat_s in beats:
@@ -260,7 +268,7 @@ class _Simulation:
         self._at(renewed_s, lambda: self._lose(number, counted=bool(beats)))
 
     def _finish(self, worker: int, number: int) -> None:
-        failed = self._draw.random() < self._misfortune.failure
+        failed = self._draw.random() < self._failure_rates.failure
 
         def answered() -> None:
             self._end(number, failed=failed)
@@ -279,7 +287,10 @@ class _Simulation:
         self._again(number, wait_s=self._policy.backoff_us(history.failures) / SECOND_US)
 
     def _lose(self, number: int, *, counted: bool) -> None:
-        """Take a job back from a dead worker at the end of its lease."""
+        """Take a job back from a dead worker at the end of its lease.
+
+        `counted` is true if the attempt counts, because it has sent a heartbeat.
+        """
         history = self._histories[number]
         if counted:
             history.attempts += 1
@@ -288,7 +299,7 @@ class _Simulation:
         self._again(number, wait_s=0.0)
 
     def _again(self, number: int, *, wait_s: float) -> None:
-        """Queue a job again after a failed or lost attempt, or end it as failed."""
+        """Queue a job again after a failed or lost attempt, or end it as failed if no attempts are left."""
         history = self._histories[number]
         over = history.attempts >= self._jobs[number].max_attempts or history.unstarted > self._policy.max_unstarted
         history.failed = over
@@ -305,6 +316,6 @@ class _Simulation:
 
 
 def _heartbeats(seconds: float, every_s: float) -> list[float]:
-    """Return the times of the heartbeats of an attempt that lasts `seconds`."""
+    """Return the times of the heartbeats of an attempt that lasts `seconds`, in seconds from its start."""
     later = itertools.takewhile(lambda beat_s: beat_s < seconds, itertools.count(every_s, every_s))
     return [beat_s for beat_s in (FIRST_HEARTBEAT_S, *later) if beat_s < seconds]

@@ -46,7 +46,7 @@ MAX_LOGIN_BYTES = 4 * KIB
 
 
 def read_me(tx: Transaction) -> Me:
-    """Return the caller, who is a user or a job, with the scopes of the credential."""
+    """Return the caller, who is a user or an attempt of a job, with the scopes of the credential."""
     principal = tx.principal
     if principal.kind == "attempt" or principal.user_name is None:
         return Me(user=None, scopes=principal.scopes, job=principal.job_id)
@@ -66,9 +66,10 @@ def sign_in(tx: Transaction, attempt: SignInTry, verified_hash: str, expires_in_
 
 
 def count_try(tx: Transaction, attempt: SignInTry) -> str | None:
-    """Count a try to sign in; return the hash that the password must match.
+    """Count a try to sign in; return the stored hash that the password must match.
 
-    Return None if no active user with a password has this name. Raises `TooManyRequestsProblem`.
+    Return None if no active user with a password has this name. Raises `TooManyRequestsProblem` above the limit of
+    tries.
     """
     sign_ins.count(tx, attempt)
     return users.stored_hash(tx, attempt.name)
@@ -99,7 +100,8 @@ class PasswordResource(Resource):
         """Count a try to sign in and check its password.
 
         Return the try and the stored hash, or the try and None if the password does not match. The check takes the same
-        time for a user who does not exist. Raises `TooManyRequestsProblem` or `UnavailableProblem`.
+        time for a user who does not exist. Raises `TooManyRequestsProblem` above the limit of tries, and
+        `UnavailableProblem` if too many passwords are being checked.
         """
         services = self.services
         address = limited_address(self.client_address)
@@ -127,8 +129,8 @@ class PasswordResource(Resource):
     async def count_code(self, code: SecretStr, try_of: Callable[[str, str, int], SignInTry]) -> SignInTry:
         """Count a try to use the code of a link or an invitation, even if the code is not valid, and return the try.
 
-        `try_of` returns the try for the code, the address of the client, and the number of tries per minute. Raises
-        `TooManyRequestsProblem`.
+        `try_of(code, address, limit)` makes the `SignInTry` from the code, the client's address, and the allowed number
+        of tries per minute. Raises `TooManyRequestsProblem` above this number.
         """
         per_minute = self.services.settings.login_tries_per_minute
         attempt = try_of(code.get_secret_value(), limited_address(self.client_address), per_minute)
@@ -188,7 +190,7 @@ class TokenQuery(PageQuery):
     prefix: str | None = Field(
         None,
         max_length=16,
-        description="List only the token with this prefix, which is the text between the two `_` of its secret.",
+        description="List only the token with this prefix: the part `<prefix>` of `marey_<prefix>_<secret>`.",
     )
     ends_within_s: int | None = Field(
         None, ge=0, le=10 * 365 * 86400, description="List only tokens that expire within this number of seconds."

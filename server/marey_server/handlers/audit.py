@@ -24,12 +24,16 @@ class AuditQuery(PageQuery):
     subject: str | None = Field(
         None, min_length=1, max_length=1024, description="Name or id of the user or of the object that was changed."
     )
-    since: AwareDatetime | None = Field(None, description="List entries from this time on, with an offset such as Z.")
-    until: AwareDatetime | None = Field(None, description="List entries before this time, with an offset such as Z.")
+    since: AwareDatetime | None = Field(
+        None, description="List entries from this time on, in RFC 3339 with a time zone such as Z."
+    )
+    until: AwareDatetime | None = Field(
+        None, description="List entries before this time, in RFC 3339 with a time zone such as Z."
+    )
 
     @property
     def filter(self) -> AuditFilter:
-        """The filter for the store."""
+        """The query parameters as the `AuditFilter` by which the store selects entries."""
         return AuditFilter(self.kind, self.actor, self.subject, self.since, self.until)
 
 

@@ -83,7 +83,7 @@ RESOURCES: tuple[type[Resource], ...] = (
 
 
 def describe_api(_order: bytes) -> bytes:
-    """Return the packed `Description` of the API. Child processes run this function, because it takes seconds."""
+    """Return a packed `Description` of the API. A child process runs this function, because it takes seconds."""
     document = build_document(routes_of(RESOURCES), version("marey"))
     text = json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
     tag = hashlib.sha256(text).hexdigest()[:16]

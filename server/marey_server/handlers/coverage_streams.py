@@ -55,15 +55,15 @@ class ProjectCoverageStreams(Resource):
         The stream starts with no coverage, or with the coverage of an evaluation. A stream that receives no frames for
         a day is deleted; the number of streams of a project is limited.
         """
-        given = await self.look_up(coverage.read_given, project, body)
-        order = partial(coverage.begin_order, body, given)
+        inputs = await self.look_up(coverage.read_stream_inputs, project, body)
+        order = partial(coverage.begin_order, body, inputs)
         begun = await self.compute_apart(coverage.BEGIN_COVERAGE, order, BegunStream.unpack)
 
         def created(stream: Stream) -> Reply:
             location = f"/projects/{project}/coverage-streams/{stream.id}"
             return Reply(CoverageStreamState(**stream.shown(), **begun.shown), rev=stream.rev, location=location)
 
-        new = NewStream(begun.settings, given.rig, begun.state)
+        new = NewStream(begun.settings, inputs.rig, begun.state)
         return await self.answer_with(created, coverage_streams.create_stream, project, new)
 
 

@@ -77,7 +77,11 @@ class Events(Resource):
 
     @contextmanager
     def _counted(self) -> Iterator[None]:
-        """Count this connection for its user. Raises `TooManyRequestsProblem` above the limit `user_followers`."""
+        """Count this connection for its user while the `with` block runs.
+
+        Raises `TooManyRequestsProblem` if the user already has as many connections as the setting `user_followers`
+        allows.
+        """
         user, counts = str(self.principal and self.principal.user_id), self.services.followers
         limit = self.services.settings.user_followers
         if counts[user] >= limit:

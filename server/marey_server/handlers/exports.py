@@ -37,13 +37,13 @@ class ExportQuery(MotionFileOptions, ConsentOverride):
     end_index: EndIndex | None = Field(
         None,
         description="For annotations in the predecessor's format: whether a segment includes its frame `end_idx`. "
-        f"Absent: the imported file, if the annotation was not changed since; otherwise {DEFAULT_END_INDEX}.",
+        f"Absent: the imported file, if the annotation is unchanged since the import; otherwise {DEFAULT_END_INDEX}.",
     )
     form: AnnotationForm | None = Field(
         None,
         description="For annotations in the predecessor's format: layout of the file. `labels`: the segments of each "
         "label. `list`: one list of all segments, without labels. `frames`: the frames of each label. Absent: the "
-        f"imported file, if the annotation was not changed since; otherwise {DEFAULT_FORM}.",
+        f"imported file, if the annotation is unchanged since the import; otherwise {DEFAULT_FORM}.",
     )
     part: ExportPart | None = Field(
         None,
@@ -54,8 +54,8 @@ class ExportQuery(MotionFileOptions, ConsentOverride):
     layout: ExportLayout | None = Field(
         None,
         description="Layout of a file in the predecessor's format: 2 or 3 for models, `database` or `file` for "
-        "skeletons. Absent: the imported file, if the item was not changed since; otherwise, for skeletons `database`, "
-        "and for models the layout that contains the time function exactly, or else 3.",
+        "skeletons. Absent: the imported file, if the item is unchanged since the import; otherwise, for skeletons "
+        "`database`, and for models the layout that contains the time function exactly, or else 3.",
     )
     time: ExportTime = Field(
         "canonical",
@@ -84,7 +84,7 @@ class Export(BlobSender):
         Clips and aligned clips can be returned as bvh, npz, predecessor and json. Skeletons, annotations, models with
         their trees, and graphs can be returned as predecessor and json; items of other kinds only as json. The format
         `predecessor` stands for the file formats of Marey's predecessor. If an item was imported from such a file and
-        not changed since, the answer is this file, unless `layout`, `form` or `end_index` is given.
+        is unchanged since the import, the answer is this file, unless `layout`, `form` or `end_index` is given.
 
         If the consent for a clip has ended, the export is refused (409, `consent-expired`). The last day of the consent
         is in the take record of the clip's newest revision; an aligned clip has the consent of its source clip.

@@ -57,7 +57,7 @@ log = logging.getLogger(__name__)
 
 
 def page(title: str, text: str, code: str = "") -> bytes:
-    """Return an HTML page with a title, a text, and perhaps a code to copy."""
+    """Return an HTML page with a title and a text, and with `code`, which the person copies, if it is given."""
     shown = Markup("<p><code>{}</code></p>").format(code) if code else ""
     return _PAGE.format(title=title, text=text, code=shown).encode()
 
@@ -180,14 +180,16 @@ class CallbackQuery(Request):
 
     model_config = ConfigDict(extra="ignore")
 
-    state: str = Field("", max_length=200, description="The state that the server sent to the provider.")
+    state: str = Field("", max_length=200, description="Value of `state` that the server sent to the provider.")
     code: str = Field("", max_length=8192, description="Authorization code, if the person has signed in.")
-    iss: str | None = Field(None, max_length=512, description="Address of the provider, if the provider sends it.")
+    iss: str | None = Field(
+        None, max_length=512, description="Issuer (RFC 9207): address of the provider, if the provider sends it."
+    )
     error: str = Field("", max_length=200, description="Code of the error, if the person has not signed in.")
 
 
 class SignInCallback(BrowserResource):
-    """Return of a browser from the identity provider."""
+    """Address to which the identity provider sends a browser back."""
 
     path = CALLBACK_PATH
     tag = "Access"
@@ -267,7 +269,7 @@ class UserIdentities(ProviderResource):
     async def get(self, user: str, query: PageQuery) -> Rendered:
         """List the people at identity providers who can sign in as a user.
 
-        Only administrators may read those of other users.
+        Only administrators may read the identities of other users.
         """
         return await self.answer(identities.list_identities, user, cursor=query.cursor, limit=query.limit)
 

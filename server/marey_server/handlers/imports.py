@@ -25,7 +25,7 @@ from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 from marey_server.http.validation import decode_body, validate_body
 from marey_server.motions import importing
-from marey_server.motions.importing import PreparedImport, PutAside, SourceFile
+from marey_server.motions.importing import PreparedImport, SourceFile, UnclearFiles
 from marey_server.store import blobs, projects
 from marey_server.store.blob_backings import SPOOLED_BYTES, Spool
 from marey_server.store.jobs import submission
@@ -94,7 +94,7 @@ class ProjectImports(Resource):
         elif isinstance(piece, bytes) and self._field is not None:
             self._field += piece
             if sum(map(len, self.fields.values())) > MAX_FORM_BYTES:
-                raise TooLargeProblem(f"The form fields may have at most {MAX_FORM_BYTES} bytes together.")
+                raise TooLargeProblem(f"The form fields may have at most {MAX_FORM_BYTES} bytes in total.")
         elif self._file is not None:
             await self._take_file(*self._file)
             self._file = None
@@ -174,15 +174,15 @@ class ProjectImports(Resource):
         plans, order = await self.compute(importing.plan, [file.name for file in self.files])
         by_name = {file.name: file for file in reversed(self.files)}
         prepare = partial(self._prepare, by_name, options, skeleton)
-        aside = PutAside()
+        unclear = UnclearFiles()
         entries = await self._import_all(
-            project, ((place, partial(prepare, plans[place], None)) for place in order), aside
+            project, ((place, partial(prepare, plans[place], None)) for place in order), unclear
         )
         entries |= await self._import_all(
             project,
             (
                 (place, partial(_ready, file) if axis is None else partial(prepare, plans[place], axis))
-                for place, file, axis in aside.files()
+                for place, file, axis in unclear.files()
             ),
             None,
         )
@@ -190,10 +190,12 @@ class ProjectImports(Resource):
             self.services.metrics.imports.labels(entry.status).inc()
         return [entries[place] for place in range(len(plans))]
 
-    async def _import_all(self, project: str, works: Iterable[Work], aside: PutAside | None) -> dict[int, ImportEntry]:
-        """Read files in child processes while earlier files are stored; return the entries by place.
+    async def _import_all(
+        self, project: str, works: Iterable[Work], unclear: UnclearFiles | None
+    ) -> dict[int, ImportEntry]:
+        """Read files in child processes while earlier files are stored; return the entries by place in the import.
 
-        Files that `aside` takes are not stored.
+        Files of which the upward axis is not clear are recorded in `unclear`, if it is given, and not stored.
         """
         entries: dict[int, ImportEntry] = {}
         reading = deque(works)
@@ -209,7 +211,7 @@ class ProjectImports(Resource):
                     place, task = ahead[0]
                     file = await task
                     ahead.popleft()
-                    if aside is None or not aside.take(place, file):
+                    if unclear is None or not unclear.take(place, file):
                         ready[place] = file
                 if storing is not None:
                     entries |= await storing
@@ -269,7 +271,7 @@ class ProjectImports(Resource):
 
 
 async def _ready(file: PreparedImport) -> PreparedImport:
-    """Return a file that was read before."""
+    """Return `file`, which was read before; this takes the place of a coroutine that reads a file."""
     return file
 
 

@@ -62,7 +62,7 @@ class ItemsQuery(CountedPageQuery):
     fields: CommaSeparated | None = Field(None, description="Members of each item to return; absent: all.")
 
     def filters(self) -> ItemFilters:
-        """Return the filters for the store."""
+        """Convert the query parameters to the `ItemFilters` by which the store selects items."""
         return ItemFilters(
             collection=self.collection,
             directly_in=self.directly_in,
@@ -80,7 +80,10 @@ class ItemsQuery(CountedPageQuery):
 
 
 def kind_of(plural: str) -> Kind:
-    """Return the kind named by a segment of the address. Raises `NotFoundProblem`."""
+    """Return the kind whose plural is a segment of the address, such as `clips`.
+
+    Raises `NotFoundProblem` if there is none.
+    """
     try:
         return Kind.from_plural(plural)
     except KeyError:

@@ -16,7 +16,7 @@ from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.http.caching import IMMUTABLE
 from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated
-from marey_server.http.reply import Lasting, Loaded, Rendered, Reply
+from marey_server.http.reply import LoadedDocument, Rendered, Reply, UnchangingDocument
 from marey_server.http.resource import Resource
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
@@ -58,10 +58,10 @@ def read_part(
     found = items.find_part(tx, project, kind, item, part, revision=query.revision)
     load = partial(items.load_part, tx, found)
     if query.frames is None and query.joints is None:
-        content: Lasting | Loaded = Lasting(found.digest, load, found.size_bytes)
+        content: UnchangingDocument | LoadedDocument = UnchangingDocument(found.digest, load, found.size_bytes)
     else:
         cut = partial(items.cut_part, load(), query.frame_slice(), query.joints, encoded=encoded)
-        content = Loaded(cut, found.size_bytes)
+        content = LoadedDocument(cut, found.size_bytes)
     if query.revision is None:
         return Reply(content, rev=found.rev)
     return Reply(content, rev=f"r{found.revision}", headers={"Cache-Control": IMMUTABLE})
@@ -126,7 +126,8 @@ class Parts(Resource):
         If the documents together are too large, the last ones are missing from the list: request them again.
         """
         loaded = await self.look_up(items.load_parts, project, body.parts)
-        return await self.render_document(Reply(Loaded(lambda: {"documents": loaded.documents}, loaded.size_bytes)))
+        content = LoadedDocument(lambda: {"documents": loaded.documents}, loaded.size_bytes)
+        return await self.render_document(Reply(content))
 
 
 RESOURCES: tuple[type[Resource], ...] = (PartResource, Parts)

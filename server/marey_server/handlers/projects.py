@@ -92,7 +92,7 @@ class ProjectRestoration(Resource):
 
     @writes(access=Access.OWNER, answer=Project, etag=True, idempotency="key")
     async def post(self, project: str) -> Rendered:
-        """Restore the project of this name that was deleted last."""
+        """Restore a deleted project; of several deleted projects with this name, the one that was deleted last."""
         return await self.answer(projects.restore_project, project)
 
 

@@ -1,4 +1,4 @@
-"""Resources of purges, which delete deleted items and datasets for good."""
+"""Resources of purges, which permanently remove items and datasets that were deleted before."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class ProjectPurges(Resource):
 
     @writes(access=Access.OWNER, body=PurgeRequest, answer=PurgeAnswer, idempotency="key")
     async def post(self, project: str, body: PurgeRequest) -> Rendered:
-        """Purge deleted items: delete their revisions, documents and names for good, or preview the purge.
+        """Purge deleted items: remove their revisions, documents and names permanently, or preview the purge.
 
         An item is not purged if a version of a dataset, a document of another item, or an unfinished job still needs
-        it; the answer lists these holders. If the only requested item is still needed, the answer is 409, with the
-        holders in `context`. Garbage collection frees the bytes later. One request examines a limited number of items;
-        send `next` of the answer as `after` to continue.
+        it. The answer lists what needs each of these items. If the only requested item is still needed, the answer is
+        409, with the same list in `context`. Garbage collection frees the bytes later. One request examines a limited
+        number of items; to continue, send the value of `next` in the answer as `after`.
         """
         if body.preview:
             return await self.render_document(Reply(await self.look_up(purging.preview_purge, project, body)))
@@ -38,11 +38,11 @@ class DatasetPurges(Resource):
 
     @writes(access=Access.OWNER, body=DatasetPurgeRequest, answer=DatasetPurgeAnswer, idempotency="key")
     async def post(self, project: str, body: DatasetPurgeRequest) -> Rendered:
-        """Purge a deleted dataset: delete its versions, branches, tags and proposals for good, or preview the purge.
+        """Purge a deleted dataset: remove its versions, branches, tags and proposals permanently, or preview the purge.
 
         A version is still needed by items that a job made from it, and by unfinished jobs that read it. If there are
         such items or jobs, the answer is 409 (`still-held`), and `context` lists them. The purge does not delete the
-        items in the versions; afterwards, deleted items among them can be purged.
+        items in the versions. After it, items of these versions that are marked as deleted can be purged, too.
         """
         if body.preview:
             return await self.render_document(Reply(await self.look_up(purging.preview_dataset_purge, project, body)))

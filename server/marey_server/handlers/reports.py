@@ -68,7 +68,10 @@ class StoredFileSender(BlobSender):
     """Base of resources that answer with a file to which a document or the result of a job refers."""
 
     async def send_file(self, file: StoredFile, media_type: str, cache_control: str, sandbox: str) -> Rendered | None:
-        """Answer with the file; a content security policy with `sandbox` restricts browsers that display the file."""
+        """Answer with the file and a Content-Security-Policy for browsers that display the file.
+
+        `sandbox` is the part of the policy that restricts scripts.
+        """
         return await self.send_blob(
             file.blob,
             disposition="inline",
@@ -81,16 +84,18 @@ class StoredFileSender(BlobSender):
 class ReportSender(StoredFileSender):
     """Base of resources that answer with the page of a report.
 
-    The stored page has empty places for its origin and for the player. They are filled here, because the stored bytes
-    depend only on what the report was computed from (decision record 0091).
+    The stored page has empty places for its origin (project, address, author and time) and for the player of motions.
+    They are filled here, because the stored bytes depend only on what the report was computed from (decision record
+    0091).
     """
 
     async def send_report(
         self, file: StoredFile, origin: ReportOrigin, scripts: Sequence[str] = ()
     ) -> Reply | Rendered | None:
-        """Answer with a page and its origin; a page that runs `scripts` and has a place for the player also gets it.
+        """Answer with the page of a report, in which the origin and, if necessary, the player are filled in.
 
-        `scripts` are digests of the page's scripts. Pages above `MOST_FILLED_BYTES` are sent as they are stored.
+        `scripts` are digests of the page's scripts. A page gets the player if it runs scripts and has a place for the
+        player. Pages above `MOST_FILLED_BYTES` are sent as they are stored.
         """
         self.holding.grow(2 * min(file.size_bytes, MOST_FILLED_BYTES))
         stored = await self.look_up(_read_page, file)
@@ -109,7 +114,7 @@ class ReportSender(StoredFileSender):
         return Reply(page, rev=digest, media_type=PAGE_TYPE, headers=headers)
 
     def origin(self, project: str, author: str | None, made_at: datetime) -> ReportOrigin:
-        """Return the origin of a report, with the address at which the caller has reached the server."""
+        """Return the origin of a report: project, author, time, and the address of this server for browsers."""
         address = self.services.settings.public_url or f"{self.request.protocol}://{self.request.host}"
         return ReportOrigin(project, address.rstrip("/"), author, made_at)
 
@@ -120,16 +125,17 @@ def _sandbox(scripts: Sequence[str]) -> str:
 
 
 def _read_page(tx: Transaction, file: StoredFile) -> bytes | None:
-    """Return a page; None if it is too large to be filled, or larger than the document states that refers to it.
+    """Return the stored page of a report, or None if it is too large to be filled in.
 
-    Clients write such documents. If they state a small size of a large blob, it must not be read into memory.
+    Also return None if the page is larger than `file` states. `file` is part of a document that a client may have
+    written; a false size must not make the server read a large blob into memory.
     """
     size = blobs.require_readable(tx, file.blob)
     return None if size > min(file.size_bytes, MOST_FILLED_BYTES) else blobs.read_blob(tx, file.blob, 0, size)
 
 
 def _filled(stored: bytes, origin: ReportOrigin, player: PackedPlayer | None) -> tuple[bytes, str]:
-    """Return a page with its origin and the player, and a digest of this page."""
+    """Fill in the origin and the player, if one is given; return the page and the first 32 digits of its SHA-256."""
     page = with_origin(stored, origin)
     if player is not None:
         page = with_player(page, player.content)
@@ -183,7 +189,10 @@ class Figure(StoredFileSender):
 def read_report_of(
     tx: Transaction, project: str, kind: Kind, item_id: str, number: int | None
 ) -> tuple[ReportDocument, Revision]:
-    """Return the report of an item, and the revision that it belongs to. Raises `NotFoundProblem`."""
+    """Return the report of an item, and the revision that it belongs to.
+
+    Raises `NotFoundProblem` if the item does not exist or has no report.
+    """
     part = items.read_part(tx, project, kind, item_id, "report", revision=number, arrays="none")
     tree: dict[str, Any] = part.tree
     report = _REPORT_OF[tree["schema"]].model_validate(tree)

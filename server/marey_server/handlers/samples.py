@@ -36,7 +36,7 @@ class SampleQuery(Request):
 
 
 class SampleFileQuery(SampleQuery):
-    """Query parameters of samples that are sent as files: as in `SampleQuery`, and the file format and unit."""
+    """Query parameters of samples that are sent as files: those of `SampleQuery`, the file format, and its unit."""
 
     format: MotionFormat = Field(
         DEFAULT_FORMAT, description="File format; several files are returned in one ZIP archive."
@@ -105,7 +105,7 @@ class SampleFiles(ModelUser):
 
 
 def _state(found: FoundModel, query: SampleQuery) -> str:
-    """Return the entity tag of samples: digest and revision of the model, number of samples, and seed."""
+    """Return the text from which the ETag of samples is made: digest and revision of the model, `count` and seed."""
     return f"{found.part.digest.removeprefix('sha256:')[:32]}.{found.part.revision}.{query.n}.{query.seed}"
 
 

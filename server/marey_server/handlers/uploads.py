@@ -80,7 +80,7 @@ async def finish_upload(resource: Resource, upload: uploads.StoredUpload) -> upl
 
 
 def upload_reply(upload: uploads.StoredUpload) -> Reply:
-    """Return the state of an upload in body and headers."""
+    """Return the answer that shows the state of an upload, in its body and in its headers."""
     shown = Upload(id=upload.id, length=upload.length, offset=upload.offset, digest=upload.digest)
     headers = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length), "Cache-Control": NOT_STORED}
     return Reply(shown, headers=headers)

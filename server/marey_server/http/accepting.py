@@ -56,11 +56,11 @@ _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 class CannotListen(Exception):
-    """Error of a server that cannot listen on its address or port; the text contains address, port and reason."""
+    """Error of a server that cannot listen on its address and port; the text contains address, port and reason."""
 
 
 def listen(host: str, port: int) -> list[socket.socket]:
-    """Return listening sockets at an address. Raises `CannotListen`."""
+    """Return sockets that listen on an address. Raises `CannotListen`, for example if the port is in use."""
     try:
         return bind_sockets(port, host)
     except OSError as error:
@@ -103,7 +103,7 @@ def default_connections() -> int:
 class _Connection(IOStream):
     """Connection that counts the bytes received by its client since the last call of `start_count`.
 
-    The connection also records the fault of the client for which it is closed.
+    The connection also records which fault of the client, if any, makes the server close it.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class _Connection(IOStream):
         self._reads_head = self._ended_by_client = self._malformed = self._answered = self._sends = False
 
     def fault(self) -> str | None:
-        """Return the fault of the client (a key of `_FAULTS`) for which the connection is being closed, or None."""
+        """Return the fault of the client (a key of `_FAULTS`) that makes the server close the connection, or None."""
         if self._malformed:
             return "malformed"
         if isinstance(self.error, UnsatisfiableReadError):
@@ -131,7 +131,7 @@ class _Connection(IOStream):
         return None if self._answered else "body-timeout"
 
     def read_until_regex(self, regex: bytes, max_bytes: int | None = None) -> Awaitable[bytes]:
-        """Read the head of a request."""
+        """Read the head of a request: the request line and the headers."""
         self._requests += 1
         self._reads_head, self._answered = True, False
         self._sends = self._read_buffer_size > 0  # the begin of the head may have come with the request before
@@ -143,7 +143,7 @@ class _Connection(IOStream):
         return super().read_until(delimiter, max_bytes)
 
     def read_bytes(self, num_bytes: int, partial: bool = False) -> Awaitable[bytes]:
-        """Read a part of a body."""
+        """Read `num_bytes` bytes of a body, or fewer if `partial` is true."""
         self._reads_head = False
         return super().read_bytes(num_bytes, partial)
 
@@ -298,9 +298,9 @@ class Connections:
             del self._by_address[one.address]
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
-        """Stop accepting connections for a moment.
+        """Stop accepting connections for `PAUSE_S` seconds, after a failure for lack of descriptors or memory.
 
-        Without this pause, the event loop would repeat a failed `accept` at once and without end.
+        Without this pause, the event loop would repeat the failed `accept` at once and without end.
         """
         loop = asyncio.get_running_loop()
         loop.remove_reader(listening)
@@ -322,7 +322,10 @@ class Connections:
         self.close_slow(time.monotonic())
 
     def close_slow(self, now_s: float) -> None:
-        """Close connections whose clients have not received enough of the waiting bytes by `now_s`."""
+        """Close each connection whose client has received too little of the waiting bytes.
+
+        The limit is `LEAST_TAKEN_BYTES` within each write timeout; `now_s` is the time of the monotonic clock.
+        """
         for one in [one for one in self._open if one.writing() and now_s - one.since_s >= self._write_timeout_s]:
             if one.taken_bytes < LEAST_TAKEN_BYTES:
                 self._log("slow", "closed a connection of %s, whose client read only %d bytes in %.0f s",

@@ -37,7 +37,10 @@ def is_secure(name: str) -> bool:
 
 
 def sent_cookies(request: HTTPServerRequest, project: str) -> dict[str, str]:
-    """Return the tokens of sessions in a project that the browser has sent, by the name of their cookie."""
+    """Return the session tokens of a project that the browser has sent, by the name of the cookie.
+
+    There are at most two: the cookies for https and for http have different names.
+    """
     if "Cookie" not in request.headers:
         return {}
     sent: dict[str, Morsel[Any]] = dict(request.cookies)
@@ -63,7 +66,11 @@ def _is_foreign(request: HTTPServerRequest) -> bool:
 
 
 def session_token(request: HTTPServerRequest, operation: Operation, project: str | None) -> str | None:
-    """Return the token of the browser's session, if the operation only reads the project of the session."""
+    """Return the token of the browser's session in a project, from the cookies of the request.
+
+    Return None if the browser has sent none, if another site has caused the request, or if the operation does more than
+    read the project.
+    """
     reads_project = operation.method == "GET" and operation.scope == "read" and operation.access.role is not None
     if project is None or not reads_project or _is_foreign(request):
         return None

@@ -18,5 +18,5 @@ WITH_SECRET = MappingProxyType({"Cache-Control": NOT_STORED})
 
 
 def caching_of_revision(named: int | None) -> str:
-    """Return the Cache-Control of an answer about the revision `named` (None: the newest revision)."""
+    """Return the Cache-Control of an answer that shows the revision `named`; None: the newest revision."""
     return REVALIDATED if named is None else IMMUTABLE

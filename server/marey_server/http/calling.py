@@ -77,7 +77,7 @@ class CallingExchange(Exchange):
 
     @cached_property
     def holding(self) -> Holding:
-        """Memory that this request holds: its body and its answer."""
+        """Memory that is counted for this request: the bytes of its body and of its answer."""
         return Holding(self.services.memory, self.client, reserved=self.operation.reserved)
 
     @cached_property
@@ -90,11 +90,11 @@ class CallingExchange(Exchange):
         with suppress(UnauthenticatedProblem):
             token = bearer_token(self.request.headers.get("Authorization"))
         if token is not None and (key := self.services.client_key(token)) is not None:
-            return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.departure)
-        return Client(limited_address(self.client_address), known=False, is_gone=self.departure)
+            return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.client_gone)
+        return Client(limited_address(self.client_address), known=False, is_gone=self.client_gone)
 
     def log_exception(self, typ: Any, value: Any, tb: Any) -> None:  # noqa: ARG002
-        """Log internal errors with their traceback; refusals are not logged as errors."""
+        """Log an internal error with its traceback; errors that refuse a request (`ApiProblem`) are not logged."""
         log_fault(value, self.request_id, self.request.method or "", self.template(), trace_id=self.trace_id)
 
     def _write_problem(self, error: BaseException) -> None:
@@ -121,11 +121,12 @@ class CallingExchange(Exchange):
             yield
 
     async def compute_in_child(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
-        """Call `function` (`module:name`) in a child process, with `make()` as argument, and return `read(result)`.
+        """Call `function` (`module:name`) in a child process, and return its result.
 
-        If the client closes the connection, the child is killed and `ClientGoneProblem` is raised.
+        `make()` returns the argument of the function as bytes; `read` converts the returned bytes to the result. If the
+        client closes the connection, the child is killed and `ClientGoneProblem` is raised.
         """
-        if self.departure.gone:
+        if self.client_gone.value:
             raise ClientGoneProblem(CLIENT_GONE)
         count_stop = self.services.metrics.count_stopped_child
         task = self.services.children.submit(self._child_user, function, make, read, count_stop)
@@ -136,16 +137,16 @@ class CallingExchange(Exchange):
             return await asyncio.wrap_future(task.future)
         except asyncio.CancelledError:
             task.abandon()
-            if self.departure.gone:
+            if self.client_gone.value:
                 raise ClientGoneProblem(CLIENT_GONE) from None
             raise
         finally:
             self._in_children.discard(task)
 
     async def compute_apart(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
-        """Call a function in a child process as `compute_in_child` does; the request counts as one that uses children.
+        """Call a function in a child process as `compute_in_child` does, and count this request as a user of children.
 
-        Raises `UnavailableProblem` if too many requests use child processes or wait for one.
+        `make` runs in a thread. Raises `UnavailableProblem` if too many requests use child processes or wait for one.
         """
         async with self.using_children():
             order = await self.compute(make)
@@ -154,7 +155,7 @@ class CallingExchange(Exchange):
 
     @property
     def _child_user(self) -> str:
-        """User whose share of child processes this request uses; all callers without a user have one common share."""
+        """User whose share of child processes this request uses; all callers without a user share one."""
         user = self.principal.user_id if self.principal is not None else None
         return user or UNKNOWN_CLIENTS
 

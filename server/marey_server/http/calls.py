@@ -20,7 +20,7 @@ from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import BadRequestProblem, ForbiddenProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Access, Operation
-from marey_server.http.reply import AnswerCache, AnswerForm, Loaded, Rendered, Reply, render, settle
+from marey_server.http.reply import AnswerCache, AnswerForm, LoadedDocument, Rendered, Reply, load_content, render
 from marey_server.store import idempotency, projects
 from marey_server.store.credentials import tokens
 from marey_server.store.idempotency import StoredAnswer
@@ -45,7 +45,8 @@ class Caller:
     def identify(self, tx: Transaction) -> None:
         """Find the credential's principal, check whether it may perform the operation, and set `tx.principal`.
 
-        The store enforces the role that the operation declares. Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
+        The store enforces the role that the operation declares. Raises `UnauthenticatedProblem` if the credential is
+        not valid or is missing, and `ForbiddenProblem` if the principal may not perform the operation.
         """
         self.principal = ANONYMOUS if self.token is None else tokens.resolve_token(tx, self.token)
         require_access(self.operation, self.principal)
@@ -97,7 +98,7 @@ Admission = tuple[str, Access, str | None, bool, bool, bool, bool, BodyTarget]
 
 
 def admission_of(caller: Caller, target: BodyTarget) -> Admission:
-    """Return the properties of a request by which the server decides whether the caller may send the body."""
+    """Return the key under which the decision is cached whether a caller may send the body of a request."""
     operation = caller.operation
     return (
         hash_secret(caller.token or ""), operation.access, operation.scope, operation.public, operation.attempts,
@@ -106,9 +107,9 @@ def admission_of(caller: Caller, target: BodyTarget) -> Admission:
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
-    """Refuse callers who may never perform the operation, regardless of its object.
+    """Refuse callers who may not perform the operation on any object, whatever their roles in projects are.
 
-    Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
+    Raises `UnauthenticatedProblem` for an anonymous caller, and `ForbiddenProblem` for all others.
     """
     access = operation.access
     guests = access is Access.ANYONE or (access is Access.READER and operation.public)
@@ -159,7 +160,10 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
 
 
 def _require_participation(access: Access, principal: Principal) -> None:
-    """Refuse operations for participants to all other callers, and all other operations to participants of studies."""
+    """Let only participants of studies perform the operations for participants, and no other operations.
+
+    Raises `ForbiddenProblem` for all other callers and operations.
+    """
     if access is Access.ANYONE:
         return
     if access is not Access.PARTICIPANT:
@@ -208,8 +212,8 @@ def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
         stored = idempotency.begin(tx, idempotent.key, idempotent.fingerprint)
         if stored is not None:
             return _repeated(tx, call.caller, idempotent, stored)
-    reply = settle(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
-    if isinstance(reply.content, Loaded):
+    reply = load_content(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
+    if isinstance(reply.content, LoadedDocument):
         return reply
     rendered = render(reply, call.form, call.answers)
     if idempotent is not None:
@@ -244,8 +248,8 @@ def _require_role_again(idempotent: IdempotentRequest, tx: Transaction) -> None:
 def admit(tx: Transaction, target: BodyTarget) -> None:
     """Refuse a caller who lacks the role that the operation declares for the project.
 
-    If the operation belongs to an attempt of a job, only the token of this attempt is admitted. `run_plain` has checked
-    the credential before.
+    If the operation belongs to an attempt of a job, only the token of this attempt is admitted. The credential must
+    have been checked before in the same transaction, as `run_plain` does.
     """
     if target.project is not None:
         projects.require(tx, target.project)
@@ -254,7 +258,7 @@ def admit(tx: Transaction, target: BodyTarget) -> None:
 
 
 def run_plain(caller: Caller, function: Callable[[Transaction], T], tx: Transaction) -> T:
-    """Run a function on behalf of the caller and return its result."""
+    """Identify the caller in the transaction, run a function on the caller's behalf, and return its result."""
     caller.identify(tx)
     return function(tx)
 

@@ -42,7 +42,7 @@ ABSENT = Precondition(absent=True)
 
 
 def entity_tag(state: int | str, form: str) -> str:
-    """Return the ETag header for a state and a form."""
+    """Return the value of the header ETag for a state of a resource that is sent in the form `form`, such as `json`."""
     return f'"{state}.{form}"'
 
 
@@ -53,7 +53,10 @@ def without_digest(tag: str) -> str:
 
 
 def parse_tags(header: str) -> list[str]:
-    """Return the opaque values of a list of tags, weak or strong; `["*"]` for `*`. Raises `BadRequestProblem`."""
+    """Return the values of a list of entity tags without quotation marks, weak or strong; `["*"]` for `*`.
+
+    Raises `BadRequestProblem` if the list is malformed or empty.
+    """
     if header.strip() == "*":
         return ["*"]
     tags: list[str] = []
@@ -70,7 +73,9 @@ def parse_tags(header: str) -> list[str]:
             raise BadRequestProblem(f"Entity tags in a header must be separated by commas: {header[:200]}")
         position += 1
     if not tags:
-        raise BadRequestProblem("The header If-Match or If-None-Match contains no entity tag.")
+        raise BadRequestProblem(
+            "The header If-Match or If-None-Match contains no entity tag; send the ETag of the resource, or *."
+        )
     return tags
 
 
@@ -83,7 +88,7 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 
 
 def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
-    """Return the precondition of a write.
+    """Return the precondition of a write, from the headers If-Match and If-None-Match.
 
     Raises `PreconditionRequiredProblem` if the request has no precondition, and `BadRequestProblem` if the tags are
     malformed or too many. Raises `PreconditionFailedProblem` if no tag begins with the `rev` of a resource.
@@ -97,7 +102,7 @@ def write_precondition(if_match: str | None, if_none_match: str | None, *, may_c
         return ABSENT
     if if_match is None:
         hint = "If-Match with the ETag you read, or *" + (", or If-None-Match: * to create" if may_create else "")
-        raise PreconditionRequiredProblem(f"State which version of the resource the change is for: send {hint}.")
+        raise PreconditionRequiredProblem(f"Name the version of the resource that you want to change: send {hint}.")
     tags = parse_tags(if_match)
     if tags == ["*"]:
         return ANY_STATE

@@ -1,7 +1,7 @@
 """Examples of requests and answers, made from their schemas.
 
-A value is what the schema itself gives as an example, or the text that fits the name of the member, or else the
-simplest value that the schema allows.
+If a schema has an example, this is used. Otherwise, a text is an example that fits the name of its member, and any
+other value is the simplest one that the schema allows.
 """
 
 from __future__ import annotations
@@ -44,7 +44,10 @@ _FORMATS = {
 
 
 def example_of(schema: Schema, components: Mapping[str, Schema], name: str = "", depth: int = 0) -> Any:
-    """Return a value that a schema allows; `components` contains the schemas to which it refers by name."""
+    """Return an example of a value that a schema allows.
+
+    `components` contains the schemas to which `$ref` refers, by name. `name` is the name of the member or parameter.
+    """
     if "$ref" in schema:
         schema = {**components[schema["$ref"].rpartition("/")[2]], **schema}
     for given in (schema.get("examples", ()), schema.get("enum", ())):
@@ -122,7 +125,10 @@ def _number(schema: Schema, kind: str) -> float:
 
 
 def curl_command(method: str, path: str, operation: Schema, shared: list[dict[str, Any]]) -> str:
-    """Return a command that sends an example of a request; `shared` are the parameters of the path."""
+    """Return a curl command that sends the example of a request.
+
+    `operation` is the OpenAPI operation with its examples; `shared` are the OpenAPI parameters of the path.
+    """
     for parameter in shared:
         path = path.replace(f"{{{parameter['name']}}}", quote(str(parameter["example"]), safe=""))
     needed = [one for one in operation["parameters"] if one["required"]]

@@ -51,17 +51,17 @@ _SECURITY_HEADERS = {
 log = logging.getLogger(__name__)
 
 
-class Departure:
-    """Function without arguments that returns whether the client of a request has closed the connection.
+class ClientGone:
+    """Whether the client of a request has closed the connection; also a function that returns this.
 
     The request refers to this object, but this object does not refer to the request. Otherwise, the two would form a
     reference cycle, which only the garbage collector frees.
     """
 
-    gone = False
+    value = False
 
     def __call__(self) -> bool:
-        return self.gone
+        return self.value
 
 
 class Exchange(RequestHandler):
@@ -79,7 +79,7 @@ class Exchange(RequestHandler):
         self.received_bytes = 0
         self.problem_code: str | None = None
         self.refused = self.performing = False
-        self.departure = Departure()
+        self.client_gone = ClientGone()
 
     def _begin_trace(self) -> RequestTrace | None:
         tracer = self.services.tracer
@@ -123,10 +123,7 @@ class Exchange(RequestHandler):
         return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     def drop(self) -> None:
-        """Discard the received part of the body of a refused request.
-
-        Closes the connection if the body is too long.
-        """
+        """Close the connection if a refused request has sent too much of its body; shorter bodies are ignored."""
         if self.received_bytes > LINGER_BYTES:
             self.wire.close()
 
@@ -140,7 +137,7 @@ class Exchange(RequestHandler):
         self.set_status(rendered.status)
         for name, value in rendered.headers.items():
             self.set_header(name, value)
-        if self.services.parting:
+        if self.services.lingering:
             self.set_header("Connection", "close")
         if rendered.status not in (204, 304):
             self.set_header("Content-Length", str(len(rendered.body) if whole_bytes is None else whole_bytes))
@@ -155,9 +152,9 @@ class Exchange(RequestHandler):
         await self.flush()
 
     async def refuse(self, error: ApiProblem) -> None:
-        """Answer before the body is read, then discard the body (closing the connection could lose the answer).
+        """Answer before the body is read; the body is then discarded, because closing could lose the answer.
 
-        From then on, the connection is idle: it is closed if there are too many connections.
+        From then on, the connection counts as idle: it is closed if there are too many connections.
         """
         self.refused = True
         self._write_problem(error)
@@ -175,12 +172,12 @@ class Exchange(RequestHandler):
 
     @property
     def stream(self) -> object:
-        """The stream of the request's connection, by which `Connections` identifies it."""
+        """The stream of the request's connection, which `Connections` uses as the key of the connection."""
         return self.wire.stream
 
     def is_awaited(self) -> bool:
         """Return whether the client is still connected and the server is not stopping."""
-        return not self.departure.gone and not self.services.draining.is_set()
+        return not self.client_gone.value and not self.services.draining.is_set()
 
     async def pause(self, seconds: float) -> bool:
         """Wait for `seconds` and return False, or return True as soon as the server is stopping."""
@@ -256,7 +253,7 @@ class Exchange(RequestHandler):
     def on_connection_close(self) -> None:
         """Record that the client has closed the connection."""
         super().on_connection_close()
-        self.departure.gone = True
+        self.client_gone.value = True
         if not self.performing:  # a method that runs ends by itself, and a draining server waits for it
             self.services.in_flight.discard(self)
 
@@ -322,7 +319,7 @@ def _problem(status: int, code: str, title: str, detail: str, request_id: str) -
 
 
 def log_fault(error: BaseException, request_id: str, method: str, path: str, *, trace_id: str | None = None) -> None:
-    """Log an internal error with its traceback."""
+    """Log an internal error with its traceback; errors that refuse a request are not logged."""
     if isinstance(error, ApiProblem | HTTPError | StreamClosedError | UnauthenticatedProblem):
         return
     log.error("%s %s failed", method, path, exc_info=error, extra={"request_id": request_id, "trace_id": trace_id})

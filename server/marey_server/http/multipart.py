@@ -33,7 +33,11 @@ Piece = PartHead | bytes | PartEnd
 
 
 def boundary_of(content_type: str) -> bytes:
-    """Return the boundary of a Content-Type header. Raises `UnsupportedMediaTypeProblem` or `BadRequestProblem`."""
+    """Return the boundary of a Content-Type header.
+
+    Raises `UnsupportedMediaTypeProblem` for another media type, and `BadRequestProblem` if the boundary is missing or
+    too long.
+    """
     media_type, parameters = parse_options_header(content_type)
     if media_type != b"multipart/form-data":
         raise UnsupportedMediaTypeProblem(
@@ -42,13 +46,14 @@ def boundary_of(content_type: str) -> bytes:
     boundary = parameters.get(b"boundary", b"")
     if not 0 < len(boundary) <= MAX_BOUNDARY_BYTES:
         raise BadRequestProblem(
-            f"The Content-Type contains no boundary of 1 to {MAX_BOUNDARY_BYTES} bytes.", code="bad-multipart"
+            f"The Content-Type multipart/form-data needs a boundary of 1 to {MAX_BOUNDARY_BYTES} bytes.",
+            code="bad-multipart",
         )
     return boundary
 
 
 class MultipartReader:
-    """Splitter of a stream into parts; each part gives one `PartHead`, its bytes in pieces, and one `PartEnd`.
+    """Reader that splits a stream into parts: one `PartHead`, pieces of bytes and one `PartEnd` for each part.
 
     The package `python-multipart` parses the stream; this class limits the size of heads and the number of parts, and
     skips a preamble.
@@ -82,7 +87,8 @@ class MultipartReader:
     def feed(self, data: bytes) -> list[Piece]:
         """Parse the next bytes; return the heads, pieces and ends of parts that were found in them.
 
-        Raises `BadRequestProblem` or `TooLargeProblem`.
+        Raises `BadRequestProblem` if the body is malformed, and `TooLargeProblem` for too many parts or a too long
+        head.
         """
         if self._preamble is not None:
             data = self._skip_preamble(self._preamble + data)
@@ -94,7 +100,7 @@ class MultipartReader:
         return pieces
 
     def finish(self) -> None:
-        """Check that the stream ended with the closing boundary. Raises `BadRequestProblem`."""
+        """Raise `BadRequestProblem` unless the stream ended with the closing boundary."""
         if not self._ended:
             raise BadRequestProblem("The multipart body ends before its closing boundary.", code="bad-multipart")
 

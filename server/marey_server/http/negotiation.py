@@ -137,9 +137,9 @@ def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TY
 
 
 def require_plain_encoding(content_encoding: str | None) -> None:
-    """Refuse compressed bodies, because a small request could expand to a large one.
+    """Raise `UnsupportedMediaTypeProblem` if the body of a request is compressed.
 
-    Raises `UnsupportedMediaTypeProblem`.
+    A small compressed body could expand to a very large one.
     """
     if content_encoding and content_encoding.strip().lower() not in ("", "identity"):
         raise UnsupportedMediaTypeProblem(

@@ -82,7 +82,7 @@ _TOKEN_OPTIONAL: list[Schema] = [{}, {"bearer": []}]
 
 
 def build_document(routes: Iterable[Route], version: str) -> Schema:
-    """Return the OpenAPI document of a table of routes."""
+    """Return the OpenAPI document that describes the operations of `routes`."""
     routes = list(routes)
     models = ApiModels(route.operation for route in routes)
     paths: dict[str, Schema] = {}
@@ -131,9 +131,10 @@ def _operation(route: Route, models: ApiModels) -> Schema:
 
 
 def _add_examples(paths: dict[str, Schema], components: dict[str, Schema]) -> None:
-    """Add an example to each parameter, and each body and answer in JSON; add a command to each operation.
+    """Add examples to the paths of an OpenAPI document.
 
-    The command of an operation sends its example.
+    Each parameter, and each body and answer in JSON, gets an example. Each operation gets a curl command that sends
+    these examples.
     """
     for path, entry in paths.items():
         shared = entry["parameters"]
@@ -287,7 +288,7 @@ def _refusals(operation: Operation) -> list[int]:
 
 
 def _problem_response(*others: str) -> Schema:
-    """Return the response for an error, which may also have one of the media types `others`."""
+    """Return the OpenAPI response for all errors; errors can also have the media types in `others`, such as HTML."""
     return {
         "description": "Reason why the request was refused.",
         "headers": {"X-Request-Id": {"description": "Quote it when asking for help.", "schema": {"type": "string"}}},

@@ -129,10 +129,10 @@ def _describe_default(schema: Schema) -> None:
 
 
 def _name_inner_objects(model: str, schema: Schema, components: dict[str, Schema]) -> None:
-    """Remove the titles of schemas inside a model, so that no two of them have the same title.
+    """Remove the titles of schemas inside a model, because two of them could have the same title.
 
-    Generated clients name the class of an object inside a model by the model and the title, or else by the model and
-    the property. If this is the name of another model, the object gets a title that differs.
+    Generated clients then name the class of an object inside a model by the model and the property. If another model
+    has this name, the object gets a title, from which clients make another name.
     """
     for name, inner in schema.get("properties", {}).items():
         for one in _inner_schemas(inner):

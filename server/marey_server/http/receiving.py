@@ -22,7 +22,7 @@ class PauseLimit:
     Parameters
     ----------
     limit_s : longest pause in seconds
-    close : called when the client has sent nothing for longer
+    close : called if the client has sent nothing for `limit_s` seconds
     """
 
     def __init__(self, limit_s: float, close: Callable[[], None]) -> None:
@@ -61,13 +61,13 @@ class Receiver:
         self._pending = bytearray()
 
     async def write(self, data: bytes) -> None:
-        """Add the next bytes; waits while a batch is being written."""
+        """Add the next bytes of the body; wait first if a batch is being written."""
         self._pending += data
         if len(self._pending) >= BATCH_BYTES:
             await self._flush()
 
     async def finish(self) -> Spool:
-        """Return the received body with its digest. The caller must close it."""
+        """Return the received body with its digest, as a `Spool` that the caller must close."""
         if len(self._pending) <= WRITTEN_AT_ONCE_BYTES:
             self._write(bytes(self._pending))
             self._pending.clear()

@@ -1,8 +1,8 @@
 """Answers of handlers, and functions that encode answers as bytes; the functions can run in any thread.
 
-A reply is *settled* in its transaction, which loads the document. It is *rendered*, which means encoded, after the
-transaction. Encoding a long document takes longer than loading it, and other requests need the thread and the
-connection of the transaction.
+An answer is made in two steps. `load_content` loads the document of the reply, in the transaction. `render` encodes the
+reply after the transaction, because encoding a long document takes longer than loading it, and other requests need the
+thread and the connection of the transaction.
 """
 
 from __future__ import annotations
@@ -36,8 +36,11 @@ MakeTree = Callable[[], Mapping[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class Lasting:
-    """Document that never changes, identified by its digest; `load` reads it if no encoded form of it is cached."""
+class UnchangingDocument:
+    """Document that never changes, identified by its digest.
+
+    `load` reads the document. It is called only if the cache of answers has no encoded form of the document.
+    """
 
     digest: str
     load: Callable[[], Mapping[str, Any]]
@@ -46,7 +49,7 @@ class Lasting:
 
 
 @dataclass(frozen=True, slots=True)
-class Loaded:
+class LoadedDocument:
     """Document that was loaded and must still be encoded. A document with a `digest` never changes."""
 
     make: MakeTree
@@ -66,7 +69,7 @@ class Reply:
     If the content is a model, `render` adds a digest of the answer. `location` is a path below the API's root.
     """
 
-    content: Content | Lasting | Loaded | None = None
+    content: Content | UnchangingDocument | LoadedDocument | None = None
     status: int | None = None
     rev: int | str | None = None
     location: str | None = None
@@ -95,27 +98,28 @@ class Rendered:
 
 @dataclass(frozen=True, slots=True)
 class AnswerForm:
-    """Requested form of an answer: media type, entity tags that the client has, and status of success."""
+    """Form of the answer that a request asks for: media type, header If-None-Match, and the status of a success."""
 
     media: MediaType
     if_none_match: str | None
     status: int
 
 
-def settle(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Reply:
-    """Load the `Lasting` document of a reply, unless the client or the cache has it already; return the new reply.
+def load_content(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Reply:
+    """Load the content of a reply if it is an `UnchangingDocument`, and return the new reply.
 
-    Must be called in the transaction.
+    The document is not loaded if the client has it already, or if its encoded form is in `answers`. This function must
+    be called in the transaction of the request.
     """
     content = reply.content
-    if not isinstance(content, Lasting):
+    if not isinstance(content, UnchangingDocument):
         return reply
     if reply.rev is not None and matches(form.if_none_match, entity_tag(reply.rev, form.media.form)):
         return replace(reply, content=None)
     cached = answers.get((content.digest, form.media.form))
     if cached is not None:
         return replace(reply, content=cached, media_type=reply.media_type or str(form.media))
-    return replace(reply, content=Loaded(partial(_itself, content.load()), content.size_bytes, content.digest))
+    return replace(reply, content=LoadedDocument(partial(_itself, content.load()), content.size_bytes, content.digest))
 
 
 def _itself(tree: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -123,7 +127,7 @@ def _itself(tree: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
-    """Encode a reply as status, headers and bytes, after `settle` has loaded its document.
+    """Encode a reply as status, headers and bytes, after `load_content` has loaded its document.
 
     If the client already has this state in this form, the status is 304 and there is no body. Encoded documents are
     added to `answers`.
@@ -150,9 +154,9 @@ def _with_digest(reply: Reply, body: bytes, media: MediaType) -> Reply:
     return replace(reply, content=body, media_type=reply.media_type or str(media), rev=state)
 
 
-def _body(content: Content | Lasting | Loaded, media: MediaType, answers: AnswerCache) -> bytes:
-    assert not isinstance(content, Lasting), "a reply is settled before it is rendered"
-    if not isinstance(content, Loaded):
+def _body(content: Content | UnchangingDocument | LoadedDocument, media: MediaType, answers: AnswerCache) -> bytes:
+    assert not isinstance(content, UnchangingDocument), "`load_content` is called before a reply is rendered"
+    if not isinstance(content, LoadedDocument):
         return encode(content, media)
     body = encode(content.make(), media)
     if content.digest is not None:

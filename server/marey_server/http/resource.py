@@ -58,7 +58,7 @@ from marey_server.http.declarations import Access, Bytes, Declared, Document, Op
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.receiving import PauseLimit
-from marey_server.http.reply import AnswerForm, Loaded, Rendered, Reply, render
+from marey_server.http.reply import AnswerForm, LoadedDocument, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
 from marey_server.store.transaction import Transaction
 
@@ -106,7 +106,7 @@ class Resource(CallingExchange):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Rendered:
-        """Run `function(tx, ...)` and return its result as a rendered answer, with the ETag and the declared status."""
+        """Run `function(tx, ...)` and return its result as the declared answer, encoded, with ETag and status."""
         return await self.answer_with(self._declared_reply, function, *args, **kwargs)
 
     async def answer_with(
@@ -116,7 +116,10 @@ class Resource(CallingExchange):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Rendered:
-        """Run `function(tx, ...)` and `to_reply` on its result in one transaction; return the rendered answer."""
+        """Run `function(tx, ...)` in a transaction, and return the encoded answer.
+
+        `to_reply` converts the result of the function to a `Reply`, in the same transaction.
+        """
         answers = self.services.answers
         call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, self._idempotent())
         run = self._read if self.operation.method == "GET" else self._write
@@ -141,7 +144,7 @@ class Resource(CallingExchange):
         Until the document is rendered, its memory counts towards the limits on the memory of requests.
         """
         rendering, answers = self.services.compute_threads.rendering, self.services.answers
-        loaded_bytes = reply.content.size_bytes if isinstance(reply.content, Loaded) else 0
+        loaded_bytes = reply.content.size_bytes if isinstance(reply.content, LoadedDocument) else 0
         self.holding.grow(loaded_bytes)
         rendered = await asyncio.wrap_future(rendering.submit(self.client, render, reply, self.answer_form, answers))
         self.holding.shrink(loaded_bytes)
@@ -165,7 +168,7 @@ class Resource(CallingExchange):
 
     @property
     def awaits_guest(self) -> bool:
-        """True if the request waits for a body from a caller without a token, who may never send it."""
+        """True if the request waits for a body from a caller without a token, who may never send this body."""
         return not self.performing and hasattr(self, "caller") and self.caller.token is None and self.expects_body()
 
     async def _wait_for_refusal(self, error: ApiProblem) -> None:
@@ -205,9 +208,10 @@ class Resource(CallingExchange):
         """Process the next piece of a streamed body."""
 
     def hold_body(self, most_bytes: int) -> None:
-        """Count the memory that a streamed body needs while it is received: its size, or `most_bytes` if it is longer.
+        """Count the memory that a streamed body needs while it is received: its size, but at most `most_bytes`.
 
-        `begin` calls this, so that a request without memory is refused before the client has sent a long body.
+        `begin` calls this, so that the request is refused before the client has sent a long body if there is not enough
+        memory.
         """
         if self.expects_body():
             self.holding.grow(min(self.declared_length() or most_bytes, most_bytes))
@@ -249,10 +253,7 @@ class Resource(CallingExchange):
             await self.refuse(error)
 
     def _turn(self) -> asyncio.Future[None] | None:
-        """Return a future that ends when this request may begin, or None if it may begin at once.
-
-        Clients take turns.
-        """
+        """Return a future that ends when it is this request's turn, or None if the request may begin at once."""
         operation = self._declared()
         reserved = operation is not None and operation.reserved
         return self.services.turns.take(self.client, reserved=reserved)

@@ -93,9 +93,11 @@ class _Opened:
 def _open_blob(
     tx: Transaction, digest: str, wanted: ByteRange | None, *, head: bool, redirect_bytes: int | None
 ) -> _Opened:
-    """Find the requested range of a blob, and read its first piece unless only the headers are requested.
+    """Find the requested range of a blob, and read the first piece of the range.
 
-    No piece is read if the blob is in object storage and has at least `redirect_bytes` bytes.
+    No piece is read if only the headers are requested (`head`), or if the blob is in object storage and has at least
+    `redirect_bytes` bytes. Raises `NotFoundProblem` if the caller may not read the blob, and
+    `RangeNotSatisfiableProblem` if no byte of the blob is in the range.
     """
     size = blobs.require_readable(tx, digest)
     start, stop = wanted.within(size) if wanted is not None else (0, size)
@@ -107,7 +109,7 @@ def _open_blob(
 
 
 def attachment(file_name: str) -> str:
-    """Return the header Content-Disposition (RFC 6266) for a file name with any characters."""
+    """Return the value of the header Content-Disposition (RFC 6266) for a file name with any characters."""
     plain = "".join(sign if " " <= sign <= "~" and sign not in '"\\%' else "_" for sign in file_name)
     return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(file_name, safe='')}"
 
@@ -125,11 +127,11 @@ class BlobSender(Resource):
         headers: Mapping[str, str] = MappingProxyType({}),
         may_redirect: bool = False,
     ) -> Rendered | None:
-        """Answer with the blob according to Range, If-Range and If-None-Match. Raises `NotFoundProblem`.
+        """Answer with the blob according to the headers Range, If-Range and If-None-Match.
 
-        By default, clients may cache the blob for a year; pass another `cache_control` if the URL does not
-        contain the digest. `headers` are sent with the bytes. With `may_redirect`, the answer for a large blob may
-        refer to object storage, which sends other headers.
+        By default, clients may cache the blob for a year; pass another `cache_control` if the URL does not contain the
+        digest. `headers` are sent with the bytes. With `may_redirect`, the answer for a large blob may refer to object
+        storage, which sends other headers. Raises `NotFoundProblem` if the caller may not read the blob.
         """
         etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
         wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)

@@ -29,7 +29,7 @@ MOST_SPANS = 64
 
 
 class RequestTrace:
-    """Spans of one request and the place of the request in a trace."""
+    """Spans of one request, and the request's context (trace and parent span) in a distributed trace."""
 
     def __init__(self, tracer: Tracer, callers: TraceCallers, header: str | None) -> None:
         self._tracer = tracer
@@ -42,9 +42,10 @@ class RequestTrace:
         self._started_ns = time.time_ns()
 
     def place(self, principal: Principal | None) -> TraceContext:
-        """Return the place of the request in its trace; the first call decides whether `principal` continues a trace.
+        """Return the trace context of the request.
 
-        So the first call must be made when the caller is known, or at the end of the request.
+        The first call decides whether the request continues the trace that `principal` has sent. So the first call
+        must be made when the caller is known, or at the end of the request.
         """
         if self._place is None:
             known = principal is not None and principal.kind != "anonymous"
@@ -61,13 +62,16 @@ class RequestTrace:
         return place.header if place.sampled else None
 
     def transaction(self, run: Callable[[Transaction], T], system: str, *, writes: bool) -> TracedTransaction[T]:
-        """Return a call that runs `run` in a transaction of a database of the given kind, and records it."""
+        """Return a callable that runs `run` in a transaction, and records the transaction as a span.
+
+        `system` is the kind of database, such as `postgresql`; `writes` states whether the transaction may write.
+        """
         return TracedTransaction(
             self, self._begin(DATABASE_WRITE if writes else DATABASE_READ, {"db.system.name": system}), run
         )
 
     def record_child(self, work: str, future: Future[T]) -> None:
-        """Record work in a child process, which ends when `future` is done."""
+        """Record the work of a child process as a span, which ends when `future` is done."""
         span = self._begin(CHILD, {"marey.work": work})
         future.add_done_callback(lambda done: self.end(span, None if done.cancelled() else done.exception()))
 
@@ -105,7 +109,7 @@ class RequestTrace:
 
 
 class TracedTransaction(Generic[T]):
-    """Function for a transaction, with the span that records it.
+    """Function that runs in a transaction, with the span that records the transaction.
 
     The span begins when a thread runs the function, not while the call waits for a thread.
     """
@@ -117,7 +121,10 @@ class TracedTransaction(Generic[T]):
         self._runs = 0
 
     def __call__(self, tx: Transaction) -> T:
-        """Run the function; may be called several times, because transactions are repeated."""
+        """Run the function in a transaction.
+
+        This may be called several times, because a transaction may be repeated.
+        """
         if not self._runs:
             now_ns = time.time_ns()
             self._span.attributes["marey.waited_ms"] = round((now_ns - self._span.started_ns) / 1e6, 3)

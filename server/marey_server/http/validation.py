@@ -110,7 +110,7 @@ def validate_body(model: type[Model], tree: Any) -> Model:
 
 
 def survey(tree: Any, steps: tuple[str, ...] = ()) -> bool:
-    """Return whether a tree contains arrays.
+    """Return whether a tree contains arrays, and check its texts.
 
     Raises `InvalidProblem` for a text with a NUL character, which databases do not store.
     """

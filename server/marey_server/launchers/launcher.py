@@ -48,7 +48,7 @@ class EngineError(Exception):
 
 
 class LauncherUnusable(Exception):
-    """Error of a launcher that does not exist, or whose options are invalid; the text gives the reason."""
+    """Error of a launcher that does not exist, cannot be loaded, or has invalid options; the text gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def read_options(model: type[Options], given: Mapping[str, Any], launcher: str) 
 
 @dataclass(frozen=True)
 class WorkerRequest:
-    """Properties of workers to start; a property that is None has the engine's default.
+    """Properties of workers to start; the engine's default replaces a property that is None.
 
     The engine ends a worker after `deadline_s` seconds. `kinds` are the kinds of jobs that the worker claims; empty:
     all kinds. `slots` is the number of jobs that the worker runs at the same time.
@@ -116,7 +116,7 @@ class WorkerRequest:
 
 @dataclass(frozen=True)
 class LaunchedWorker:
-    """Worker that the engine knows; `started_at` is None until it runs. The worker claims jobs under this name."""
+    """Worker that the engine knows. It claims jobs under the name `name`; `started_at` is None until it runs."""
 
     name: str
     state: WorkerState
@@ -126,7 +126,10 @@ class LaunchedWorker:
 
 @dataclass(frozen=True)
 class WorkerEnd:
-    """End of a worker; `status` is its exit status, or a negative number for a signal."""
+    """End of a worker.
+
+    `status` is its exit status, or the negative number of the signal that ended it; None if unknown.
+    """
 
     reason: EndReason
     status: int | None = None
@@ -142,9 +145,9 @@ class Launcher(Protocol):
     async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
         """Start `count` workers, and return their names, which contain `key`.
 
-        `key` has lower-case letters and digits, at most 16 characters. If the answer to a start was lost, the start is
-        repeated with the same key and count. A repeated start returns the same names, and starts nothing that the
-        engine knows already.
+        `key` consists of lower-case letters and digits, at most 16. If the answer to a start was lost, the caller
+        repeats the start with the same key and count. A repeated start returns the same names, and starts only workers
+        that the engine does not have yet.
         """
         ...
 

@@ -38,7 +38,7 @@ STOP_S = 20.0
 
 
 class LocalOptions(BaseModel):
-    """Options of the launcher; there are none."""
+    """Options of the launcher `local`, which has none."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -87,7 +87,10 @@ class PoolKeeper:
             log.warning("pool %s: %s", self._pool.name, getattr(error, "detail", error))
 
     async def adjust(self) -> None:
-        """Start or stop workers once, if this process is the leader. Raises `EngineError` and `ApiProblem`."""
+        """Start or stop workers once, if this process is the leader.
+
+        Raises `EngineError` if the engine refuses a request, and `ApiProblem` if the database cannot be used.
+        """
         if self._launcher.outlives_server and not await self._lead.take():
             self._size.forget()
             self._ended = None
@@ -114,7 +117,7 @@ class PoolKeeper:
     # -- workers --
 
     async def _start(self, key: str, count: int) -> None:
-        """Start workers; if the answer is lost and the engine lists no new workers, the start is repeated."""
+        """Start workers. If the answer is lost, `key` and count are kept, so that the start can be repeated."""
         pool = self._pool
         request = WorkerRequest(
             labels=pool.labels, kinds=pool.kinds, slots=pool.slots, cpus=pool.cpus, memory_bytes=pool.memory_bytes,
@@ -128,7 +131,7 @@ class PoolKeeper:
         log.info("pool %s: started %d workers: %s", pool.name, len(names), ", ".join(names))
 
     def _present(self, listed: tuple[LaunchedWorker, ...]) -> list[str]:
-        """Return the names of the workers that run or will run, beginning with those that have not started yet."""
+        """Return the names of the workers that are starting or running, the starting ones first."""
         now_s = self._clock_s()
         known = {worker.name for worker in listed}
         self._started = {
@@ -143,7 +146,7 @@ class PoolKeeper:
         return [name for name in (*self._started, *(worker.name for worker in alive)) if name not in self._stopped]
 
     async def _note_ends(self, listed: tuple[LaunchedWorker, ...]) -> None:
-        """Log why workers ended since the last round; after quick failures, pause before the next start."""
+        """Log why workers have ended since the last round; after quick failures, delay the next start."""
         ended = {worker.name for worker in listed if worker.state == "ended"}
         news = set() if self._ended is None else ended - self._ended
         for name in sorted(news)[:MOST_EXPLAINED]:

@@ -44,10 +44,10 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     """Run the workers of a server that listens on `address` while the `async with` block runs.
 
     At the end of the block, the workers on this machine are stopped. Workers of other engines continue, and the next
-    server finds them. Raises `LauncherUnusable`.
+    server finds them. Raises `LauncherUnusable` if the launcher does not exist, or its options are invalid.
     """
     settings = services.settings
-    keepers: list[Keeper] = [
+    controllers: list[WorkerController] = [
         PoolKeeper(
             pool,
             _launcher_of(pool, services, address),
@@ -67,21 +67,24 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
         )
         await fixed.start(WorkerRequest(), settings.local_workers, key=FIXED_KEY)
     if settings.own_pods is not None:
-        keepers.append(_dispatcher(services, address))
+        controllers.append(_dispatcher(services, address))
     if (settings.pools or settings.own_pods) and settings.worker_url is None and settings.launcher != "local":
         log.info("workers in pools reach this server at %s; the setting worker_url names another address", address)
-    tasks = [asyncio.create_task(keeper.keep()) for keeper in keepers]
+    tasks = [asyncio.create_task(controller.keep()) for controller in controllers]
     try:
         yield
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await asyncio.gather(*(keeper.close() for keeper in keepers), *([fixed.close()] if fixed else []))
+        await asyncio.gather(*(controller.close() for controller in controllers), *([fixed.close()] if fixed else []))
 
 
-class Keeper(Protocol):
-    """Task of the server that starts and stops workers."""
+class WorkerController(Protocol):
+    """Interface of a task that starts and stops workers.
+
+    There is one for each pool, and one for jobs with their own pods.
+    """
 
     async def keep(self) -> None:
         """Adjust the workers at regular intervals, until the task is cancelled."""
@@ -92,22 +95,25 @@ class Keeper(Protocol):
         ...
 
 
-def _dispatcher(services: Services, address: str) -> Keeper:
-    """Return the dispatcher of jobs that need a pod of their own. Raises `LauncherUnusable`."""
+def _dispatcher(services: Services, address: str) -> WorkerController:
+    """Return the task that starts pods for single jobs. Raises `LauncherUnusable` if its options are invalid."""
     settings = services.settings
     make = _load(EntryPoint("kubernetes", DISPATCHER, ENTRY_POINTS))
-    return cast(Keeper, make(settings, services.database, settings.worker_url or address))
+    return cast(WorkerController, make(settings, services.database, settings.worker_url or address))
 
 
 def find_launcher(name: str) -> MakeLauncher:
-    """Return the function that makes launchers of a kind. Raises `LauncherUnusable`."""
+    """Return the function that makes launchers, by the name of the launcher in the settings.
+
+    Raises `LauncherUnusable` if there is no such launcher, or if it cannot be loaded.
+    """
     if name in BUILT_IN:
         found = EntryPoint(name, BUILT_IN[name], ENTRY_POINTS)
     else:
         others = {one.name: one for one in entry_points(group=ENTRY_POINTS)}
         if name not in others:
             known = ", ".join(sorted({*BUILT_IN, *others}))
-            raise LauncherUnusable(f"launcher: there is no launcher {name!r}, only: {known}")
+            raise LauncherUnusable(f"launcher: there is no launcher {name!r}; choose one of {known}")
         found = others[name]
     return cast(MakeLauncher, _load(found))
 
@@ -116,7 +122,7 @@ def _load(found: EntryPoint) -> Any:
     try:
         return found.load()
     except (ImportError, AttributeError) as error:
-        raise LauncherUnusable(f"launcher: {found.name} cannot be loaded: {error}") from error
+        raise LauncherUnusable(f"launcher: the launcher {found.name!r} cannot be loaded: {error}") from error
 
 
 def _launcher_of(pool: WorkerPool, services: Services, address: str) -> Launcher:

@@ -47,12 +47,12 @@ async def repeat(name: str, adjust: Callable[[], Awaitable[None]], round_s: floa
 
 
 async def ask(call: Awaitable[T]) -> T:
-    """Return the answer of an engine. Raises `EngineError` if it takes too long."""
+    """Wait for a call of a launcher's method and return its result. Raises `EngineError` after `ENGINE_S` seconds."""
     try:
         async with asyncio.timeout(ENGINE_S):
             return await call
     except TimeoutError:
-        raise EngineError(f"the engine did not answer within {ENGINE_S:.0f} s") from None
+        raise EngineError(f"the engine did not answer within {ENGINE_S:.0f} s to a request about workers") from None
 
 
 class ServerLead:

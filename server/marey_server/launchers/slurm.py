@@ -75,7 +75,7 @@ END_REASONS: Mapping[str, EndReason] = {
 
 
 class SlurmOptions(BaseModel):
-    """Options of the launcher."""
+    """Options of the launcher `slurm`; none of them is required."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -117,7 +117,7 @@ class _Task(NamedTuple):
 
 
 class SlurmLauncher:
-    """Launcher of workers with Slurm's commands."""
+    """Launcher that runs workers as tasks of Slurm array jobs."""
 
     outlives_server = True
 
@@ -130,14 +130,17 @@ class SlurmLauncher:
         """Times at which running workers were asked to stop, by name."""
 
     async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
-        """Submit an array job, unless Slurm has a job with this name. Each worker is a task of the array job."""
+        """Submit an array job, in which each task is a worker.
+
+        If Slurm has a job with this name already, nothing is submitted.
+        """
         job_name = f"{self._context.pool}-{key}"
         names = tuple(f"{job_name}-{number}" for number in range(1, count + 1))
         if not await self._tasks(f"--name={job_name}"):
             try:
                 self._prepare_logs()
             except OSError as error:
-                raise EngineError(f"the logs of workers cannot be kept: {error}") from error
+                raise EngineError(f"the logs of workers cannot be kept in the data folder: {error}") from error
             await self._run("sbatch", *self._submission(request, count, job_name), str(SCRIPT), *self._command(request))
         return names
 
@@ -248,7 +251,7 @@ class SlurmLauncher:
         return None
 
     async def _run(self, program: str, *arguments: str) -> str:
-        """Run a command of Slurm and return its output. Raises `EngineError`."""
+        """Run a command of Slurm and return its output. Raises `EngineError` if it fails or takes too long."""
         environment = clean_environment() | {
             "MAREY_LOG_FORM": self._context.log_form, "MAREY_LOG_LEVEL": self._context.log_level
         }  # fmt: skip
@@ -282,7 +285,7 @@ def _task_of(row: list[str]) -> _Task:
 
 
 def _time_of(text: str) -> datetime | None:
-    """Return a time of Slurm, which is in the time zone of this machine; None for `N/A`."""
+    """Convert a time that Slurm prints, in the time zone of this machine; return None for `N/A`."""
     with suppress(ValueError):
         return datetime.fromisoformat(text).astimezone(UTC)
     return None

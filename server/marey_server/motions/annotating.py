@@ -45,11 +45,11 @@ _LONGEST_REASON = 4000
 def apply_commands(
     found: FoundAnnotation, change: AnnotationChange, *, expected_rev: ExpectedRev = None
 ) -> ChangedAnnotation:
-    """Apply commands to an annotation in order; return a `ChangedAnnotation` with the result or the error.
+    """Apply commands to an annotation, one after another; return a `ChangedAnnotation` with the result or the error.
 
-    If a command fails, no command is applied. The function needs no database. An error is returned, not raised.
-    `put_changed` raises it later, inside the transaction that stores the answer under the idempotency key. So a
-    repeated request gets the same error, even if the annotation has changed since.
+    If a command fails, no command is applied. The function needs no database. It returns the error and does not raise
+    it: `put_changed` raises it later, inside the transaction that stores the answer under the idempotency key. So a
+    repeated request gets the same error, even if the annotation has changed in the meantime.
     """
     if not is_expected(found.rev, expected_rev):
         return ChangedAnnotation(found.rev, moved_on(found.rev))
@@ -88,9 +88,10 @@ def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocume
 
 
 def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCreate:
-    """Convert a document of Marey's predecessor into an annotation of a clip, to be created in the clip's folder.
+    """Convert the document in `given` to the request that creates an annotation in the clip's folder.
 
-    Raises `InvalidProblem` if the document is not a valid annotation of this clip.
+    `given` contains a document in a format of Marey's predecessor. Raises `InvalidProblem` if the document is not a
+    valid annotation of this clip.
     """
     assert given.document is not None
     part = _imported(given.document, "document", clip.item.id, clip.item.revision, clip.frame_count, given)
@@ -98,7 +99,7 @@ def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCrea
 
 
 def created(clip: AnnotatedClip, given: AnnotationImport, parts: dict[str, PreparedDocument]) -> ItemCreate:
-    """Return the request that creates an imported annotation with these parts in the folder of its clip."""
+    """Return the request that creates an imported annotation, with the documents in `parts`, in its clip's folder."""
     return ItemCreate(
         name=given.name or f"{clip.item.name} {given.layer}"[:MAX_NAME_LENGTH],
         collection=clip.item.collection,
@@ -118,9 +119,10 @@ class AnnotationOrder(Message):
 
 
 def find_file(tx: Transaction, given: AnnotationImport, most_bytes: int) -> bytes:
-    """Return the content of the file to import.
+    """Return the content of the file to import, which the request names by its digest.
 
-    Raises `NotFoundProblem` if the caller may not read it, and `TooLargeProblem` if it has more than `most_bytes`.
+    Raises `NotFoundProblem` if the caller may not read the file, and `TooLargeProblem` if it has more than `most_bytes`
+    bytes.
     """
     assert given.file is not None
     digest = given.file.blob
@@ -138,14 +140,14 @@ def annotation_order(clip: AnnotatedClip, given: AnnotationImport, content: byte
 
 
 def found_annotation(answer: bytes) -> dict[str, PreparedDocument]:
-    """Return the parts of the annotation that a child process has read."""
+    """Unpack the parts of the annotation from the answer of a child process."""
     return prepare_parts(Kind.ANNOTATION, {"annotation": unpack_tree(answer)})
 
 
 def read_annotation(order: bytes) -> bytes:
-    """Carry out an `AnnotationOrder` in a child process; return the packed part `annotation`.
+    """Read the file of an annotation, in a child process. `order` is an `AnnotationOrder` as bytes.
 
-    Raises `InvalidProblem` if the file is not a valid annotation of the clip.
+    Return the part `annotation` as bytes. Raises `InvalidProblem` if the file is not a valid annotation of the clip.
     """
     with LOADING:
         from marey_motion.errors import MotionError
@@ -166,7 +168,10 @@ def read_annotation(order: bytes) -> bytes:
 def _imported(
     document: Mapping[str, Any], name: str, clip: str, revision: int, frame_count: int, given: AnnotationImport
 ) -> dict[str, Any]:
-    """Convert a document of the predecessor to the part `annotation` of an item. Raises `InvalidProblem`."""
+    """Convert a document of Marey's predecessor to the part `annotation` of an item.
+
+    Raises `InvalidProblem` if the document is not a valid annotation of the clip.
+    """
     with LOADING:
         from marey_motion import documents
         from marey_motion.errors import MotionError
@@ -184,7 +189,7 @@ def _imported(
 
 
 def _not_an_annotation(error: MotionError, pointer: str) -> InvalidProblem:
-    """Return the error for a document that is not a valid annotation; its field error has the same text."""
+    """Return an `InvalidProblem` for a document that is not a valid annotation, with the text of `error`."""
     with LOADING:
         from marey_motion.formats.texts import cut_text
 

@@ -1,6 +1,7 @@
 """Child process of the server that reads untrusted files and computes.
 
-It carries out one order after another, each within limits of memory and time. An order is the call of a function.
+It carries out one order after another, each within limits of memory and time. An order is a message that names a
+function and its argument.
 
 Messages between server and child are MessagePack that the receiver validates; nothing is pickled.
 
@@ -47,7 +48,10 @@ class Message(BaseModel):
 
     @classmethod
     def unpack(cls, data: bytes) -> Self:
-        """Return the message that the bytes contain. Raises `BadMessage`."""
+        """Return the message that the bytes contain.
+
+        Raises `BadMessage` if they contain no valid message of this class.
+        """
         try:
             fields: Any = msgpack.unpackb(data)
             return cls.model_validate(fields)
@@ -64,7 +68,7 @@ class AnswerEncoding(Message):
     arrays: ArrayForm
 
     def encode(self, tree: Any) -> bytes:
-        """Return a document as bytes of the media type that the client accepts."""
+        """Return a document as bytes of the media type that the client has requested."""
         return encode_tree(tree, self.media_type, arrays=self.arrays)
 
 
@@ -106,7 +110,7 @@ class ChildOrder(Message):
 
 
 class ChildRefusal(Message):
-    """Refusal by a function: the status, code and text of an `ApiProblem`."""
+    """Message about an `ApiProblem` that the called function raised: its status, code, text and field errors."""
 
     status: int
     code: str
@@ -115,7 +119,10 @@ class ChildRefusal(Message):
 
 
 class ChildAnswer(Message):
-    """Answer to a `ChildOrder`: the result of the function, or one reason why there is none."""
+    """Answer to a `ChildOrder`: `payload` is the result of the function.
+
+    If there is no result, `refusal`, `out_of_memory` or `traceback` gives the reason.
+    """
 
     payload: bytes = b""
     refusal: ChildRefusal | None = None
@@ -177,7 +184,7 @@ def _answer(order: ChildOrder) -> ChildAnswer:
 
 
 def _load(name: str) -> None:
-    """Import a module, and call the function if one is named."""
+    """Import `name`, which is a module or `module:function`; in the second case, call the function."""
     module, _, function = name.partition(":")
     loaded = import_module(module)
     if function:

@@ -62,7 +62,7 @@ class DifferenceSource:
 
 
 class SideOrder(Message):
-    """Revision on one side of a `DifferenceOrder`, with its documents as bytes."""
+    """Part of a `DifferenceOrder`: the revision on one side of the comparison, with its documents as bytes."""
 
     place: ComparedRevision
     parts: dict[str, bytes]
@@ -83,10 +83,10 @@ class DifferenceOrder(Message):
 def read_difference(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: DifferenceRequest
 ) -> DifferenceSource:
-    """Read the parts that differ between two revisions, and return them.
+    """Read two revisions and the documents of the parts that differ between them.
 
-    Raises `NotFoundProblem` if an item or a revision does not exist, and `TooLargeProblem` if the motions are too
-    large.
+    Raises `NotFoundProblem` if an item or a revision does not exist, and `TooLargeProblem` if the motions have too many
+    values to be compared at once.
     """
     item = items.read_item(tx, project, kind, item_id)
     other = item if request.to_item is None else items.read_item(tx, project, kind, request.to_item)
@@ -156,7 +156,11 @@ def _side_order(side: ComparedSide) -> SideOrder:
 
 
 def make_difference(packed: bytes) -> bytes:
-    """Carry out a `DifferenceOrder` and return the document of the difference. Raises `TooLargeProblem`."""
+    """Compare two revisions, in a child process. `packed` is a `DifferenceOrder` as bytes.
+
+    Return the document of the difference, encoded for the client. Raises `TooLargeProblem` if the parts cannot be
+    compared.
+    """
     from marey_motion.errors import MotionError
 
     order = DifferenceOrder.unpack(packed)

@@ -52,11 +52,11 @@ ADVANCE_COVERAGE = "marey_server.motions.coverage:advance_coverage"
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
-    """Skeleton and evaluation that a new stream refers to.
+class StreamInputs:
+    """References and documents that a request for a new stream names.
 
-    `skeleton` and `evaluation` are references to revisions. `rig` is the encoded skeleton with its joint mapping.
-    `measured` is the document of the evaluation (its part `evaluation`).
+    `skeleton` and `evaluation` are references to revisions (item and revision). `rig` is the encoded skeleton with its
+    joint mapping. `measured` is the document of the evaluation (its part `evaluation`).
     """
 
     skeleton: Tree | None = None
@@ -66,10 +66,7 @@ class Given:
 
 
 class BeginOrder(Message):
-    """Message that asks a child process to start a stream.
-
-    If the stream starts from an evaluation, `measured` is the encoded document of this evaluation.
-    """
+    """Message that asks a child process to start a stream; `measured` is the document of the evaluation as bytes."""
 
     request: CoverageStreamCreate
     skeleton: Tree | None
@@ -77,9 +74,9 @@ class BeginOrder(Message):
     evaluation: Tree | None
     measured: bytes | None
 
-    def given(self) -> Given:
-        """Return the skeleton and the evaluation of the new stream, with the decoded document of the evaluation."""
-        return Given(
+    def inputs(self) -> StreamInputs:
+        """Return the references and documents in the message, with the decoded document of the evaluation."""
+        return StreamInputs(
             self.skeleton, self.rig, self.evaluation, None if self.measured is None else unpack_tree(self.measured)
         )
 
@@ -99,7 +96,7 @@ class StreamOrder(Message):
 
 @dataclass(frozen=True, slots=True)
 class NextFrames:
-    """Digest of the frames of a request, and the packed message that asks a child process to add them."""
+    """Message, as bytes, that asks a child process to add the frames of a request, and the digest of these frames."""
 
     digest: str
     order: bytes
@@ -121,8 +118,8 @@ class AdvancedStream(Message):
     state: bytes
 
 
-def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
-    """Return the skeleton and the evaluation that a request for a stream refers to, with their documents.
+def read_stream_inputs(tx: Transaction, project: str, request: CoverageStreamCreate) -> StreamInputs:
+    """Return the references and documents that a request for a new stream names.
 
     Raises `NotFoundProblem` if the skeleton or the evaluation does not exist.
     """
@@ -137,7 +134,7 @@ def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> 
         part = items.read_part(tx, project, Kind.EVALUATION, request.evaluation, "evaluation")
         evaluation = {"item": request.evaluation, "revision": part.revision}
         measured = part.tree
-    return Given(skeleton, rig, evaluation, measured)
+    return StreamInputs(skeleton, rig, evaluation, measured)
 
 
 def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tree | None:
@@ -147,14 +144,14 @@ def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tre
         return None
 
 
-def begin_order(request: CoverageStreamCreate, given: Given) -> bytes:
+def begin_order(request: CoverageStreamCreate, inputs: StreamInputs) -> bytes:
     """Return the packed message that asks a child process to start a stream."""
     return BeginOrder(
         request=request,
-        skeleton=given.skeleton,
-        rig=given.rig,
-        evaluation=given.evaluation,
-        measured=None if given.measured is None else pack_tree(given.measured),
+        skeleton=inputs.skeleton,
+        rig=inputs.rig,
+        evaluation=inputs.evaluation,
+        measured=None if inputs.measured is None else pack_tree(inputs.measured),
     ).pack()
 
 
@@ -169,7 +166,7 @@ def look_order(stream: Stream) -> bytes:
 def next_frames(held: Stream, frames: CoverageFrames) -> NextFrames | Tree:
     """Return the message that asks a child process to add the frames of a request to a stream.
 
-    If the request repeats the last request, the stored answer to that request is returned instead. Raises
+    If the request repeats the previous request, the stored answer to that request is returned instead. Raises
     `CoverageOffset` if the frames do not start at the stream's offset.
     """
     digest = _digest_of(frames)
@@ -197,27 +194,30 @@ def _digest_of(frames: CoverageFrames) -> str:
 
 
 def begin_coverage(packed: bytes) -> bytes:
-    """Start the stream that a packed `BeginOrder` describes; return a packed `BegunStream`."""
+    """Start a stream, in a child process. `packed` is a `BeginOrder`, and the result a `BegunStream`, both as bytes."""
     order = BeginOrder.unpack(packed)
-    return begin(order.request, order.given()).pack()
+    return begin(order.request, order.inputs()).pack()
 
 
 def look_at_coverage(packed: bytes) -> bytes:
-    """Carry out a `StreamOrder` and return the computed members of `CoverageStreamState` as MessagePack."""
+    """Compute the coverage of a stream, in a child process. `packed` is a `StreamOrder` as bytes.
+
+    Return the computed members of `CoverageStreamState` as MessagePack.
+    """
     order = StreamOrder.unpack(packed)
     return encode_tree(_state(_online(order.state), order.settings), MSGPACK)
 
 
 def advance_coverage(packed: bytes) -> bytes:
-    """Carry out a `StreamOrder` with frames and return an `AdvancedStream`.
+    """Add frames to a stream, in a child process. `packed` is a `StreamOrder` with frames, as bytes.
 
-    Raises `InvalidProblem` if the frames do not fit the stream.
+    Return an `AdvancedStream` as bytes. Raises `InvalidProblem` if the frames do not fit the stream.
     """
     order = StreamOrder.unpack(packed)
     return advance(order, CoverageFrames.model_validate(unpack_tree(order.frames or b""))).pack()
 
 
-def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
+def begin(request: CoverageStreamCreate, inputs: StreamInputs) -> BegunStream:
     """Start a coverage stream, and return its state. Raises `InvalidProblem` if the skeleton cannot be used."""
     from marey_motion.evaluation.online import OnlineCoverage
     from marey_schemas.options.evaluation import COVERAGE_LEAST_S, Grid
@@ -225,19 +225,19 @@ def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
     asked = request.model_dump(include={"speeds_m_s", "turn_rates_deg_s"}, exclude_none=True)
     grid = Grid(**asked)
     least_s, seconds = request.least_s or COVERAGE_LEAST_S, None
-    if given.evaluation is not None:
+    if inputs.evaluation is not None:
         with refusing("evaluation"):
-            found = MeasuredCoverage.model_validate(given.measured)
+            found = MeasuredCoverage.model_validate(inputs.measured)
         grid = found.options.grid
         least_s, seconds = found.options.coverage_least_s, found.coverage.seconds
     with refusing("evaluation"):  # a grid that the request gives has been checked
         online = OnlineCoverage(request.frame_rate_hz, grid, least_s=least_s, seconds=seconds)
     with refusing("skeleton"):
-        _load_kernels(None if given.rig is None else body_of(given.rig))
+        _load_kernels(None if inputs.rig is None else body_of(inputs.rig))
     settings = {
         "frame_rate_hz": request.frame_rate_hz,
-        "skeleton": given.skeleton,
-        "evaluation": given.evaluation,
+        "skeleton": inputs.skeleton,
+        "evaluation": inputs.evaluation,
         "speeds_m_s": np.unique(grid.speeds_m_s).tolist(),
         "turn_rates_deg_s": np.unique(grid.turn_rates_deg_s).tolist(),
         "least_s": least_s,
@@ -248,7 +248,10 @@ def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
 
 
 def advance(order: StreamOrder, frames: CoverageFrames) -> AdvancedStream:
-    """Add frames to a stream; return its new state and the answer to the request. Raises `InvalidProblem`."""
+    """Add frames to a stream; return its new state and the answer to the request.
+
+    Raises `InvalidProblem` if the frames do not fit the stream.
+    """
     online = _online(order.state)
     before = online.counts.copy()
     windows = 0
@@ -276,7 +279,11 @@ def _online(state: bytes) -> OnlineCoverage:
 
 
 def _add_poses(online: OnlineCoverage, order: StreamOrder, frames: CoverageFrames) -> int:
-    """Add the poses of a request to the stream, and return the number of time windows that they complete."""
+    """Add the poses of a request to the stream.
+
+    Return the number of time windows of the coverage measure that these poses complete. Raises `InvalidProblem` if the
+    stream has no skeleton, or the poses do not fit its skeleton.
+    """
     from marey_motion.documents import clip_from_document
 
     if order.rig is None:
@@ -329,7 +336,7 @@ def body_of(rig: bytes) -> MatchingBody:
 
 
 def _load_kernels(body: MatchingBody | None) -> None:
-    """Load compiled code in advance, so that the first frames do not wait for it."""
+    """Load the compiled kernels that frames of this skeleton need, so that the first frames do not wait for them."""
     from marey_motion.clip import Clip
     from marey_motion.evaluation.online import OnlineCoverage
 
@@ -379,7 +386,7 @@ def _state(online: OnlineCoverage, settings: Tree) -> Tree:
 
 
 def _now(online: OnlineCoverage, settings: Tree) -> Tree:
-    """Return the members of `CoverageNow` for a stream: missing time, targets and performer."""
+    """Return the members of `CoverageNow` for a stream: missing seconds, motions to record next, and performer."""
     targets = online.targets(settings["target_count"], path_s=settings["path_s"])
     performer = _performer(online)
     return {

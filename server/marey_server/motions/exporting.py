@@ -67,7 +67,7 @@ def read_source(
     """Return an item with all documents that a file format may need.
 
     Raises `NotFoundProblem` if the item does not exist. Raises `ConflictProblem` if the consent for the clip has ended,
-    unless the caller has `permitted` the export.
+    unless the export is `permitted`.
     """
     found = items.read_item(tx, project, kind, item_id)
     if kind in WITH_MOTION and not permitted:
@@ -96,11 +96,11 @@ def find_unchanged_original(
     *,
     permitted: bool,
 ) -> OriginalFile | None:
-    """Return the file of Marey's predecessor that an item was imported from; None if the item was changed since.
+    """Return the file of Marey's predecessor from which an item was imported, if the item is unchanged since then.
 
-    Also return None for an item of another kind or format, and if `options` name a form of the file. Raises
-    `NotFoundProblem` if the item or the revision does not exist. Raises `ConflictProblem` if the consent for the clip
-    has ended, unless the caller has `permitted` the export.
+    Return None if the item was changed, if it was not imported from such a file, or if `options` ask for another form
+    of the file. Raises `NotFoundProblem` if the item or the revision does not exist. Raises `ConflictProblem` if the
+    consent for the clip has ended, unless the export is `permitted`.
     """
     if kind not in DOCUMENTS_OF:
         return None
@@ -130,8 +130,8 @@ def find_original(
 ) -> OriginalFile:
     """Return the file that an item was imported from. Items other than clips must be unchanged since the import.
 
-    Raises `NotFoundProblem` if the item was not imported from a file, or was changed since. Raises `ConflictProblem` if
-    the consent for the clip has ended, unless the caller has `permitted` the export.
+    Raises `NotFoundProblem` if the item was not imported from a file, or has changed since the import. Raises
+    `ConflictProblem` if the consent for the clip has ended, unless the export is `permitted`.
     """
     if kind is Kind.CLIP:
         info = items.read_part(tx, project, kind, item_id, "info", revision=revision, arrays="none").tree
@@ -171,7 +171,10 @@ def export_order(source: ItemToExport, file: MotionFileOptions, time: ExportTime
 
 
 def export_item(packed: bytes) -> bytes:
-    """Carry out an `ExportOrder` and return a packed `ComputedFile`."""
+    """Write the file of an item, in a child process.
+
+    `packed` is an `ExportOrder`; the result is a `ComputedFile` as bytes.
+    """
     order = ExportOrder.unpack(packed)
     return write_file(order.source(), order.file, order.time, order.options).pack()
 

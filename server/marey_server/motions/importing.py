@@ -1,4 +1,7 @@
-"""Import of uploaded files: they are read and encoded in child processes, then stored, several in one transaction."""
+"""Import of uploaded files: child processes read and encode the files; the server stores them.
+
+Several files are stored in one transaction.
+"""
 
 from __future__ import annotations
 
@@ -59,10 +62,10 @@ class SourceFile:
 
 @dataclass(frozen=True, slots=True)
 class PreparedImport:
-    """File of an import after it was read, ready to be stored.
+    """File of an import after a child process has read it, ready to be stored.
 
-    If there is nothing to store, `entry` is the answer's entry for the file. `axis` is the upward axis that was
-    recognised in the file, and how clearly.
+    If there is nothing to store, `entry` is the answer's entry for the file. `axis` states which axis of the file
+    points up, and how clearly the motion shows this.
     """
 
     name: str
@@ -85,9 +88,9 @@ def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
 
 
 def plan(names: Sequence[str]) -> tuple[list[PlannedFile], list[int]]:
-    """Decide for each file of a batch whether it is imported, read together with another file, or refused.
+    """Decide for each file of an import whether it is read, read together with another file, or refused.
 
-    Also return the places of the files in the order in which they are imported.
+    Return these decisions in the order of `names`, and the indices of the files in the order in which they are read.
     """
     with LOADING:
         from marey_motion.importing.plan import plan_imports, reading_order
@@ -97,9 +100,9 @@ def plan(names: Sequence[str]) -> tuple[list[PlannedFile], list[int]]:
 
 
 def planned_entry(planned: PlannedFile) -> PreparedImport | None:
-    """Return the answer's entry for a file that is not read by itself, or None if the file is to be read.
+    """Return the entry in the answer for a file that needs no order of its own, or None if the file is to be read.
 
-    A file is not read by itself if it is read together with the file that it accompanies, or if its name is refused.
+    Files that are read together with another file need no order, and neither do files whose names are refused.
     """
     with LOADING:
         from marey_motion.importing.files import planned_entry
@@ -117,8 +120,8 @@ def file_order(
 ) -> bytes:
     """Return the packed message that asks a child process to read a file together with the files that accompany it.
 
-    `sources` are the files that `PlannedFile.together` names. `sibling_axis` is the upward axis that other files with
-    the same skeleton show.
+    `sources` are these files with their content. `sibling_axis` is the upward axis that other files with the same
+    skeleton show.
     """
     with LOADING:
         from marey_server.motions.reading import FileOrder, packed_skeleton
@@ -142,7 +145,7 @@ def file_order(
 
 
 def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> PreparedImport:
-    """Return the content that a child process has read from a file, ready to be stored."""
+    """Convert the answer of a child process that has read a file to a `PreparedImport`."""
     with LOADING:
         from marey_server.motions.reading import ReadFile
 
@@ -160,10 +163,10 @@ def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> 
     return PreparedImport(name, tuple(sources), drafts, found.checks, found.frames, graph=graph, axis=found.axis)
 
 
-class PutAside:
-    """Files of an import that do not clearly show which axis points up: they wait until all files have been read.
+class UnclearFiles:
+    """Files of an import that do not clearly show which axis points up.
 
-    Then other files with the same skeleton may have shown the axis.
+    They wait until all other files have been read, because another file with the same skeleton may show the axis.
     """
 
     def __init__(self) -> None:
@@ -171,7 +174,10 @@ class PutAside:
         self._findings: list[AxisFinding] = []
 
     def take(self, place: int, file: PreparedImport) -> bool:
-        """Record the upward axis found in a file; return whether the file, at this place in the import, must wait."""
+        """Record the upward axis found in a file; return whether the file must wait for the other files.
+
+        `place` is the index of the file in the import.
+        """
         if file.axis is None:
             return False
         self._findings.append(file.axis)
@@ -181,9 +187,9 @@ class PutAside:
         return True
 
     def files(self) -> Iterator[tuple[int, PreparedImport, UpAxis | None]]:
-        """Yield each file with its place in the import, and the upward axis with which to read the file again.
+        """Yield the waiting files: index in the import, the file as it was read, and the upward axis to use.
 
-        The axis is None if the file need not be read again.
+        The file must be read again with this axis; if the axis is None, it need not be read again.
         """
         with LOADING:
             from marey_motion.importing.siblings import axes_of_skeletons, axis_of_siblings
@@ -194,14 +200,17 @@ class PutAside:
 
 
 def refused_import(name: str, error: ApiProblem) -> PreparedImport:
-    """Return the entry of a file that was refused; errors that concern the whole request are raised again."""
+    """Return the import of a refused file, with the reason in its entry.
+
+    Raises `error` again if it concerns the whole request and not a single file.
+    """
     if error.status in REFUSED_ALTOGETHER:
         raise error
     return PreparedImport(name, entry=_refused(name, error))
 
 
 def new_skeletons(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> set[str]:
-    """Return the digests of the files' skeletons that the project does not have yet."""
+    """Return the digests of those skeletons in the files that the project does not have yet."""
     digests = {_hierarchy(draft).digest for file in files for draft in file.drafts if draft.kind is Kind.SKELETON}
     return digests - items.find_contents(tx, project, Kind.SKELETON, "hierarchy", digests)
 
@@ -229,7 +238,7 @@ def mapping_order(file: PreparedImport) -> bytes:
 
 
 def found_mapping(answer: bytes) -> PreparedDocument:
-    """Return the part `mapping` that a child process has found."""
+    """Unpack the part `mapping` from the answer of a child process."""
     with LOADING:
         from marey_server.motions.reading import ReadDocument
 
@@ -251,7 +260,7 @@ def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedD
 
 
 def refuse_with_skeleton(files: Sequence[PreparedImport], digest: str, error: ApiProblem) -> list[PreparedImport]:
-    """Return the files, but with a refusal in place of each file that contains the skeleton with this digest.
+    """Replace each file that contains the skeleton with this digest by a refusal; return all files.
 
     `error` is the reason why no joint mapping could be derived for the skeleton.
     """
@@ -284,8 +293,8 @@ def require_folder(tx: Transaction, project: str, folder: str) -> None:
 def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> list[ImportEntry]:
     """Store the original files and the items read from them; return one entry for each file.
 
-    A file that cannot be stored is refused and does not affect other files. The bytes are counted at the end, because
-    other requests of the user must wait from the count to the end of the transaction.
+    A file that cannot be stored is refused and does not affect other files. The sent bytes are counted last, because
+    other requests of the user must wait from this count to the end of the transaction.
     """
     row = projects.require(tx, project)
     hold_off_purges(tx, row.id)
@@ -308,7 +317,7 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
 
 
 class _Stored(NamedTuple):
-    """Entries of the answer for files that were stored together, and the number of new bytes of their sources."""
+    """Result of storing some files together: their entries in the answer, and the bytes that are new on the server."""
 
     entries: list[ImportEntry]
     sent_bytes: int = 0
@@ -327,7 +336,10 @@ def _runs(files: Sequence[PreparedImport]) -> Iterator[list[PreparedImport]]:
 
 
 def _concerns_request(error: ApiProblem) -> bool:
-    """Return whether an error concerns the whole request; a missing role in a folder concerns only files in it."""
+    """Return whether an error concerns the whole request.
+
+    A missing role in a folder concerns only files in this folder.
+    """
     return error.status in REFUSED_ALTOGETHER and not isinstance(error, FolderRoleProblem)
 
 
@@ -341,7 +353,11 @@ def _publish_alone(tx: Transaction, row: ProjectRow, file: PreparedImport, sent_
 
 
 def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport], sent_bytes: int) -> _Stored:
-    """Store files together, or none of them. `sent_bytes` is the number of new bytes of the files stored before."""
+    """Store files together, or none of them, if an error occurs.
+
+    `sent_bytes` is the number of new bytes of the files that this request has stored before; they count towards the
+    caller's daily quota.
+    """
     with tx.connection.begin_nested():
         fresh = [file for file in files if file.entry is None]
         sources = {one.digest: one.content for file in fresh for one in file.sources if one.content is not None}

@@ -1,4 +1,7 @@
-"""Conditions `like(...)` of queries: examples are read in one transaction, and child processes search an index."""
+"""Conditions `like(...)` of queries, which select clips with a moment like an example.
+
+One transaction reads the examples of a query; child processes then search the index of motions.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ SEARCH_CLIPS = "marey_server.motions.likeness:search_clips"
 
 @dataclass(frozen=True, slots=True)
 class FoundLikeness:
-    """Condition of a query, with its example and its metric."""
+    """Condition `like(...)` of a query, with its example, its metric, and the search request that stands for it."""
 
     condition: Likeness
     request: SimilarRequest
@@ -43,26 +46,26 @@ class FoundLikeness:
 
 
 class LikenessOrder(SimilarOrder):
-    """Message that asks a child process for the clips that have a moment like the example."""
+    """Message that asks a child process for the clips whose distance from the example is below or above a limit."""
 
     distance: float
     below: bool
 
 
 class AlikeClips(Message):
-    """Ids of the clips found, and number of changed clips that the index does not have."""
+    """Answer to a `LikenessOrder`: ids of the clips found, and number of changed clips that the index does not have."""
 
     clips: tuple[str, ...]
     behind: int
 
 
 def may_compare_motion(query: str | None) -> bool:
-    """Return whether a query may have a condition `like(...)`, without parsing it."""
+    """Return whether a query could contain a condition `like(...)`; this is a quick check of its text."""
     return query is not None and "like" in query.lower()
 
 
 def nothing_alike(query: str) -> dict[str, frozenset[str]]:
-    """Return an empty set of clips for each condition `like(...)` of a query.
+    """Return an empty set of clips for each condition `like(...)` of a query, for items that are not clips.
 
     Raises `BadRequestProblem` for a query that cannot be read.
     """
@@ -92,7 +95,10 @@ def _read(tx: Transaction, project: str, condition: Likeness) -> FoundLikeness:
 
 
 def _find(tx: Transaction, project: str, kind: Kind, path: str, condition: Likeness) -> str:
-    """Return the id of the item at a path."""
+    """Return the id of the item at a path.
+
+    Raises `BadRequestProblem`, with the column of the condition, if there is none.
+    """
     found = items.list_items(tx, project, kind, ItemFilters(path=path, name=path.rpartition("/")[2]), limit=1).items
     if not found:
         raise _bad(condition, f"There is no {kind.value} {path!r} in this project.")
@@ -111,9 +117,10 @@ def likeness_order(found: FoundLikeness, index: FoundIndex, shards: tuple[ShardF
 
 
 def clips_of(project: str, condition: Likeness, found: AlikeClips) -> frozenset[str]:
-    """Return the clips that meet a condition.
+    """Return the ids of the clips that meet a condition.
 
-    Raises `ConflictProblem` if the index does not have all clips, and `BadRequestProblem` if too many meet it.
+    Raises `ConflictProblem` if the index does not have all clips, and `BadRequestProblem` if too many clips meet the
+    condition.
     """
     if found.behind:
         raise ConflictProblem(
@@ -131,10 +138,10 @@ def clips_of(project: str, condition: Likeness, found: AlikeClips) -> frozenset[
 
 
 def search_clips(packed: bytes) -> bytes:
-    """Carry out a `LikenessOrder` and return packed `AlikeClips`.
+    """Search the clips that meet a condition, in a child process. `packed` is a `LikenessOrder` as bytes.
 
-    Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if files of the index are missing
-    or damaged.
+    Return `AlikeClips` as bytes. Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if
+    files of the index are missing or damaged.
     """
     from marey_motion.similarity import searching
 

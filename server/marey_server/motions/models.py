@@ -41,7 +41,7 @@ SAMPLES_SCHEMA = "marey/motion-samples@1"
 
 @dataclass(frozen=True, slots=True)
 class FoundModel:
-    """Revision of a model that the caller may read."""
+    """Revision of a model that the caller may read, and where its document is stored."""
 
     item: str
     name: str
@@ -50,7 +50,7 @@ class FoundModel:
 
 @dataclass(frozen=True, slots=True)
 class LoadedModel:
-    """Documents of a model."""
+    """Documents of a model: its part `model`, and the `hierarchy` of its skeleton."""
 
     model: dict[str, Any]
     hierarchy: dict[str, Any]
@@ -130,14 +130,20 @@ def pack_model(loaded: LoadedModel, tree: dict[str, Any] | None, mapping: dict[s
 
 
 def draw_samples(packed: bytes) -> bytes:
-    """Carry out a `SampleOrder` and return the document of the samples."""
+    """Draw samples from a model, in a child process. `packed` is a `SampleOrder` as bytes.
+
+    Return the document of the samples, encoded for the client.
+    """
     order = SampleOrder.unpack(packed)
     model = _usable_model(order.found, order.model)
     return order.encoding.encode(sample_document(order.found, model, order.count, order.seed))
 
 
 def write_samples(packed: bytes) -> bytes:
-    """Carry out a `SampleFileOrder` and return a packed `ComputedFile`."""
+    """Draw samples from a model and write them to a file, in a child process. `packed` is a `SampleFileOrder` as bytes.
+
+    Return a `ComputedFile` as bytes.
+    """
     order = SampleFileOrder.unpack(packed)
     model = _usable_model(order.found, order.model)
     return sample_file(order.found, model, order.count, order.seed, order.format, order.unit).pack()

@@ -76,10 +76,10 @@ class PredecessorOptions:
 
 
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
-    """Return the file of the predecessor that an item was imported from, or None if the requested part was changed.
+    """Return the file of Marey's predecessor from which an item was imported, or None if there is none.
 
-    Also return None for an item of another kind, and if `options` specify the form of the file, because the imported
-    file may have another form. The documents in `parts` may contain references to stored arrays in place of the arrays.
+    Also return None if the requested part was changed since the import, or if `options` specify a layout or form, which
+    the imported file may not have. The documents in `parts` may contain references to arrays in place of the arrays.
     """
     if options.layout is not None or options.form is not None or options.end_index is not None:
         return None
@@ -191,7 +191,10 @@ def _alignment(part: Mapping[str, Any]) -> bytes:
 
 
 def _model(part: Mapping[str, Any], hierarchy: Mapping[str, Any], options: PredecessorOptions) -> bytes:
-    """Return the file of a model; without a layout, in the layout that can contain its time function exactly."""
+    """Return the file of a model in the layout that `options` name.
+
+    Without a layout, use the one that can contain the model's time function exactly, or else layout 3.
+    """
     from marey_motion.documents import skeleton_from_document
     from marey_motion.formats.predecessor.model_writer import write_predecessor_model
     from marey_motion.formats.predecessor.time_functions import PredecessorTime
@@ -218,7 +221,10 @@ def _tree(model: Mapping[str, Any], part: Mapping[str, Any]) -> bytes:
 
 
 def _skeleton(name: str, parts: Parts, options: PredecessorOptions) -> tuple[str, bytes]:
-    """Return the ending of the name and the content of the file of a skeleton or of its skeleton model."""
+    """Return the file of a skeleton, or of its skeleton model (joint mapping and axes) if `options` ask for it.
+
+    Return the ending of the file's name, and its content. Raises `NotFoundProblem` if there is no joint mapping.
+    """
     from marey_motion.documents import skeleton_from_document
     from marey_motion.formats.predecessor.encoding import encode_document
     from marey_motion.formats.predecessor.skeleton import skeleton_document

@@ -1,4 +1,7 @@
-"""Previews of edits: inputs are read in one transaction; results are computed in a child process and not stored."""
+"""Previews of edits, which show the result of commands without storing it.
+
+One transaction reads the inputs; a child process computes the result.
+"""
 
 from __future__ import annotations
 
@@ -141,10 +144,11 @@ def preview_order(source: PreviewSource, request: EditPreviewRequest, encoding: 
 
 
 def make_preview(packed: bytes) -> bytes:
-    """Carry out a `PreviewOrder` and return the document of the preview.
+    """Compute a preview, in a child process. `packed` is a `PreviewOrder` as bytes.
 
-    Raises `InvalidProblem` if the commands cannot be applied, or if the result does not have the requested frames.
-    Raises `TooLargeProblem` if the edit or the requested range is too large.
+    Return the document of the preview, encoded for the client. Raises `InvalidProblem` if the commands cannot be
+    applied, or if the result does not have the requested frames. Raises `TooLargeProblem` if the edit or the requested
+    range is too large.
     """
     from marey_motion.documents import clip_to_document
     from marey_motion.kinematics import global_positions
@@ -204,7 +208,10 @@ def _edited(source: PreviewSource, most_work: float) -> tuple[EditedClip, ...]:
 
 
 def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
-    """Return a clip and its skeleton; the joint mapping is parsed when a command needs it. Raises `MotionError`."""
+    """Return a clip and its skeleton; the joint mapping is parsed when a command needs it.
+
+    Raises `MotionError` if the motion or the skeleton is not valid.
+    """
     from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
     from marey_motion.editing.take import EditedBody
     from marey_motion.rigs import JointMapping, map_joints, require_trust

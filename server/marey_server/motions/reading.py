@@ -26,7 +26,11 @@ _SKELETONS_KEPT = 64
 
 
 class FileOrder(Message):
-    """Message that asks a child process to read a file, together with its companion and its notes if it has them."""
+    """Message that asks a child process to read a file.
+
+    `companion` and `notes` are the contents of two files that accompany it, if they exist. `sibling_axis` is the upward
+    axis that other files with the same skeleton show.
+    """
 
     planned: PlannedFile
     content: bytes
@@ -41,7 +45,7 @@ class FileOrder(Message):
     notes_digest: str | None = None
 
     def file(self) -> FileToImport:
-        """Return the file with everything that is needed to import it."""
+        """Return the file with everything that is needed to import it, with the decoded skeleton."""
         given = None
         if self.skeleton is not None:
             item, revision, hierarchy = self.skeleton
@@ -60,7 +64,7 @@ def packed_skeleton(given: GivenSkeleton | None) -> tuple[str, int, bytes] | Non
 
 
 class ReadDocument(Message):
-    """Document that a child process has checked and encoded; the server computes its digests."""
+    """Message with a document that a child process has checked and encoded; the server computes the digests."""
 
     schema_name: str
     body: bytes
@@ -68,12 +72,12 @@ class ReadDocument(Message):
 
     @classmethod
     def of(cls, document: PreparedDocument) -> Self:
-        """Return the message that contains a prepared document."""
+        """Convert a prepared document to a message."""
         arrays = {pointer: data for pointer, (_, data) in document.arrays.items()}
         return cls(schema_name=document.schema, body=canonical_json(document.body), arrays=arrays)
 
     def document(self) -> PreparedDocument:
-        """Return the prepared document that the message contains."""
+        """Convert the message back to a prepared document."""
         return document_of_bytes(self.schema_name, self.body, self.arrays)
 
 
@@ -84,7 +88,7 @@ _SKELETONS: LruCache[bytes, PreparedDocument] = LruCache(max_entries=_SKELETONS_
 
 
 class ReadDraft(Message):
-    """Item to be created from a file."""
+    """Message with an item that is to be created from a file, and its parts."""
 
     name: str
     kind: Kind
@@ -96,14 +100,14 @@ class ReadDraft(Message):
     same_skeleton: bool
 
     def documents(self) -> dict[str, PreparedDocument]:
-        """Return the parts as prepared documents."""
+        """Return the parts of the item as prepared documents, by name."""
         if self.kind is not Kind.SKELETON:
             return {part: read.document() for part, read in self.parts.items()}
         return {part: _SKELETONS.get_or_make(read.body, read.document) for part, read in self.parts.items()}
 
 
 class ReadGraph(Message):
-    """Graph of models, read from a file of Marey's predecessor.
+    """Message with a graph of models, read from a file of Marey's predecessor.
 
     Each node is a tuple: action, name, id of the model, type, and transitions as pairs of action and name.
     """
@@ -118,7 +122,7 @@ class ReadGraph(Message):
 
     @classmethod
     def of(cls, graph: ImportedGraph) -> Self:
-        """Return the message that contains a graph."""
+        """Convert an imported graph to a message."""
         nodes = tuple((*place, node.model_id, node.type, node.transitions) for place, node in graph.graph.nodes.items())
         return cls(
             name=graph.name, collection=graph.collection, tags=tuple(graph.tags), file=graph.file, digest=graph.digest,
@@ -126,14 +130,14 @@ class ReadGraph(Message):
         )  # fmt: skip
 
     def graph(self) -> ImportedGraph:
-        """Return the graph that the message contains."""
+        """Convert the message back to an imported graph."""
         nodes = {(action, name): GraphNode(model, form, onwards) for action, name, model, form, onwards in self.nodes}
         graph = PredecessorGraph(nodes, self.start)
         return ImportedGraph(self.name, self.collection, self.tags, graph, self.file, self.digest)
 
 
 class ReadFile(Message):
-    """Items of a file, or the reason why the file was refused."""
+    """Message with the items that a child process has read from a file, or the reason why the file was refused."""
 
     items: tuple[ReadDraft, ...] = ()
     checks: tuple[Check, ...] = ()
@@ -165,7 +169,10 @@ def load_kernels() -> None:
 
 
 def read_file(order: bytes) -> bytes:
-    """Carry out a `FileOrder`; return a packed `ReadFile`. Raises `InvalidProblem` if a document cannot be stored."""
+    """Read a file, in a child process. `order` is a `FileOrder`, and the result a `ReadFile`, both as bytes.
+
+    Raises `InvalidProblem` if a document of the file cannot be stored.
+    """
     found = import_file(FileOrder.unpack(order).file())
     return ReadFile(
         items=tuple(map(_read_item, found.items)),
@@ -178,7 +185,10 @@ def read_file(order: bytes) -> bytes:
 
 
 def find_mapping(order: bytes) -> bytes:
-    """Carry out a `MappingOrder` and return the part `mapping` as a packed `ReadDocument`."""
+    """Find the joint mapping and the axes of a skeleton, in a child process. `order` is a `MappingOrder` as bytes.
+
+    Return the part `mapping` as a `ReadDocument`, as bytes.
+    """
     wanted = MappingOrder.unpack(order)
     skeleton = ImportedItem("", Kind.SKELETON, "", "", {"hierarchy": decoded_tree(wanted.hierarchy.document())})
     items = [skeleton]

@@ -1,4 +1,4 @@
-"""Comparison of the runs of a script: columns that differ, best values, and means of replicates with intervals."""
+"""Comparison of the runs of a script: differing columns, best values, and means of replicates with intervals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MOST_NAMED = 20
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """Runs, fields and goals of a requested comparison.
+    """Request for a comparison of runs.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Compared:
 
 
 def compare_runs(tx: Transaction, project: str, name: str, wanted: Compared) -> RunComparison:
-    """Compare the succeeded runs of a script.
+    """Compare the succeeded runs of a script, or the first `wanted.limit` of them.
 
     Raises `BadRequestProblem` for an unknown order, and for a field that no run has logged.
     """
@@ -66,7 +66,11 @@ def compare_read(
     *,
     complete: bool,
 ) -> RunComparison:
-    """Compare runs that were read, with their curves by the digest of the file. Raises `BadRequestProblem`."""
+    """Compare runs that were read from the database.
+
+    `curves` maps the digest of a curves file to its curves by field. `complete` is false if there are more runs than
+    these. Raises `BadRequestProblem` for a field that no run has logged.
+    """
     goals = _goals(wanted)
     logged = dict.fromkeys(field for run in found for field in run.fields)
     if found and (unknown := [field for field in (*wanted.fields, *goals) if field not in logged]):
@@ -97,7 +101,10 @@ def compare_read(
 
 
 def _goals(wanted: Compared) -> dict[str, Goal]:
-    """Return the goals by field; in an ascending order by a field, the lowest value of this field is the best."""
+    """Return for each field whether its highest or its lowest value is the best.
+
+    If the order of the runs names a field, it counts as a goal: in descending order, the highest value is the best.
+    """
     falls, field = wanted.sort.startswith("-"), wanted.sort.removeprefix("-")
     goals: dict[str, Goal] = {}
     if field.startswith("fields.") and (not wanted.fields or field.removeprefix("fields.") in wanted.fields):
@@ -108,7 +115,10 @@ def _goals(wanted: Compared) -> dict[str, Goal]:
 def _drawn(
     found: Sequence[RunToCompare], curves: Mapping[str, Mapping[str, Curve]], wanted: Compared
 ) -> tuple[str, ...]:
-    """Return the fields whose curves are compared."""
+    """Return the fields whose curves are returned, at most `MOST_DRAWN`.
+
+    These are the requested fields, or else the fields that most runs have.
+    """
     counts = Counter(field for run in found for field in curves.get(run.curves_blob or "", {}))
     fields = wanted.fields or [field for field, _ in counts.most_common()]
     return tuple(field for field in fields if field in counts)[:MOST_DRAWN]
@@ -176,7 +186,7 @@ def _with_best(
     runs: Sequence[ComparedRun],
     settings: Sequence[ComparedSetting],
 ) -> ComparedColumn:
-    """Return a column of a field with its best values, if its goal is known."""
+    """Return the column of a field with the best value and the best mean; unchanged if the field has no goal."""
     goal = goals.get(column.name) if column.of == "field" else None
     if goal is None:
         return column

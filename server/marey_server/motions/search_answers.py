@@ -67,7 +67,7 @@ class SearchOrder(Message):
     limits: SearchLimits
 
     def search(self) -> tuple[SearchResult, list[Searchable]]:
-        """Return the result of the search, and the model of each step."""
+        """Run the search; return its result, and the parsed model of each step."""
         usable = usable_searchables(self.models, self.request.seed, self.limits.drawing_work)
         return search(usable, self.request, self.limits.work), usable
 
@@ -102,7 +102,7 @@ class SearchResult:
 
 
 def search_limits() -> SearchLimits:
-    """Return the limits of every search."""
+    """Return the limits that apply to every search."""
     return SearchLimits(MOST_WORK, searching.MOST_DRAWING_WORK)
 
 
@@ -110,23 +110,29 @@ def search_limits() -> SearchLimits:
 
 
 def answer_search(packed: bytes) -> bytes:
-    """Carry out a `SearchAnswerOrder` and return the document of the answer."""
+    """Search models for motions, in a child process. `packed` is a `SearchAnswerOrder` as bytes.
+
+    Return the document of the answer, encoded for the client.
+    """
     order = SearchAnswerOrder.unpack(packed)
     result, usable = order.search()
     return order.encoding.encode(answer_of(result, usable, order.models.found, order.request))
 
 
 def write_search(packed: bytes) -> bytes:
-    """Carry out a `SearchFileOrder` and return a packed `ComputedFile`."""
+    """Search models and write found motions to a file, in a child process. `packed` is a `SearchFileOrder` as bytes.
+
+    Return a `ComputedFile` as bytes.
+    """
     order = SearchFileOrder.unpack(packed)
     return file_of(order.search()[0], order.models.found, order.format, order.unit).pack()
 
 
 def search(searchables: Sequence[Searchable], request: SearchRequest, most_work: float) -> SearchResult:
-    """Find the motions that a request describes.
+    """Search the models of all steps for the motions that a request describes.
 
-    Raises `InvalidProblem` with a pointer to the faulty constraint, and `TooLargeProblem` for searches that would take
-    more than a few seconds.
+    `most_work` limits the estimated computing time, in nanoseconds of one thread. Raises `InvalidProblem` with a JSON
+    Pointer to the faulty constraint, and `TooLargeProblem` for searches that would take longer.
     """
     from marey_motion.errors import MotionError
     from marey_motion.modelling.search import work as search_work
@@ -185,7 +191,7 @@ def _steps_of(searchables: Sequence[Searchable], request: SearchRequest) -> tupl
 
 
 def _invalid(request: SearchRequest, error: Any) -> InvalidProblem:
-    """Return an `InvalidProblem` with a JSON Pointer to the constraint that caused the error."""
+    """Convert an error of the search to an `InvalidProblem` with a JSON Pointer to the constraint that caused it."""
     where = str(error.where or "")
     if not request.steps:
         where = where.removeprefix("steps[0]").removeprefix(".")
@@ -256,7 +262,7 @@ def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintErr
 
 
 def _tolerance(constraint: SearchConstraint, unit: str) -> float:
-    """Return a constraint's tolerance in the unit in which the constraint's error is measured."""
+    """Return the tolerance of a constraint in the unit of its error: cm, degrees or seconds."""
     if isinstance(constraint, JointPositionConstraint | RootPositionConstraint):
         return constraint.tolerance_m / CM
     return float(getattr(constraint, f"tolerance_{unit}"))
@@ -287,7 +293,7 @@ def _found_step(result: SearchResult, number: int, one: Searchable, found: Found
 
 
 def placement_of(start: StartPlacement) -> Placement:
-    """Return the start position and heading as a `Placement`, which moves canonical coordinates into the world."""
+    """Return the `Placement` that moves canonical coordinates to a start position and heading in the world."""
     from marey_motion.alignment.aligned import Placement
 
     return Placement(radians(start.heading_deg), start.x, start.z)

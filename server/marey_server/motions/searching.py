@@ -34,9 +34,9 @@ SearchableKey = tuple[str, str, str]
 
 @dataclass(frozen=True, slots=True)
 class FoundSearchable:
-    """Model that the caller may search, with its tree and the mapping of its skeleton, if they exist.
+    """Model that the caller may search, with its search tree and the joint mapping of its skeleton, if they exist.
 
-    A tree that belongs to another state of the model is not used.
+    `tree` is None if the stored tree belongs to another state of the model.
     """
 
     model: FoundModel
@@ -64,7 +64,7 @@ class SearchedModels(Message):
 
 @dataclass(frozen=True, slots=True)
 class LoadedSearchable:
-    """Documents of a model that can be searched."""
+    """Documents of a model to be searched, with its search tree and joint mapping, if they exist."""
 
     model: LoadedModel
     tree: dict[str, Any] | None
@@ -77,7 +77,7 @@ class LoadedSearchable:
 
 @dataclass(frozen=True, slots=True)
 class Searchable:
-    """Model that can be searched.
+    """Parsed model that can be searched.
 
     `stored` is true if the tree is stored with the model, and false if it was built for the search from random samples.
     `drawing_work` is the estimated computing time for drawing these samples, in nanoseconds. `log_likelihoods` are the
@@ -153,10 +153,10 @@ def _parse_packed(packed: bytes, seed: int, most_work: float) -> Searchable:
 
 
 def parse_searchable(loaded: LoadedSearchable, seed: int, most_work: float) -> Searchable:
-    """Return the parsed model with a tree.
+    """Return the parsed model with a tree; a missing tree is built from samples that are drawn with `seed`.
 
-    Raises `InvalidProblem` if numbers of the model are not valid, and `TooLargeProblem` if drawing samples for a
-    missing tree would take too long.
+    Raises `InvalidProblem` if numbers of the model are not valid, and `TooLargeProblem` if drawing the samples would
+    cost more than `most_work`, in nanoseconds of one thread.
     """
     from marey_motion.documents import mapping_from_document
     from marey_motion.errors import MotionError

@@ -45,9 +45,10 @@ _LISTS_CACHE_BYTES = 64 * MIB
 
 @dataclass(frozen=True, slots=True)
 class FoundExample:
-    """Example of a search: its frames with some context in `motion`, and the skeleton of the clip.
+    """Example of a search: the frames `frames` of a clip, with the skeleton of the clip.
 
-    `first` is the index in `motion` of the first frame of the example.
+    `motion` contains these frames and some context before and after them; `first` is the index in `motion` of the first
+    frame of the example.
     """
 
     clip: str
@@ -60,7 +61,10 @@ class FoundExample:
 
 
 class ShardFiles(Message):
-    """Local files of a shard, and the numbers of the clips in it that do not belong to the index."""
+    """Paths of the local files of a shard: the list of its clips, and the features of their poses.
+
+    `dropped` contains the positions in the list of the clips that no longer belong to the index.
+    """
 
     clips: str
     poses: str
@@ -82,7 +86,7 @@ class SimilarOrder(Message):
 
 
 class FoundWindow(Message):
-    """Window that resembles the example: its clip, frames and seconds."""
+    """Window of a clip that resembles the example: half-open range of frames, times in seconds, and distance."""
 
     clip: str
     revision: int
@@ -94,7 +98,11 @@ class FoundWindow(Message):
 
 
 class FoundWindows(Message):
-    """Result of a search: windows, and the numbers of searched clips, and of changed clips that were not searched."""
+    """Result of a search by example: the windows found, the most similar first.
+
+    `searched_clips` is the number of clips that were searched; `behind` is the number of clips that were created or
+    changed after the last update of the index, and so not searched.
+    """
 
     windows: tuple[FoundWindow, ...]
     searched_clips: int
@@ -104,7 +112,8 @@ class FoundWindows(Message):
 def read_example(tx: Transaction, project: str, request: SimilarRequest) -> FoundExample:
     """Return the example of a search.
 
-    Raises `NotFoundProblem` if the clip does not exist, and `InvalidProblem` if it does not have the frames.
+    Raises `NotFoundProblem` if the clip does not exist. Raises `InvalidProblem` if the clip has fewer frames than the
+    example, or if the example is too long.
     """
     part = items.read_part(tx, project, Kind.CLIP, request.clip, "motion", revision=request.revision)
     motion, (start, stop) = part.tree, request.frames
@@ -162,7 +171,7 @@ def search_order(
 def answer_of(
     found: FoundWindows, metric: MetricDocument, index: FoundIndex, clips: dict[str, FoundClip]
 ) -> SimilarAnswer:
-    """Return the answer; a clip that was changed or deleted during the search is left out."""
+    """Return the answer to a search; windows of clips that were changed or deleted during the search are left out."""
     moments = [
         SimilarMoment(path=clips[one.clip].path, **one.model_dump())
         for one in found.windows
@@ -185,7 +194,7 @@ def _invalid(pointer: str, detail: str, code: str = "no-frames") -> InvalidProbl
 
 
 class ListedShard:
-    """List of the clips of a shard, with what every search needs of it."""
+    """List of the clips of a shard, with values that are computed once for all searches."""
 
     def __init__(self, clips: ShardClips) -> None:
         import numpy as np
@@ -214,10 +223,10 @@ _RANKS: LruCache[tuple[str, ...], list[Any]] = LruCache(max_entries=4)
 
 
 def search_index(packed: bytes) -> bytes:
-    """Carry out a `SimilarOrder` and return packed `FoundWindows`.
+    """Search an index of motions, in a child process. `packed` is a `SimilarOrder` as bytes.
 
-    Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if files of the index are missing
-    or damaged.
+    Return `FoundWindows` as bytes. Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if
+    files of the index are missing or damaged.
     """
     order = SimilarOrder.unpack(packed)
     with opened(order) as search:
@@ -226,7 +235,7 @@ def search_index(packed: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class OpenedSearch:
-    """Input of a search in a child process: the shards, the clips of each, the example and the metric."""
+    """Input of a search in a child process: the shards, the list of clips of each, the example and the metric."""
 
     lists: list[ListedShard]
     shards: list[SearchedShard]
@@ -235,7 +244,7 @@ class OpenedSearch:
     metric: PerceptualMetric
 
     def behind(self, heads: dict[str, int]) -> int:
-        """Count the clips that were created or changed since the index was updated; the index lacks their revisions.
+        """Count the clips of which the index does not have the newest revision.
 
         `heads` maps the id of a clip to the number of its newest revision.
         """
@@ -310,7 +319,7 @@ def _damaged() -> NotFoundProblem:
 
 
 def _ranks(lists: list[ListedShard]) -> list[Any]:
-    """Number the clips of all shards in the order of their ids."""
+    """Return, for each shard, the rank of each of its clips in the order of the ids of all clips."""
     import numpy as np
 
     if not lists:
@@ -323,7 +332,7 @@ def _ranks(lists: list[ListedShard]) -> list[Any]:
 
 
 def _example(order: SimilarOrder) -> tuple[Example, float]:
-    """Compute the features of the example, and its frame rate."""
+    """Compute the features of the example; also return its frame rate in Hz."""
     from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
     from marey_motion.matching.body import MatchingBody
     from marey_motion.motion import Motion
@@ -347,7 +356,7 @@ def _example(order: SimilarOrder) -> tuple[Example, float]:
 def _searched(
     order: SimilarOrder, files: ShardFiles, listed: ListedShard, ranks: Any, rate_hz: float, example: Example
 ) -> SearchedShard:
-    """Return a shard to search, without its dropped clips and the clips that changed since the index was updated."""
+    """Return a shard to search, without dropped clips, and without clips that changed since the index was updated."""
     import numpy as np
 
     from marey_motion.similarity.shard_search import SearchedShard

@@ -14,10 +14,11 @@ from marey_server.store.studies.judgements import CollectedAnswers
 
 
 def draw_plans(planned: PlannedDraw, count: int) -> list[Plan]:
-    """Return the motions of each trial for the next `count` participants.
+    """Draw the trials of the next `count` participants of a study.
 
-    The trials of a participant depend only on the study and on the participant's number in it, not on the number of
-    links that are created at once.
+    Return the motions of each trial, as indices of shape (count, trials, motions per trial). The trials of a
+    participant depend only on the study and on the participant's number in it, not on the number of links that are
+    created at once.
     """
     design = planned.design
     earlier = np.array(planned.earlier, np.int64) if planned.earlier else None
@@ -27,7 +28,7 @@ def draw_plans(planned: PlannedDraw, count: int) -> list[Plan]:
 
 
 def find_differences(collected: CollectedAnswers) -> StudyDifferences:
-    """Compute from the answers of a study how different its motions look, and the order of the motions."""
+    """Compute how different the motions of a study look to its participants, and an order of the motions by this."""
     count = collected.motion_count
     if not collected.answers:
         none = ((0,) * count,) * count

@@ -45,7 +45,10 @@ class WalkOrder(Message):
 
 
 def read_walks(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> WalkSource:
-    """Read an evaluation and the displayed frames of its trials. Raises `NotFoundProblem`."""
+    """Read an evaluation and the displayed frames of its trials.
+
+    Raises `NotFoundProblem` if the item is not an evaluation, or does not exist.
+    """
     if kind is not Kind.EVALUATION:
         raise NotFoundProblem(
             f"Only evaluations have a walk graph, not an item of the kind {kind}.", code="not-an-evaluation"
@@ -72,16 +75,16 @@ def walk_order(source: WalkSource, trial: str | None, form: WalkGraphFormat) -> 
 
 
 def make_walk_graph(packed: bytes) -> bytes:
-    """Carry out a `WalkOrder` and return the graph."""
+    """Compute a walk graph, in a child process. `packed` is a `WalkOrder` as bytes; the result is the graph's file."""
     order = WalkOrder.unpack(packed)
     source = WalkSource(order.name, unpack_tree(order.evaluation), unpack_tree(order.records))
     return write_walk_graph(source, order.trial, order.format)
 
 
 def write_walk_graph(source: WalkSource, trial: str | None, form: WalkGraphFormat) -> bytes:
-    """Write the graph of one trial, or of all trials together.
+    """Compute the walk graph of one trial, or of all trials together (`trial` is None); return it as a file.
 
-    Raises `NotFoundProblem` for an unknown trial, `InvalidProblem` if the documents contradict each other.
+    Raises `NotFoundProblem` for an unknown trial, and `InvalidProblem` if the documents contradict each other.
     """
     from marey_motion.errors import MotionError
     from marey_motion.evaluation.result_documents import clips_from_tree, records_from_tree

@@ -32,7 +32,7 @@ def give_token(tx: Transaction, administrator: str | None, token_file: Path, *, 
 
 
 def write_secret(file: Path, secret: str) -> None:
-    """Write a secret to a file that only its owner can read, in one step; missing folders are created."""
+    """Write a secret to a file that only its owner can read. Readers see the old file or the new one, never a part."""
     file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     partial_file = file.with_name(f"{file.name}.partial")
     partial_file.unlink(missing_ok=True)

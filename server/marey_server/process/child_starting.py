@@ -58,7 +58,10 @@ class ChildStarter:
                 self._fork_server.close()
 
     def _loaded(self, process: Loading) -> Loading:
-        """Wait until a process has loaded its modules, and return it. Raises `ChildBroken` or `OSError`."""
+        """Wait until a process has loaded its modules, and return it.
+
+        Raises `ChildBroken` or `OSError` if the process has ended before.
+        """
         with self._changed:
             self._loading.add(process)
             if self._closed:

@@ -1,8 +1,8 @@
 """Child processes in which the server reads untrusted files and computes.
 
-The number of children is limited, and users share them fairly. Each child has a thread, which starts it, sends it one
-task after another, and replaces it. When a child is free, it gets a task of the caller who uses the fewest children; no
-caller can use all of them.
+The number of children is limited, and users share them fairly. Each child has a thread in the server, which starts the
+child, sends it one task after another, and replaces it. A free child gets a task of the caller who uses the fewest
+children; no caller can use all of them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ChildLimits:
-    """Limits of all child processes together, and limits of each task."""
+    """Limits of all child processes together, and limits of each task.
+
+    Parameters
+    ----------
+    children : greatest number of child processes
+    requests : greatest number of requests that use a child or wait for one
+    memory_mb : memory in MiB that a task may use
+    processor_s, wall_s : greatest processor time and greatest duration of a task, in seconds
+    """
 
     children: int
     requests: int
@@ -71,10 +79,10 @@ class ChildLimits:
 
 @dataclass(eq=False)
 class ChildTask(Generic[T]):
-    """Call of a function in a child process.
+    """Call of a function, named `module:function`, in a child process.
 
     `make` creates the bytes that the function receives as its argument. `read` converts the bytes that the function
-    returns.
+    returns to the result of the task.
     """
 
     caller: str
@@ -110,7 +118,10 @@ class ChildTask(Generic[T]):
             _after(ABANDONED_S, self.stop, "client-gone")
 
     def succeed(self, payload: bytes) -> None:
-        """End the task with the result of `read` for the bytes `payload`, or with the error that `read` raises."""
+        """End the task with the result `read(payload)`, or with the error that `read` raises.
+
+        `payload` is the child's answer.
+        """
         try:
             result = self.read(payload)
         except Exception as error:  # noqa: BLE001 - whoever waits for the task gets it
@@ -124,7 +135,7 @@ class ChildTask(Generic[T]):
         self.count_stop(reason, self.function.partition(":")[2])
 
     def fail(self, error: Exception) -> None:
-        """End the task without a result."""
+        """End the task with an error, which is raised where the result is awaited."""
         with suppress(InvalidStateError):
             self.future.set_exception(error)
 
@@ -158,17 +169,17 @@ class Children:
 
     @contextmanager
     def request(self, caller: str, guest: str = "") -> Iterator[None]:
-        """Count a request of a caller, and of a guest if one is given, until the `with` statement ends.
+        """Count a request of a caller, and of a guest if one is given, while the `with` block runs.
 
         Raises `UnavailableProblem` if too many requests already use a child process or wait for one.
         """
         with self._changed:
             if self._requests[caller] >= self.limits.requests_each:
-                raise _busy(f"{self._requests[caller]} of your requests")
+                raise _busy(self._requests[caller], own=True)
             if guest and self._guests[guest] >= self.limits.requests_of_guest:
-                raise _busy(f"{self._guests[guest]} of your requests")
+                raise _busy(self._guests[guest], own=True)
             if self._requests.total() >= self.limits.requests:
-                raise _busy(f"{self._requests.total()} requests")
+                raise _busy(self._requests.total(), own=False)
             self._requests[caller] += 1
             self._guests[guest] += 1
         try:
@@ -235,7 +246,7 @@ class Children:
         thread.start()
 
     def _eligible(self) -> list[ChildTask[Any]]:
-        """Return the waiting tasks of callers who may use one more child; cancelled tasks are removed."""
+        """Return the waiting tasks of callers who may use one more child; first remove cancelled tasks."""
         self._waiting = [task for task in self._waiting if not task.future.cancelled()]
         using = Counter(task.caller for task in self._running)
         return [task for task in self._waiting if using[task.caller] < self.limits.children_each]
@@ -243,7 +254,7 @@ class Children:
     # -- the thread of one child --
 
     def _work(self, number: int) -> None:
-        """Run one task after another until the pool is closed; a child that has ended is replaced at once."""
+        """Run tasks in one child until the pool is closed. A child that has ended is replaced at once."""
         child, orders = self._started(), 0
         while (task := self._next_task(number)) is not None:
             if child is None or not child.alive:
@@ -294,7 +305,7 @@ class Children:
         return None
 
     def _perform(self, task: ChildTask[Any], child: ConnectedChild) -> bool:
-        """Run a task in a child; return whether the child can run another one."""
+        """Run a task in a child; return whether the child can run another task."""
         try:
             order = ChildOrder(function=task.function, payload=task.make(), processor_s=self.limits.processor_s).pack()
         except Exception as error:  # noqa: BLE001 - whoever waits for the task gets it
@@ -318,10 +329,10 @@ class Children:
         finally:
             timer.cancel()
             task.assign(None)
-        self._settle(task, outcome)
+        self._report_outcome(task, outcome)
         return not task.stopped and not outcome.out_of_memory
 
-    def _settle(self, task: ChildTask[Any], outcome: ChildAnswer) -> None:
+    def _report_outcome(self, task: ChildTask[Any], outcome: ChildAnswer) -> None:
         if outcome.out_of_memory:
             task.count_end("memory")
             task.fail(self._too_much_memory())
@@ -334,7 +345,10 @@ class Children:
             task.succeed(outcome.payload)
 
     def _problem_of_end(self, task: ChildTask[Any], status: int) -> ApiProblem:
-        """Return the error for a task whose child process ended during the task, and count the end in the metrics."""
+        """Return the error for a task whose child process ended with the exit status `status` during the task.
+
+        Also count the end in the metrics.
+        """
         if task.stopped == "closing":
             return _stopping()
         if status == LOST:
@@ -372,7 +386,8 @@ def _discard(child: ConnectedChild | None) -> None:
         child.kill(grace_s=0.0)
 
 
-def _busy(which: str) -> UnavailableProblem:
+def _busy(count: int, *, own: bool) -> UnavailableProblem:
+    which = f"{count} of your requests" if own else f"{count} requests"
     return UnavailableProblem(
         f"{which} already use the child processes of the server or wait for one; try again in a few seconds.",
         code="children-busy",

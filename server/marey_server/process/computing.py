@@ -26,7 +26,7 @@ BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class ComputeThreads:
-    """Three lanes (threads with a queue).
+    """Threads of the server process, in three lanes (threads with a queue of computations).
 
     The first lane computes for requests. One client may use as many of its threads as there are processors, but at
     least two. The same limit applies to all clients without a known token together. One more thread is always left to
@@ -68,7 +68,7 @@ class ComputeThreads:
 
 
 def compute_on_one_thread_each() -> None:
-    """Limit each computation of this process to one thread, because several computations run at the same time."""
+    """Limit the threads of numeric libraries to one for each computation, because computations run in parallel."""
     from threadpoolctl import threadpool_limits
 
     for name in BLAS_VARIABLES:  # for libraries that are not loaded yet
@@ -77,7 +77,7 @@ def compute_on_one_thread_each() -> None:
 
 
 def leave() -> None:
-    """End this process at once, without waiting for running computations and without freeing its objects one by one.
+    """End this process at once, without waiting for running computations and without freeing its objects.
 
     Nobody waits for the computations, because their clients have disconnected. Freeing all objects would take 0.3 s.
     """

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class DiskSpace:
-    """Free space of the disk that holds a folder; `floor_bytes` are kept for deletions and heartbeats."""
+    """Free space of the disk that holds a folder; below `floor_bytes`, only deletions and heartbeats are allowed."""
 
     def __init__(self, folder: Path, floor_bytes: int) -> None:
         self._folder = folder

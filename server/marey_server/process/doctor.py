@@ -1,6 +1,6 @@
-"""Checks of a server's machine, which also work while no server runs: settings, disk, database, kernels, sign-in.
+"""Checks of a server's machine: settings, disk, database, kernels, and sign-in.
 
-The checks do not change stored data, and do not create a database that does not exist.
+The checks also work while no server runs. They do not change stored data, and do not create a missing database.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Task that wakes waiting requests of this process after new events in the feed, the list of changes by all processes.
+"""Task that wakes waiting requests of this process when the feed has new events.
 
-One task per process reads the feed after each commit and after each notification of Postgres. It also reads the feed
-periodically, in case a notification was lost. So even many waiting requests cause no work while nothing changes.
+The feed is the list of changes by all processes that share the database. One task per process reads it after each
+commit and after each notification of Postgres. It also reads the feed periodically, in case a notification was lost. So
+even many waiting requests cause no work while nothing changes.
 """
 
 from __future__ import annotations
@@ -65,9 +66,9 @@ async def _follow(services: Services) -> None:
 
 
 class _FeedPosition:
-    """Position in the feed: the number of the last event that this process has read.
+    """Position of this process in the feed: the number of the last event that it has read.
 
-    It also holds the time up to which the process has announced retries that became due.
+    It also contains the time up to which due retries were announced to waiting workers.
     """
 
     def __init__(self, services: Services) -> None:
@@ -77,9 +78,9 @@ class _FeedPosition:
         self._look_for_due_at_s = 0.0
 
     async def announce_news(self) -> None:
-        """Wake the requests that wait for an event which has occurred since the last call.
+        """Wake the requests that wait for an event that was recorded after the last call.
 
-        Also wake workers that wait for jobs of a kind if a retry of such a job has become due.
+        Also wake the workers that wait for a kind of job, if a retry of such a job has become due.
         """
         await self._services.number_events()
         if self._last is None:
@@ -93,9 +94,9 @@ class _FeedPosition:
         await self._announce_due()
 
     async def _announce_due(self) -> None:
-        """Wake workers that wait for a kind of job if a retry of such a job has become due.
+        """Wake the workers that wait for a kind of job, if a retry of such a job has become due.
 
-        Finding due retries reads the whole queue, so this is not done after each commit.
+        Finding due retries reads the whole queue, so this is done at most every `LOOK_EVERY_S` seconds.
         """
         if time.monotonic() < self._look_for_due_at_s:
             return

@@ -1,10 +1,10 @@
-"""Periodic work of the server.
+"""Periodic work of the server, called housekeeping.
 
-It reclaims expired leases, and shares cached results with waiting jobs. It commits the outputs of jobs that have many
-outputs, merges waiting proposals, and submits the jobs of due schedules. It deletes old or unreferenced data. Only the
-leading process does this work, except that each process cares for its own data folder. Concurrent housekeeping would be
-safe, because every statement checks its conditions again. Each kind of work runs in a separate task, so that a failure
-does not affect other kinds of work.
+It reclaims expired leases, and completes waiting jobs with the results of identical jobs. It commits the outputs of
+jobs that have many outputs, merges waiting proposals, and submits the jobs of due schedules. It deletes old or
+unreferenced data. Only the leading process does this work, except that each process cleans its own data folder. Even
+concurrent housekeeping would be safe, because every statement checks its conditions again. Each kind of work runs in a
+separate task, so that a failure does not affect the other kinds.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ FIRST_GARBAGE_S = 60.0
 
 
 @asynccontextmanager
-async def keeping_house(services: Services) -> AsyncIterator[None]:
+async def running_housekeeping(services: Services) -> AsyncIterator[None]:
     """Run the periodic work while the `async with` block runs; then end the leadership of this process."""
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
     merges = WaitingMerges(services.database)
     with wakeups.listen([OUTPUTS_TO_COMMIT]) as listener:  # all the time, so that no job is missed during a commit
         chores = (
-            (tick_s, tick_s, _reap),
+            (tick_s, tick_s, _reclaim_leases),
             (tick_s, tick_s, _share_results),
             (tick_s, tick_s, partial(_merge_waiting, merges=merges)),
             (tick_s, tick_s, _submit_scheduled),
@@ -80,7 +80,10 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
 
 
 async def _give_up_lead(services: Services, holder: str) -> None:
-    """End the leadership of this process; if the database is unreachable, the leadership ends with its lease."""
+    """Give up the leadership of this process.
+
+    If the database is unreachable, the leadership ends when its lease expires.
+    """
     try:
         await _write(services, leader.give_up_lead, LEAD, holder)
     except ApiProblem as error:
@@ -88,7 +91,7 @@ async def _give_up_lead(services: Services, holder: str) -> None:
 
 
 async def _repeat(services: Services, holder: str, first_s: float, every_s: float, chore: Chore) -> None:
-    """Call `chore` after `first_s` seconds, and then again `every_s` seconds after each call has ended.
+    """Call `chore` after `first_s` seconds, and then again and again, `every_s` seconds after the last call has ended.
 
     A failure is logged and does not stop the repetition.
     """
@@ -103,29 +106,29 @@ async def _repeat(services: Services, holder: str, first_s: float, every_s: floa
         await asyncio.sleep(every_s)
 
 
-async def _reap(services: Services, holder: str) -> None:
-    """Reclaim every expired lease, page by page.
+async def _reclaim_leases(services: Services, holder: str) -> None:
+    """Reclaim every expired lease, page by page, if this process is the leader.
 
-    After a start or an interruption, first wait for a grace period, in which workers can renew their leases.
+    Nothing is reclaimed during the grace period after a start or an interruption, in which workers renew their leases.
     """
     try:
-        leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
-        if leads and may_reap:
-            await _reap_pages(services)
+        leads, may_reclaim = await _write(services, _look_round, holder, services.start_grace)
+        if leads and may_reclaim:
+            await _reclaim_pages(services)
     except UnavailableProblem:
         services.start_grace.restart()
         raise
 
 
 def _look_round(tx: Transaction, holder: str, grace: StartGrace) -> tuple[bool, bool]:
-    """Return whether this process is the leader, and whether the `grace` period is over.
+    """Return whether this process is the leader, and whether the grace period is over.
 
-    In this period after a start or an interruption, workers can renew leases that expired in the meantime.
+    In the grace period after a start or an interruption, workers can renew leases that expired in the meantime.
     """
     return _leads(tx, holder), grace.over(tx.now_us)
 
 
-async def _reap_pages(services: Services) -> None:
+async def _reclaim_pages(services: Services) -> None:
     if await _write(services, reaper.correct_times, services.queue_policy):
         log.warning("the database's clock was set back; times of leases were corrected")
     page = await _write(services, reaper.reap_page, services.queue_policy)
@@ -138,28 +141,28 @@ async def _reap_pages(services: Services) -> None:
 
 
 async def _share_results(services: Services, holder: str) -> None:
-    """Complete waiting jobs with the results of identical jobs that have succeeded."""
+    """Complete waiting jobs with the results of identical jobs that have succeeded, if this process is the leader."""
     if await _write(services, _leads, holder):
         while await _write(services, reaper.share_waiting) > 0:
             pass
 
 
 async def _merge_waiting(services: Services, holder: str, merges: WaitingMerges) -> None:
-    """Merge the waiting proposals that now meet all requirements."""
+    """Merge the waiting proposals that now meet all requirements, if this process is the leader."""
     if await _write(services, _leads, holder):
         await _in_thread(services, merges.attempt)
 
 
 async def _submit_scheduled(services: Services, holder: str) -> None:
-    """Submit the jobs of some due schedules; nothing is submitted while the disk is full."""
+    """Submit the jobs of some due schedules, if this process is the leader and the disk is not full."""
     if services.disk.fault() is None and await _write(services, _leads, holder):
         await _in_thread(services, submit_due, services.database)
 
 
 async def _commit_outputs(services: Services, holder: str, *, listener: Listener, longest_wait_s: float) -> None:
-    """Commit the outputs of jobs that have many outputs, and end these jobs; first wait for such jobs.
+    """Commit the outputs of jobs that have many outputs, and end these jobs, if this process is the leader.
 
-    The wait takes at most `longest_wait_s` seconds.
+    First wait until there is such a job, but at most `longest_wait_s` seconds.
     """
     await listener.wait(longest_wait_s)
     if await _write(services, _leads, holder):
@@ -167,7 +170,7 @@ async def _commit_outputs(services: Services, holder: str, *, listener: Listener
 
 
 def _leads(tx: Transaction, holder: str) -> bool:
-    """Return whether this process is the leader."""
+    """Become or remain the leader for housekeeping, if possible; return whether this process is the leader."""
     return leader.take_lead(tx, LEAD, holder, LEAD_TTL_US) is not None
 
 
@@ -203,7 +206,7 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 
 
 async def _forget_tries(services: Services, holder: str) -> None:
-    """Delete the expired rows of the limits on sign-ins, and sign-ins that were not completed in a browser.
+    """Delete expired counts of tries to sign in, and browser sign-ins that were not completed in time.
 
     The deletion takes little time, because there are few rows: each sign-in adds three rows, and passwords are hashed
     one by one.

@@ -54,7 +54,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Addresses from the discovery document of a provider, and how the server sends its client secret to it."""
+    """Facts from the discovery document of a provider.
+
+    `authorization`, `token` and `keys` are addresses. `secret_in_body` is true if the server must send its client
+    secret in the body of a request and not in a header.
+    """
 
     authorization: str
     token: str
@@ -64,8 +68,8 @@ class Endpoints:
     """True if the provider always sends its issuer (parameter `iss`, RFC 9207) when it sends a browser back."""
 
 
-class Remembered(Generic[T]):
-    """Cached document of the provider, read when it is first needed; concurrent requests cause a single read."""
+class CachedDocument(Generic[T]):
+    """Cached document of the provider, read when it is first needed. Concurrent requests cause a single read."""
 
     def __init__(self, load: Callable[[], Awaitable[T]]) -> None:
         self._load = load
@@ -74,7 +78,10 @@ class Remembered(Generic[T]):
         self._failed: tuple[float, str] | None = None
 
     async def get(self, most_age_s: float = KEPT_S) -> T:
-        """Return the document, which was read at most `most_age_s` seconds ago. Raises `UnavailableProblem`."""
+        """Return the document; read it again if the cached one is older than `most_age_s` seconds.
+
+        Raises `UnavailableProblem` if the document cannot be read.
+        """
         async with self._lock:
             now_s = time.monotonic()
             if self._loaded is not None and now_s - self._loaded[0] <= most_age_s:
@@ -90,19 +97,19 @@ class Remembered(Generic[T]):
 
 
 def provider_unavailable(detail: str) -> UnavailableProblem:
-    """Return the error for a provider that does not answer as it should."""
+    """Return the error for an identity provider that does not answer, or not as it should; `detail` is the reason."""
     return UnavailableProblem(detail, code="identity-provider-unavailable")
 
 
 class IdentityProvider:
-    """Client of one identity provider; it must be used on one event loop."""
+    """Client of one identity provider; all its methods must be called on the same event loop."""
 
     def __init__(self, settings: IdentitySettings) -> None:
         assert settings.oidc_issuer is not None
         self.issuer = settings.oidc_issuer
         self._settings = settings
-        self._endpoints = Remembered(self._discover)
-        self._keys = Remembered(self._fetch_keys)
+        self._endpoints = CachedDocument(self._discover)
+        self._keys = CachedDocument(self._fetch_keys)
         self._places = asyncio.Semaphore(MOST_AT_ONCE)
 
     @property
@@ -111,12 +118,16 @@ class IdentityProvider:
         return f"{(self._settings.public_url or '').rstrip('/')}{API}{CALLBACK_PATH}"
 
     async def check(self) -> None:
-        """Read the discovery document and the keys. Raises `UnavailableProblem`."""
+        """Read the discovery document and the keys. Raises `UnavailableProblem` if one of them cannot be used."""
         await self._endpoints.get()
         await self._keys.get()
 
     async def authorization_url(self, state: str, nonce: str, verifier: str) -> str:
-        """Return the address at which the person signs in. Raises `UnavailableProblem`."""
+        """Return the address at the provider to which the server sends a browser, so that the person signs in.
+
+        `state`, `nonce` and `verifier` belong to this sign-in (OpenID Connect, PKCE). Raises `UnavailableProblem` if
+        the provider's discovery document cannot be read.
+        """
         digest = hashlib.sha256(verifier.encode()).digest()
         endpoint = (await self._endpoints.get()).authorization
         query = {
@@ -132,18 +143,18 @@ class IdentityProvider:
         return f"{endpoint}{'&' if '?' in endpoint else '?'}{urlencode(query)}"
 
     async def identify(self, code: str, issuer: str | None, nonce: str, verifier: str) -> Person:
-        """Redeem an authorization code, and return the person in the ID token.
+        """Redeem an authorization code for an ID token, and return the person whom the token names.
 
-        `issuer` is the name that the provider gave when it sent the browser back, if any. Raises
+        `issuer` is the issuer that the provider gave when it sent the browser back, if any. Raises
         `UnauthenticatedProblem` if the code or the token is not valid, `ForbiddenProblem` if the person may not sign
-        in, and `UnavailableProblem`.
+        in, and `UnavailableProblem` if the provider does not answer as it should.
         """
         if self._places.locked():
             raise provider_unavailable("Too many people sign in at the moment; try again in a few seconds.")
         async with self._places:
             endpoints = await self._endpoints.get()
             if issuer != self.issuer and (issuer is not None or endpoints.names_issuer):
-                raise _refused("The answer came from another identity provider.")
+                raise _refused("The answer came from another identity provider than that of this server.")
             token = await self._redeem(endpoints, code, verifier)
             expected = Expectation(
                 self.issuer, self._settings.oidc_client_id or "", nonce, self._settings.oidc_leeway_s
@@ -207,7 +218,7 @@ class IdentityProvider:
             _fail("key set", str(error))
 
     async def _redeem(self, endpoints: Endpoints, code: str, verifier: str) -> str:
-        """Return the ID token for an authorization code; the caller must check the token."""
+        """Redeem an authorization code, and return the ID token as text; the caller must verify the token."""
         form = {
             "grant_type": "authorization_code",
             "code": code,
@@ -236,7 +247,11 @@ class IdentityProvider:
     async def _fetch(
         self, what: str, method: str, url: str, headers: Mapping[str, str] | None = None, form: Any = None
     ) -> dict[str, Any]:
-        """Return a JSON object that the provider sends. Raises `UnavailableProblem` and `UnauthenticatedProblem`."""
+        """Send a request to the provider, and return the JSON object in its answer.
+
+        `what` names the answer in errors. Raises `UnauthenticatedProblem` if the provider refuses the authorization
+        code, and `UnavailableProblem` for every other failure.
+        """
         sent = {"Accept": "application/json", "Accept-Encoding": "identity", **(headers or {})}
         try:
             async with (
@@ -264,7 +279,7 @@ class IdentityProvider:
 
 
 async def _read(what: str, answer: httpx.Response) -> bytes:
-    """Return the body of an answer that is not compressed and not too long."""
+    """Return the body of an answer. Raises `UnavailableProblem` if the body is compressed or too long."""
     if answer.headers.get("Content-Encoding", "identity") != "identity":
         _fail(what, "it is compressed, although this was not requested")
     body = bytearray()
@@ -285,7 +300,9 @@ def _secret_in(file: Any) -> str:
         return read_secret(file)
     except ValueError as error:
         log.error("the setting oidc_client_secret_file: %s", error)
-        raise provider_unavailable("The server cannot read its secret for the identity provider.") from None
+        raise provider_unavailable(
+            "The server cannot read the file that the setting oidc_client_secret_file names; ask an administrator."
+        ) from None
 
 
 def _fail(what: str, reason: str) -> NoReturn:

@@ -21,7 +21,7 @@ UNKNOWN_CLIENTS = "unknown-clients"
 
 
 class RequestMemory:
-    """Count of the bytes that all requests hold, limited to `total_bytes`. It is thread-safe.
+    """Count of the bytes that all requests hold, limited to `total_bytes`; any thread may use it.
 
     While no other request holds bytes, a request may exceed `total_bytes`; the limits on the size of a single request
     still apply.
@@ -56,7 +56,7 @@ class RequestMemory:
             self._count(client, more)
 
     def give_back(self, client: Client, held: int) -> None:
-        """Subtract `held` bytes, which a request no longer holds, from the memory counted for its client."""
+        """Subtract `held` bytes, which a request of the client has released, from the counted bytes."""
         with self._lock:
             self._count(client, -held)
 
@@ -71,7 +71,7 @@ class RequestMemory:
 def _shares(client: Client) -> dict[str, float]:
     """Return the keys under which a client's bytes are counted, each with its greatest share of the memory.
 
-    The bytes of an unknown client are counted under a key of its own, and under one key for all unknown clients.
+    A known client has one key. An unknown client has two: one of its own, and one that all unknown clients share.
     """
     if client.known:
         return {client.key: CLIENT_SHARE}
@@ -103,7 +103,7 @@ class Holding:
             self._memory.give_back(self._client, less)
 
     def release(self) -> None:
-        """Release all held bytes; may be called more than once."""
+        """Release all bytes that the request holds; may be called several times."""
         held, self._bytes = self._bytes, 0
         if held:
             self._memory.give_back(self._client, held)

@@ -49,7 +49,7 @@ access_log = logging.getLogger("marey_server.access_log")
 
 
 def request_id(given: str | None) -> str:
-    """Return the request id `given` by the client if it is valid, or else a new request id."""
+    """Return `given`, the request id that the client sent, if it is valid; otherwise, return a new request id."""
     return given if given is not None and _SANE_ID.fullmatch(given) else secrets.token_hex(12)
 
 
@@ -77,27 +77,27 @@ def _kind_of_fault(error: Exception) -> str:
 
 
 def _is_of_an_upgrade(record: logging.LogRecord) -> bool:
-    """Return whether to keep a log record of Alembic, which upgrades the schema of the database.
+    """Return whether to keep a log record of Alembic, the library that upgrades the schema of the database.
 
-    Warnings, errors and records of upgrades that run are kept. Other records, such as those of the schema check in each
-    readiness request, are dropped.
+    Warnings, errors, and records about upgrade steps that run are kept. Other records, such as those of the schema
+    check in each readiness request, are dropped.
     """
     return record.levelno > logging.INFO or record.getMessage().startswith("Running")
 
 
 @dataclass(frozen=True)
 class _OneMetric:
-    """Registry that contains one metric only."""
+    """Registry for the Prometheus client that contains one metric only."""
 
     metric: Metric
 
     def collect(self) -> Iterable[Metric]:
-        """Return the metric in a tuple."""
+        """Return the metric as a tuple of one element, as the Prometheus client expects."""
         return (self.metric,)
 
 
 class Metrics:
-    """Metrics for /metrics, in their own registry."""
+    """Prometheus metrics of this process, which `/metrics` shows, in a registry of their own."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -190,9 +190,10 @@ class Metrics:
             self.received.inc(bytes_in)
 
     def count_stopped_child(self, reason: str, work: str) -> None:
-        """Count a child process that ended before its work was done.
+        """Count a child process that ended before its task was done.
 
-        `reason` and `work` are names that the server's code defines.
+        `reason` is the reason of the end, and `work` the name of the task's function, both as the server's code defines
+        them.
         """
         self.children_stopped.labels(reason, work).inc()
 

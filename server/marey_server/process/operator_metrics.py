@@ -24,7 +24,10 @@ _CLAIM_DELAYS_S = (0.01, 0.05, 0.1, 0.5, 1, 5, 30, 120, 600, 3600, 6 * 3600, 864
 
 
 class OperatorMetrics(Observer):
-    """Metrics about the queue, workers and stored data; it observes the transactions of this process."""
+    """Metrics about the queue, workers and stored data.
+
+    The database calls an object of this class to count claims, ends of jobs, and lost leases in this process.
+    """
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self._add_jobs(registry)
@@ -100,7 +103,7 @@ class OperatorMetrics(Observer):
         self.disk_free.set_function(lambda: shutil.disk_usage(folder).free if folder.exists() else 0)
 
     def note_feed(self) -> None:
-        """Record the time at which this process has read the feed of events to its end."""
+        """Record that this process has just read the feed of events to its end."""
         self._feed_read_s = time.monotonic()
 
     @property
@@ -109,11 +112,11 @@ class OperatorMetrics(Observer):
         return time.monotonic() >= self._next_read_s
 
     def rest(self, duration_s: float) -> None:
-        """Postpone the next read of the numbers, after a read that took `duration_s` seconds."""
+        """Set the time before which the numbers are not read again, after a read that took `duration_s` seconds."""
         self._next_read_s = time.monotonic() + max(REFRESH_S, REST * duration_s)
 
     def show(self, figures: Figures, backing: str) -> None:
-        """Set the metrics to numbers that were read from the database."""
+        """Set the metrics to numbers read from the database; `backing` is the kind of storage for blobs."""
         self.has_figures, self._figures_read_s = True, time.monotonic()
         _replace(self.jobs_queued, {key: one.count for key, one in figures.queued.items()})
         _replace(self.oldest_age, {key: one.oldest_age_s for key, one in figures.queued.items()})
@@ -124,7 +127,7 @@ class OperatorMetrics(Observer):
         self.database_bytes.set(figures.database_bytes)
 
     def count_ended(self, state: str, reason: str | None) -> None:
-        """Count a job that has ended."""
+        """Count a job that has ended in the state `state`; `reason` is the reason of its failure, if it has failed."""
         self.jobs_ended.labels(state, reason or "none").inc()
 
     def count_requeued(self, outcome: str) -> None:
@@ -142,7 +145,7 @@ class OperatorMetrics(Observer):
 
 
 def _replace(gauge: Gauge, values: Mapping[tuple[str, ...], float]) -> None:
-    """Set the values of a gauge; combinations of labels that are not given become 0."""
+    """Set the values of a gauge by their labels; combinations of labels that are not in `values` become 0."""
     for shown in gauge.collect():
         for sample in shown.samples:
             gauge.labels(**sample.labels).set(0)

@@ -1,8 +1,8 @@
-"""Threads that hash passwords, and the part of a client's address for which sign-ins are limited.
+"""Threads that hash passwords, and the addresses by which sign-ins are limited.
 
-A hash takes 0.1 s and 32 MiB, so few hashes are computed at once. They never use the threads of the database or of
-other computations. There is one thread for users at addresses from which they have signed in before, and one thread for
-all other sign-ins. So these other sign-ins do not delay known users, and use at most one processor.
+A hash takes 0.1 s and 32 MiB, so few hashes are computed at once, and never in the threads of the database or of other
+computations. One thread is for users at addresses from which they have signed in before; the other is for all other
+sign-ins. So these other sign-ins do not delay known users, and use at most one processor.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ REFUSALS_REMEMBERED = 10_000
 
 
 def limited_address(text: str) -> str:
-    """Return the address for which a sign-in is counted: the client's address, or for IPv6 its /64 network."""
+    """Return the address by which sign-ins of a client are limited: its address, or for IPv6 its /64 network."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:  # a Unix socket has none
@@ -47,7 +47,7 @@ def limited_address(text: str) -> str:
 
 
 class PasswordLane:
-    """Thread that hashes passwords, and a bounded number of requests that use it."""
+    """Thread that hashes passwords, for a limited number of requests at the same time."""
 
     def __init__(self, name: str) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"marey-password-{name}")
@@ -58,7 +58,7 @@ class PasswordLane:
 
     @contextmanager
     def place(self, address: str) -> Iterator[None]:
-        """Count a request of an address while the `with` block runs.
+        """Occupy a place in this lane for a request from an address, while the `with` block runs.
 
         Raises `TooManyRequestsProblem` if the address already has too many requests in this lane, and
         `UnavailableProblem` if there are too many in total.
@@ -93,7 +93,10 @@ class PasswordLane:
 
 
 class RefusedTries:
-    """Refused sign-ins, remembered until they are allowed again, so that repetitions do not reach the database."""
+    """Addresses and accounts whose sign-ins are refused at the moment, with the time until which they are refused.
+
+    They are kept in memory, so that repeated tries do not reach the database.
+    """
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -110,7 +113,7 @@ class RefusedTries:
                 raise too_many_sign_ins(limit, wait_s)
 
     def note(self, attempt: SignInTry, refusal: TooManyRequestsProblem) -> None:
-        """Remember the time until which tries are refused.
+        """Remember a refusal of a try, and the time until which further tries are refused.
 
         Depending on the exceeded limit, either all tries from this address are refused, or only those for this name.
         """

@@ -1,4 +1,4 @@
-"""Start of programs beside the server: workers, the processes at a shared port, and the compilation of kernels."""
+"""Start of other programs by the server: workers, the processes that share a port, and the compilation of kernels."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 async def start_program(
     *arguments: str, environment: Mapping[str, str], stdin: int | None = None, inherited: Sequence[int] = ()
 ) -> Process:
-    """Start a Python interpreter with arguments, which inherits descriptors, and return its process.
+    """Start a Python interpreter with arguments as a new process, and return the process.
 
-    `stdin` is a descriptor, `asyncio.subprocess.PIPE`, or None to inherit the standard input. Raises `OSError`.
+    The process inherits the descriptors `inherited`. `stdin` is a descriptor, `asyncio.subprocess.PIPE`, or None to
+    inherit the standard input. Raises `OSError` if the process cannot be started.
     """
     return await asyncio.create_subprocess_exec(
         sys.executable, *arguments, stdin=stdin, pass_fds=inherited, env=environment

@@ -1,12 +1,13 @@
-"""Clients whose requests are refused often: their refusals are delayed while the event loop is late.
+"""Delays of refusals while the event loop is late, for clients whose requests are often refused.
 
 Every request, even a refused one, takes a few milliseconds of the event loop. If two hundred connections send only
 refused requests, all other clients wait for seconds. So while the event loop is late, a client that was refused several
 times must wait for its next refusal. Meanwhile, the event loop has time for other clients. Such a client is also
 treated as a client without a known token, so that its requests begin after the requests of other clients.
 
-Meanwhile, threads that compute also give way to the event loop sooner than Python's default of 5 ms, for which the loop
-would wait after almost every system call. This is not done always, because it makes all work some percent slower.
+While the event loop is late, threads that compute also give way to it sooner than Python's default of 5 ms, for which
+the loop would wait after almost every system call. Otherwise, the default applies, because a shorter time makes all
+work some percent slower.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class RefusalBrake:
 
     @contextlib.contextmanager
     def delaying(self) -> Iterator[None]:
-        """Count a refusal as delayed during the `with` block."""
+        """Count one more refusal that is being delayed, while the `with` block runs."""
         self._delayed += 1
         try:
             yield
@@ -100,7 +101,10 @@ class RefusalBrake:
             self._delayed -= 1
 
     def is_often_refused(self, client: str) -> bool:
-        """Return whether more than `FREE_REFUSALS` refusals of a client count."""
+        """Return whether a client is refused often at the moment.
+
+        This means that more than `FREE_REFUSALS` of its refusals still count; each one counts for a limited time.
+        """
         return self._count(client, time.monotonic()) > FREE_REFUSALS
 
     def _count(self, client: str, now_s: float) -> float:

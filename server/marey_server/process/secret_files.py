@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def read_secret(file: Path) -> str:
-    """Return the secret that a file contains. Raises `ValueError` if the file cannot be read."""
+    """Return the secret that a file contains. Raises `ValueError`, with the reason, if the file cannot be read."""
     try:
         return file.read_text(encoding="utf-8").rstrip("\r\n")
     except (OSError, UnicodeDecodeError) as error:

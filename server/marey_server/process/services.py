@@ -78,7 +78,7 @@ def _answer_cache(most_bytes: int) -> LruCache[tuple[str, str], bytes]:
 class Services:
     """Shared parts of a server process: database, threads, metrics, and whether the server is draining."""
 
-    parting = False
+    lingering = False
     """True if the process accepts no more connections; then its answers ask clients to close their connections."""
     tracer: Tracer | None
     """Sender of the spans of requests; None if no collector is configured."""
@@ -131,7 +131,7 @@ class Services:
         self._watch()
 
     def _watch(self) -> None:
-        """Add the sizes of queues and pools to the metrics."""
+        """Let the metrics show the sizes of queues and pools."""
         passwords = {"passwords": self.password_lane, "passwords-unknown": self.unknown_lane}
         self.metrics.watch({**self.database.lanes, **self.compute_threads.lanes, **passwords})
         self.database.observer = self.metrics.operator
@@ -143,7 +143,10 @@ class Services:
         self.metrics.database_connections.set_function(lambda: self.database.connections_in_use)
 
     def note_faults(self, faults: Sequence[str]) -> None:
-        """Log the reasons why the server is not ready when these reasons change; also log when it is ready again."""
+        """Log changes of the server's readiness.
+
+        `faults` are the reasons why the server is not ready; empty: it is ready.
+        """
         if list(faults) != self._faults:
             self._faults = list(faults)
             if faults:
@@ -152,11 +155,11 @@ class Services:
                 log.info("ready again")
 
     def client_key(self, token: str) -> str | None:
-        """Return the key of the client that has a token, or None if no request with this token was accepted before.
+        """Return the key of the client to which a token belongs, or None if the token is not known.
 
-        All tokens of a user belong to one client, so that nobody gets more than one share by creating tokens. Each
-        worker and each attempt is a client of its own. The token of an attempt is known before its first request,
-        because its seal shows that a server has issued it.
+        A token is known if a request with it was accepted before. All tokens of a user belong to one client, so that
+        nobody gets more than one share by creating tokens. Each worker and each attempt is a client of its own. The
+        token of an attempt is known before its first request, because its seal shows that a server has issued it.
         """
         hashed = token_hash(token)
         key = self._client_keys.get(hashed)
@@ -165,7 +168,7 @@ class Services:
         return key or None
 
     def forget_client(self, token: str) -> None:
-        """Treat a token that is no longer valid like an unknown token, until a request with it is accepted again."""
+        """Treat a token that is no longer valid as unknown, until a request with it is accepted again."""
         if self.client_key(token) is not None:  # invented tokens must not displace others
             self._client_keys.put(token_hash(token), "")
 
@@ -187,8 +190,8 @@ class Services:
     async def refresh_figures(self) -> None:
         """Begin to read the numbers about the queue and stored data for the metrics, unless they were read recently.
 
-        Does not wait for the result, which later requests for metrics show. Only while nothing was read yet, this
-        method waits, at most `FIGURES_WAIT_S`.
+        The method does not wait for the result, which later requests for metrics show. But if no numbers have been read
+        yet, it waits, at most `FIGURES_WAIT_S` seconds.
         """
         if (self._reading_figures is None or self._reading_figures.done()) and self.metrics.operator.is_due:
             self._reading_figures = asyncio.create_task(self._read_figures())
@@ -205,13 +208,13 @@ class Services:
         shown.rest(time.monotonic() - begun_s)
 
     async def number_events(self) -> None:
-        """Number all committed events, so that they can be read; on SQLite, events are numbered already."""
+        """Give numbers to all committed events, so that they can be read. On SQLite, each commit does this itself."""
         numbered = 0 if self.database.is_sqlite else events.NUMBERED_AT_ONCE
         while numbered == events.NUMBERED_AT_ONCE:
             numbered = await asyncio.wrap_future(self.database.submit_write(SYSTEM, events.number_events))
 
     def end_attempt(self, lost: AuthorLostProblem) -> None:
-        """End a job whose author may no longer run the job; if this fails, the job ends when its lease expires."""
+        """End the job of an attempt whose author may no longer run jobs; if this fails, the job ends with its lease."""
         with suppress(UnavailableProblem):
             self.database.submit_write(SYSTEM, end_for_lost_author, lost.job_id, lost.fence)
 

@@ -26,7 +26,7 @@ def explain_faults(error: ValidationError, given: Mapping[str, Any]) -> str:
 
 
 def explain_variable(error: SettingsError) -> str:
-    """Return the reason for refusing the variable of a setting whose value must be a list or an object."""
+    """Return the reason why a variable is refused whose setting must be a list or an object: it is not valid JSON."""
     setting = re.search(r'field "(\w+)"', str(error))
     variable = f"{PREFIX}{setting[1]}".upper() if setting else f"a variable that begins with {PREFIX}"
     return f"{variable}: the value is not JSON ({error.__cause__}); {_JSON_FORMS}"
@@ -49,9 +49,9 @@ def _reason(fault: Any) -> str:
 
 
 def _setting_at(steps: Sequence[int | str], given: Mapping[str, Any]) -> str:
-    """Return where a setting is set: its name, the name of its variable, or the file and the line with its name.
+    """Return the place where a setting is set: the name of its variable, or the file, the line and its name.
 
-    The name alone is returned for a setting of the command line (`given`), and for one that is set nowhere.
+    For a setting of the command line (`given`), and for one that is set nowhere, return only its name.
     """
     name, whole = str(steps[0]) if steps else "", ".".join(map(str, steps))
     if given.get(name) is not None:

@@ -320,7 +320,7 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
                 "database_url must contain a user and no password, as in postgresql://marey@db.internal/marey"
             )
         if not read_secret(file):
-            raise ValueError(f"{file} is empty, but must contain a password")
+            raise ValueError(f"{file} is empty, but must contain the password of the database user")
         return file
 
     @field_validator("heartbeat_s")

@@ -24,7 +24,7 @@ _ENDLESS = 2**62
 
 
 class Turns:
-    """Requests that wait for their turn, and the number of requests that may still begin in this round."""
+    """Queue of requests that wait for their turn. In each round of the event loop, a limited number of them begins."""
 
     def __init__(self) -> None:
         self._reserved: FairLine[asyncio.Future[None]] = FairLine(_ENDLESS, _ENDLESS)
@@ -36,7 +36,7 @@ class Turns:
         return len(self._reserved) + len(self._ordinary)
 
     def take(self, client: Client, *, reserved: bool) -> asyncio.Future[None] | None:
-        """Return a future that ends when the request may begin, or None if the request may begin at once.
+        """Return a future that ends when it is the request's turn, or None if the request may begin at once.
 
         With `reserved`, the request waits in the line of reserved operations, such as heartbeats. In each round, this
         line has `RESERVED_PER_ROUND` places of its own.

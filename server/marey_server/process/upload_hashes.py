@@ -22,7 +22,7 @@ READ_BYTES = 4 * 2**20
 
 
 class _RunningHash:
-    """Hash of the first `offset` bytes of an upload, and the file to which these bytes are copied, if there is one."""
+    """Hash of the first `offset` bytes of an upload, and the file to which these bytes are copied, if any."""
 
     def __init__(self, copy: Path | None) -> None:
         self.lock = threading.Lock()
@@ -70,9 +70,10 @@ class UploadHashes:
                 running.add(data)
 
     def finish(self, principal: Principal, upload: uploads.StoredUpload) -> tuple[str, Path | None] | None:
-        """Return the digest of a complete upload and the path of its copy, which is None if there is no copy.
+        """Return the digest of an upload and the path of its copy, which is None if there is no copy.
 
-        Hash at most `STEP_BYTES` of the bytes that are not hashed yet; if bytes remain after this, return None.
+        All bytes of the upload must be stored. Each call hashes at most `STEP_BYTES` of them; if bytes remain, return
+        None: call again.
         """
         running = self._running(upload.id)
         with running.lock:

@@ -60,7 +60,8 @@ class WorkerPool(BaseModel):
         300.0, ge=1, description="Seconds for which a worker must be superfluous before it is stopped."
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="Options of the launcher for this pool, in addition to launcher_options."
+        default_factory=dict,
+        description="Options of the launcher for this pool; each replaces the same option in launcher_options.",
     )
 
     @property
@@ -110,7 +111,8 @@ class OwnPods(BaseModel):
     )
     cpus: int | None = Field(None, ge=1, le=1024, description="Processors of a pod. Absent: cpus of the launcher.")
     options: dict[str, Any] = Field(
-        default_factory=dict, description="Options of the launcher for these pods, in addition to launcher_options."
+        default_factory=dict,
+        description="Options of the launcher for these pods; each replaces the same option in launcher_options.",
     )
 
     @property

@@ -1,4 +1,4 @@
-"""A server process as its parent sees it: started, ready, asked to stop, ended."""
+"""Handle with which the parent starts, watches and stops a server process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STOPPING_S = 45.0
 
 
 class ProcessHandle:
-    """A server process that the parent has started; `number` is its place among the processes of the server."""
+    """Server process that the parent has started. `number` is its place among the processes of the server, from 1."""
 
     def __init__(
         self, number: int, process: Process, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
@@ -39,7 +39,7 @@ class ProcessHandle:
 
     @classmethod
     async def start(cls, number: int, order: StartOrder) -> Self:
-        """Start a process, which inherits the sockets in its order. Raises `OSError`."""
+        """Start a process, which inherits the sockets that `order` names. Raises `OSError` if it cannot be started."""
         ours, theirs = socket.socketpair()
         with theirs:
             process = await programs.start_program(
@@ -66,11 +66,11 @@ class ProcessHandle:
 
     @property
     def runs(self) -> bool:
-        """True if the process is running and was not asked to end."""
+        """True if the process is running and the parent has not asked it to end."""
         return not self.stopping and not self._ended.done()
 
     async def until_ready(self) -> bool:
-        """Wait until the process accepts connections, and return True; return False if it ends before."""
+        """Wait until the process accepts connections, and return True; return False if it ends before this."""
         await asyncio.wait((self._ready, self._ended), return_when=asyncio.FIRST_COMPLETED)
         return self.is_ready and not self._ended.done()
 
@@ -79,11 +79,14 @@ class ProcessHandle:
         return await asyncio.shield(self._ended)
 
     def keep_workers(self) -> None:
-        """Let the process run the workers of the server from now on."""
+        """Ask the process to run the workers of the server from now on."""
         self._writer.write(KEEP_WORKERS)
 
     async def stop(self, drain_s: float) -> None:
-        """Let the process end its running requests, and wait until it has ended; kill it if it takes too long."""
+        """Ask the process to finish its running requests and end; kill it if it takes too long.
+
+        Wait until it has ended.
+        """
         self.stopping = True
         self._send(signal.SIGTERM)
         try:

@@ -1,7 +1,7 @@
-"""Messages between the parent and a server process, over a pair of sockets that is the process's standard input.
+"""Messages between the parent and a server process, over a pair of sockets.
 
-The pair of sockets also shows to each side that the other has ended. Nothing is passed in arguments or variables,
-because settings may contain a password.
+One of the sockets is the process's standard input. Each side also notices by the pair of sockets that the other side
+has ended. Nothing is passed in arguments or variables, because settings may contain a password.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MOST_LINE_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class StartOrder:
-    """First line that a server process receives.
+    """First message that a server process receives from its parent.
 
     `settings` are those that were given as options; the process reads variables and `marey.toml` itself. `sockets` are
     the descriptors of the listening sockets, and `metrics_sockets` those of the process's own port for metrics.
@@ -40,7 +40,10 @@ class StartOrder:
 
     @classmethod
     def receive(cls, control: socket.socket) -> Self:
-        """Wait for the order. Raises `EOFError` if the parent ends before it sends one."""
+        """Wait for the first message and return it.
+
+        Raises `EOFError` if the parent ends before it has sent the message.
+        """
         line = bytearray()
         while not line.endswith(b"\n"):
             received = control.recv(1)  # so that nothing that follows the line is taken

@@ -34,7 +34,8 @@ async def serve_in_processes(settings: Settings, given: dict[str, Any]) -> None:
     """Run the processes of a server until SIGTERM or SIGINT; SIGHUP replaces all of them, one after another.
 
     The processes get the settings `given`. They read all other settings themselves, so that new processes use changed
-    settings. Raises `CannotListen` and `ProcessesFailed`.
+    settings. Raises `CannotListen` if the address cannot be used, and `ProcessesFailed` if the processes cannot be
+    started or end repeatedly.
     """
     configure_logging(settings.log_form, settings.log_level)
     sockets = listen(settings.host, settings.port)
@@ -52,7 +53,7 @@ async def serve_in_processes(settings: Settings, given: dict[str, Any]) -> None:
 
 
 class ProcessesFailed(Exception):
-    """Error of a server whose processes end again and again; its text says what happened and what to do."""
+    """Error of a server whose processes cannot be started or end repeatedly; the text gives the reason."""
 
 
 class Parent:
@@ -90,7 +91,10 @@ class Parent:
         self.stopping = asyncio.Event()
 
     async def run(self) -> None:
-        """Run the processes until `stopping` is set. Raises `ProcessesFailed`."""
+        """Run the processes until `stopping` is set.
+
+        Raises `ProcessesFailed` if they cannot be started or end repeatedly.
+        """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stopping.set)
@@ -121,7 +125,10 @@ class Parent:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _start_all(self) -> None:
-        """Start all processes; the first one upgrades the database before the others start."""
+        """Start all processes: first one process, which upgrades the database, and then the others.
+
+        Raises `ProcessesFailed` if the first process ends, or a process cannot be started.
+        """
         numbers = iter(self._changing)
         first = self._current[next(numbers)] = await self._start(1, first=True)
         self._worker_keeper = first if self._has_workers else None
@@ -155,7 +162,7 @@ class Parent:
     # -- processes that end by themselves --
 
     async def _keep(self, number: int) -> None:
-        """Start the process in a place again whenever it ends by itself, with growing pauses."""
+        """Start the process with this number again whenever it ends by itself, with growing pauses."""
         quick_ends = 0
         while True:
             process = self._current[number]
@@ -180,14 +187,17 @@ class Parent:
                 self._announce()
 
     async def _start_again(self, number: int) -> None:
-        """Start the process in a place; if the system starts no process, the next attempt follows after a pause."""
+        """Start the process with this number. If the operating system cannot start it, only log this."""
         try:
             self._current[number] = await self._start(number)
         except ProcessesFailed as error:
             log.error("%s", error)
 
     def _note_end(self, process: ProcessHandle, status: int) -> None:
-        """Count a process that ended. Raises `ProcessesFailed` if the processes end again and again."""
+        """Count an ended process as failed if it ran only shortly.
+
+        Raises `ProcessesFailed` after several failures in a row.
+        """
         self._failures = self._failures + 1 if process.age_s < HEALTHY_AFTER_S else 0
         healthy = any(one.is_ready and one.runs and one.age_s >= HEALTHY_AFTER_S for one in self._current.values())
         if self._failures >= MOST_FAILURES and not healthy:
@@ -197,7 +207,7 @@ class Parent:
             )
 
     def _give_workers(self) -> None:
-        """Let one process run the workers, if the process that ran them has ended or stops."""
+        """Let one process run the workers if no process runs them, because that process has ended or is stopping."""
         if not self._has_workers or (self._worker_keeper is not None and self._worker_keeper.runs):
             return
         ready = [one for one in self._current.values() if one.is_ready and one.runs]
@@ -219,7 +229,7 @@ class Parent:
             note_ready()
 
     async def _replace_all(self) -> bool:
-        """Replace all processes; stop and return False when a new process does not become ready."""
+        """Replace all processes one after another; stop and return False if a new process does not become ready."""
         for number in self._changing:
             async with self._changing[number]:
                 try:

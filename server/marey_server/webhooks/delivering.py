@@ -1,7 +1,7 @@
-"""Sends events to webhooks. Of all processes that share the database, only the leading one does this.
+"""Task that sends events to webhooks. Of all processes that share the database, only the leader runs it.
 
-The leading process wakes up when there are events, and starts a task for each webhook that may have something to
-send. A task sends the deliveries of its webhook one after another, so a slow receiver delays only its own webhook.
+The leader wakes up when there are events, and starts a task for each webhook that may have something to send. A task
+sends the deliveries of its webhook one after another, so a slow receiver delays only its own webhook.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 @asynccontextmanager
 async def delivering(services: Services) -> AsyncIterator[None]:
-    """Deliver events to webhooks while the `async with` block runs, if this process leads."""
+    """Send events to webhooks while the `async with` block runs, if this process is the leader."""
     deliverer = Deliverer(services)
     task = asyncio.create_task(deliverer.run())
     try:
@@ -92,7 +92,7 @@ class Deliverer:
                 await listener.wait(wait_s)
 
     async def close(self) -> None:
-        """Stop: wait a short time for attempts under way, then give up the lead."""
+        """Stop sending: wait a short time for attempts that are under way, then give up the lead."""
         lead, self._lead = self._lead, None
         if self._tasks:
             await asyncio.wait(self._tasks.values(), timeout=STOP_S)
@@ -107,7 +107,10 @@ class Deliverer:
                 log.warning("deliveries can pass to another process only in %d s: %s", LEAD_TTL_S, error.detail)
 
     async def _look_round(self) -> float:
-        """Start the tasks of webhooks that may have something to send; return the seconds until the next search."""
+        """Start a task for each webhook that may have something to send.
+
+        Return the number of seconds until the next search for such webhooks.
+        """
         if not self._leads() and time.monotonic() < self._renew_at_s:
             return RENEW_EVERY_S
         work = await self._read(outbox.find_work, self._after)
@@ -142,7 +145,7 @@ class Deliverer:
         self._lead_until_s = asked_s + LEAD_TTL_S / 2
 
     def _leads(self) -> bool:
-        """Return whether this process leads, and its lease has enough time left, so that no other process can lead."""
+        """Return whether this process is the leader and remains it for some time, so that no other process can lead."""
         return self._lead is not None and time.monotonic() < self._lead_until_s
 
     def _start(self, webhook_id: str) -> None:
@@ -165,8 +168,8 @@ class Deliverer:
     async def _serve(self, webhook_id: str) -> None:
         """Send everything that a webhook has to send, until an attempt fails.
 
-        If this process loses the lead, or if an error of the server interrupts the task, the next search for work
-        starts the webhook again.
+        If this process loses the lead, or if an error of the server interrupts the task, the next search starts a new
+        task for the webhook.
         """
         interrupted = True
         try:
@@ -183,7 +186,7 @@ class Deliverer:
                 self._interrupted.add(webhook_id)
 
     async def _send_batch(self, webhook_id: str) -> bool:
-        """Send the next deliveries of a webhook; return whether there may be more."""
+        """Send the next deliveries of a webhook; return whether there may be more of them."""
         newest = self._after or 0
         batch = await self._read(outbox.next_batch, webhook_id, self._scanned.get(webhook_id, 0))
         if batch is None:
@@ -205,7 +208,10 @@ class Deliverer:
         return not batch.complete
 
     async def _note_scanned(self, webhook_id: str, position: int, newest: int) -> None:
-        """Remember that no event up to the one numbered `newest` concerns a webhook; store this from time to time."""
+        """Remember that no event up to the number `newest` concerns a webhook.
+
+        The database stores this only from time to time.
+        """
         self._scanned[webhook_id] = newest
         if newest - position > outbox.SKIPPED_MOST:
             await self._write(outbox.move_on, webhook_id, position, newest)
@@ -213,7 +219,7 @@ class Deliverer:
     async def _send(self, batch: Batch, delivery: Delivery, before: tuple[int, int]) -> Outcome | None:
         """Send a delivery, record the result, and return the outcome.
 
-        Returns None if this process is no longer the leader, or if the webhook has changed since the batch was read.
+        Return None if this process is no longer the leader, or if the webhook has changed since the delivery was read.
         """
         share = self._shares.get(batch.sharer) or asyncio.Semaphore(MOST_OF_ONE_USER)
         self._shares[batch.sharer] = share

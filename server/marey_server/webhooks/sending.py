@@ -43,7 +43,7 @@ class AddressRefused(OSError):
 
 
 class CheckedResolver(Resolver):
-    """Resolver that returns only addresses to which the server may connect.
+    """Resolver of host names that returns only addresses to which the server may connect.
 
     Parameters
     ----------
@@ -51,14 +51,17 @@ class CheckedResolver(Resolver):
     """
 
     def initialize(self, networks: Sequence[Network]) -> None:
-        """Store the networks, and make the threads."""
+        """Store the networks, and create the threads that resolve names."""
         self._networks = tuple(networks)
         self._threads = ThreadPoolExecutor(RESOLVERS, thread_name_prefix="webhook-names")
 
     async def resolve(
         self, host: str, port: int, family: socket.AddressFamily = socket.AF_UNSPEC
     ) -> list[tuple[int, Any]]:
-        """Return the permitted addresses of a host, each with its family. Raises `AddressRefused` or `OSError`."""
+        """Return the permitted addresses of a host, each with its family.
+
+        Raises `AddressRefused` if no address of the host is permitted, and `OSError` if the name cannot be resolved.
+        """
         loop = asyncio.get_running_loop()
         found = await loop.run_in_executor(self._threads, _look_up, host, port, family)
         permitted = [(kind, address) for kind, address in found if may_connect(address[0], self._networks)]
@@ -90,7 +93,7 @@ class Sender:
         )
 
     async def send(self, destination: Destination, delivery: Delivery) -> DeliveryResult:
-        """Send a delivery once, and return the result. A status from 200 to 299 is a success."""
+        """Send a delivery once, and return the result. An answer with a status from 200 to 299 is a success."""
         body = delivery.body.encode()
         headers = signed_headers(destination.secrets, delivery.id, delivery.kind, int(time.time()), body)
         first_lines: list[str] = []
@@ -122,7 +125,10 @@ class Sender:
 
 
 def _status(first_lines: Sequence[str]) -> int | None:
-    """Return the status in the last status line; earlier ones belong to interim answers, such as 100 Continue."""
+    """Return the status of an answer, or None if there is no answer.
+
+    The last of the status lines has this status; earlier lines belong to interim answers, such as 100 Continue.
+    """
     with suppress(IndexError, ValueError):
         return int(first_lines[-1].split()[1])
     return None
@@ -134,7 +140,7 @@ def _refusal(status: int) -> str:
 
 
 def _sentence(error: Exception | None) -> str:
-    """Return the reason of a failure in words that contain nothing that the receiver has sent."""
+    """Return the reason of a failure as a sentence that contains no text from the receiver."""
     if isinstance(error, HTTPTimeoutError):
         return f"no answer within {TIMEOUT_S:g} s"
     if isinstance(error, AddressRefused):

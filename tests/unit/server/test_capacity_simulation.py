@@ -11,7 +11,7 @@ import scipy.stats
 
 from marey_server.capacity.simulation import (
     FREE,
-    Misfortune,
+    FailureRates,
     QueueCosts,
     RequestCosts,
     SimulatedJob,
@@ -87,14 +87,14 @@ def test_a_saturated_server_limits_the_jobs_per_second_and_few_workers_limit_the
 
 def test_equal_seeds_give_equal_runs() -> None:
     jobs = poisson_jobs(1.0, 1.0, 5)[:200]
-    sad = Misfortune(failure=0.2, death=0.1)
-    runs = [simulate(jobs, [ANY] * 3, NO_COSTS, seed=seed, misfortune=sad) for seed in (1, 1, 2)]
+    sad = FailureRates(failure=0.2, death=0.1)
+    runs = [simulate(jobs, [ANY] * 3, NO_COSTS, seed=seed, failure_rates=sad) for seed in (1, 1, 2)]
     assert runs[0] == runs[1] != runs[2]
 
 
 def test_jobs_of_one_concurrency_key_never_overlap() -> None:
     jobs = [SimulatedJob(0.0, 1.0 + number % 3, concurrency_key="gpu") for number in range(20)]
-    run = simulate(jobs, [ANY] * 4, NO_COSTS, misfortune=Misfortune(failure=0.3), seed=4)
+    run = simulate(jobs, [ANY] * 4, NO_COSTS, failure_rates=FailureRates(failure=0.3), seed=4)
     times = sorted(
         (start_s, start_s + job.work_s) for job, one in zip(jobs, run.jobs, strict=True) for start_s in one.starts_s
     )
@@ -110,7 +110,7 @@ def test_a_job_waits_for_a_worker_with_its_labels() -> None:
 
 
 def test_a_dead_worker_is_noticed_at_the_end_of_the_lease() -> None:
-    run = simulate([SimulatedJob(0.0, 0.5, max_attempts=2)], [ANY], NO_COSTS, misfortune=Misfortune(death=1.0))
+    run = simulate([SimulatedJob(0.0, 0.5, max_attempts=2)], [ANY], NO_COSTS, failure_rates=FailureRates(death=1.0))
     (one,) = run.jobs
     ttl_s = DEFAULT_POLICY.lease_ttl_s
     assert one.starts_s == pytest.approx([ttl_s * number for number in range(DEFAULT_POLICY.max_unstarted + 1)])
@@ -118,14 +118,15 @@ def test_a_dead_worker_is_noticed_at_the_end_of_the_lease() -> None:
 
 
 def test_an_attempt_with_a_heartbeat_counts_and_renews_its_lease() -> None:
-    run = simulate([SimulatedJob(0.0, 1e4, max_attempts=2)], [ANY], NO_COSTS, misfortune=Misfortune(death=1.0), seed=3)
+    rates = FailureRates(death=1.0)
+    run = simulate([SimulatedJob(0.0, 1e4, max_attempts=2)], [ANY], NO_COSTS, failure_rates=rates, seed=3)
     (one,) = run.jobs
     assert (one.failed, one.attempts, len(one.starts_s)) == (True, 2, 2)
     assert one.starts_s[1] > DEFAULT_POLICY.lease_ttl_s
 
 
 def test_a_failed_attempt_is_repeated_after_the_backoff() -> None:
-    run = simulate([SimulatedJob(0.0, 1.0, max_attempts=3)], [ANY], NO_COSTS, misfortune=Misfortune(failure=1.0))
+    run = simulate([SimulatedJob(0.0, 1.0, max_attempts=3)], [ANY], NO_COSTS, failure_rates=FailureRates(failure=1.0))
     (one,) = run.jobs
     pauses_s = [later - earlier - 1.0 for earlier, later in zip(one.starts_s, one.starts_s[1:], strict=False)]
     assert (one.failed, one.failures) == (True, 3)

@@ -389,7 +389,7 @@ def test_the_server_commits_the_outputs_when_the_last_task_ends(gaits: Committin
 
     async def end() -> bool:
         with wakeups.listen([job_topic(made)]) as listener:
-            async with housekeeping.keeping_house(app.services):
+            async with housekeeping.running_housekeeping(app.services):
                 await asyncio.sleep(0)
                 await asyncio.to_thread(gaits.desk.complete, last)
                 return await listener.wait(30)

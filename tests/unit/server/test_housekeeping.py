@@ -34,7 +34,7 @@ def test_garbage_is_collected_soon_after_the_start_and_again_later(
                 both_done.set()
 
         monkeypatch.setattr(housekeeping, "_collect_garbage", noted)
-        async with housekeeping.keeping_house(app.services):
+        async with housekeeping.running_housekeeping(app.services):
             await asyncio.wait_for(both_done.wait(), 30)
         return rounds
 
@@ -57,7 +57,7 @@ def test_waiting_proposals_are_merged_again_and_again(
     monkeypatch.setattr(WaitingMerges, "attempt", attempt)
 
     async def two_rounds() -> bool:
-        async with housekeeping.keeping_house(app.services):
+        async with housekeeping.running_housekeeping(app.services):
             return await asyncio.to_thread(both_done.wait, 30)
 
     assert asyncio.run(two_rounds())
@@ -83,7 +83,7 @@ def test_housekeeping_leaves_the_compute_threads_to_requests(
     app = create_app(Settings(data=tmp_path, port=0), database)
 
     async def compute_beside() -> int:
-        async with housekeeping.keeping_house(app.services):
+        async with housekeeping.running_housekeeping(app.services):
             try:
                 assert await asyncio.to_thread(lambda: all(begun.acquire(timeout=20) for _ in range(3)))
                 future = app.services.compute_threads.submit_for(Client("anna"), sum, (1, 2))
@@ -113,7 +113,7 @@ def test_outputs_that_wait_since_the_last_commit_began_are_committed_at_once(
     app.services.queue_policy = QueuePolicy(lease_ttl_s=4 * 3600)
 
     async def two_commits() -> bool:
-        async with housekeeping.keeping_house(app.services):
+        async with housekeeping.running_housekeeping(app.services):
             for _ in range(10):
                 await asyncio.sleep(0)  # until housekeeping waits
             wakeups.announce([OUTPUTS_TO_COMMIT])
@@ -131,7 +131,7 @@ def test_copies_of_index_files_that_the_store_has_deleted_are_removed(
     copy.write_bytes(b"poses")
 
     async def until_removed() -> None:
-        async with housekeeping.keeping_house(app.services):
+        async with housekeeping.running_housekeeping(app.services):
             while copy.exists():
                 await asyncio.sleep(0.01)
 

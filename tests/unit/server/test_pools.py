@@ -44,10 +44,10 @@ def test_a_launcher_is_found_by_its_name() -> None:
     assert find_launcher("local") is LocalLauncher
     assert find_launcher("cloud") is make_launcher
     with pytest.raises(
-        LauncherUnusable, match="there is no launcher 'slrum', only: broken, cloud, kubernetes, local, slurm"
+        LauncherUnusable, match="there is no launcher 'slrum'; choose one of broken, cloud, kubernetes, local, slurm"
     ):
         find_launcher("slrum")
-    with pytest.raises(LauncherUnusable, match="broken cannot be loaded: No module named"):
+    with pytest.raises(LauncherUnusable, match="'broken' cannot be loaded: No module named"):
         find_launcher("broken")
 
 
@@ -103,5 +103,5 @@ def test_a_launcher_that_does_not_exist_is_an_error_in_one_line(tmp_path: Path) 
     serve = [sys.executable, "-m", "marey_client.cli", "serve", "--port", "0"]
     done = subprocess.run(serve, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
-    assert "invalid setting: launcher: there is no launcher 'slrum', only:" in done.stderr.splitlines()[-1]
+    assert "invalid setting: launcher: there is no launcher 'slrum'; choose one of" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr

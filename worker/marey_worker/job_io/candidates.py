@@ -20,11 +20,11 @@ from marey_schemas.wording import counted
 from marey_worker.context import Context
 from marey_worker.job_io.evaluated_set import EvaluatedSet
 from marey_worker.job_io.matching_clips import ClipSet, build_clips, read_motions, uid_of
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
 
 class Unusable(NamedTuple):
-    """Folder whose clips cannot be used for motion matching, with the number of clips and the reason."""
+    """Folder of candidates whose clips cannot be used for motion matching, with the number of clips and the reason."""
 
     folder: str
     clips: int
@@ -34,10 +34,11 @@ class Unusable(NamedTuple):
 
 @dataclass
 class Candidates:
-    """Matching databases of candidates, by name of the group, and folders whose clips cannot be used.
+    """Candidates of a job, in one matching database for each group.
 
-    A group contains the clips of one folder that have the same skeleton. The databases have the options and the
-    normaliser of the evaluated set.
+    A group contains the clips of one folder that have the same skeleton. `databases` maps the names of groups to
+    databases, which have the options and the normaliser of the evaluated set. `unusable` lists the groups whose clips
+    cannot be used.
     """
 
     databases: dict[str, MatchingDatabase] = field(default_factory=dict)
@@ -70,7 +71,7 @@ def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
 
 
 def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[tuple[str, _Group]]:
-    """Yield the name of each group, and the group.
+    """Yield each group with its name.
 
     The name is the folder, with the name of the skeleton if the folder has clips of several skeletons.
     """
@@ -80,15 +81,16 @@ def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[
 
 
 def _build(context: Context, group: _Group, database: MatchingDatabase) -> MatchingDatabase:
-    """Return the matching database of a group.
+    """Return the matching database of a group, with the options and the normaliser of `database`.
 
-    If the skeleton of the group equals the skeleton of `database`, the joints for matching are taken from `database`.
+    If the skeleton of the group equals that of `database`, the joints for matching are taken from `database`;
+    otherwise, from the joint mapping of the group's skeleton.
     """
     newest = max(map(_skeleton_of, group.motions), key=lambda ref: ref.revision)
-    rigged = read_rigged(context, Rig.as_stored(newest))
+    mapped = read_mapped(context, Rig.as_stored(newest))
     body = database.body
-    if not same_hierarchy(rigged.skeleton, body.skeleton, tolerance_m=SAME_OFFSET_M):
-        body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+    if not same_hierarchy(mapped.skeleton, body.skeleton, tolerance_m=SAME_OFFSET_M):
+        body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
     return build_clips(context, ClipSet(tuple(group.pins)), group.motions, body, database.options, database.normaliser)
 
 

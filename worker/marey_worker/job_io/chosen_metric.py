@@ -9,9 +9,10 @@ from marey_worker.context import Context, JobRefused
 
 
 def read_metric(context: Context, name: str | None) -> MetricDocument | None:
-    """Return the metric that the job uses, or None if it names none.
+    """Return the perceptual metric that the job uses, or None if it uses none.
 
-    Raises `JobRefused` if the job has both a parameter `metric` and an input `metric`.
+    `name` is the parameter `metric` of the job. Raises `JobRefused` if the job has both this parameter and an input
+    `metric`.
     """
     (pin,) = context.inputs.get("metric", ()) or (None,)
     if pin is None:
@@ -25,5 +26,5 @@ def read_metric(context: Context, name: str | None) -> MetricDocument | None:
 
 
 def read_metric_or_default(context: Context, name: str | None) -> MetricDocument:
-    """Return the metric that the job uses, by default `DEFAULT_METRIC`."""
+    """Return the perceptual metric that the job uses: its parameter or input `metric`, or else `DEFAULT_METRIC`."""
     return read_metric(context, name) or built_in_metric(DEFAULT_METRIC)

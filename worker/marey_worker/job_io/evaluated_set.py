@@ -19,7 +19,7 @@ from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_cli
 
 @dataclass(frozen=True)
 class EvaluatedSet:
-    """Evaluation with the records of its trials, and the matching database of its clips with the same normaliser."""
+    """Evaluation with the records of its trials, and a matching database of its clips that has its normaliser."""
 
     result: EvaluationResult
     clips: MatchingClips
@@ -31,7 +31,7 @@ class EvaluatedSet:
 
 
 def read_result(context: Context, pin: PinnedInput) -> tuple[EvaluationResult, Mapping[str, Any]]:
-    """Return an evaluation with the records of its trials, and its document."""
+    """Return an evaluation with the records of its trials, and its document (part `evaluation`)."""
     document = context.document(Kind.EVALUATION, pin.item, pin.revision, "evaluation")
     records = records_from_tree(context.document(Kind.EVALUATION, pin.item, pin.revision, "records"))
     with refusing_motion_errors():
@@ -39,7 +39,10 @@ def read_result(context: Context, pin: PinnedInput) -> tuple[EvaluationResult, M
 
 
 def read_evaluated_set(context: Context) -> EvaluatedSet:
-    """Return the job's input `evaluation` with its clips. Raises `JobRefused` if the clips cannot be used."""
+    """Return the job's input `evaluation` with the matching database of its clips.
+
+    Raises `JobRefused` if the clips cannot be used.
+    """
     (pin,) = context.inputs["evaluation"]
     result, document = read_result(context, pin)
     return EvaluatedSet(result, read_evaluated_clips(context, pin, document, result.options.database))
@@ -51,7 +54,7 @@ def store_document(context: Context, tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def store_file(context: Context, data: bytes) -> dict[str, Any]:
-    """Send a file; return an entry for the job's result, which refers to the file and so protects it from deletion."""
+    """Send a file to the server; return an entry for the job's result. The entry protects the file from deletion."""
     file = context.scratch / "document"
     file.write_bytes(data)
     return StoredFile(blob=context.put_file(file), size_bytes=len(data)).model_dump(mode="json")

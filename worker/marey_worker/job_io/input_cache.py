@@ -32,16 +32,17 @@ class InputCache:
         self._bytes = sum(size for _, size, _ in self._files())
 
     def get(self, key: str, fetch: Callable[[], bytes]) -> bytes:
-        """Return the bytes of `key` from the folder; if they are not there, call `fetch` and store its result."""
+        """Return the bytes for `key`; if they are not in the folder, call `fetch`, and store and return its result."""
         (data,) = self.get_many([key], lambda _missing: [fetch()])
         assert data is not None
         return data
 
     def get_many(self, keys: Sequence[str], fetch: Callable[[list[int]], Sequence[bytes | None]]) -> list[bytes | None]:
-        """Return the bytes of `keys`; call `fetch` with the indices of keys that are not cached, and store the result.
+        """Return the bytes for several keys, in order; store those that were missing.
 
-        `fetch` may leave out values at the end; the result then ends before the first key without a value. A value of
-        None is returned, but not stored.
+        `fetch` gets the indices of the keys that are not in the folder, and returns their bytes. It may leave out
+        values at the end; the result then ends before the first key without a value. A value of None is returned, but
+        not stored.
         """
         paths = [self.folder / hashlib.sha256(key.encode()).hexdigest() for key in keys]
         held = [self._read(path) for path in paths]
@@ -68,7 +69,7 @@ class InputCache:
         return data
 
     def _keep(self, path: Path, data: bytes) -> None:
-        """Store bytes if possible; if the folder is full or missing, the job continues without the cache."""
+        """Store bytes if possible; if they cannot be stored, for example on a full disk, log this and continue."""
         size = SEAL_BYTES + len(data)
         if size > self.max_bytes:
             return

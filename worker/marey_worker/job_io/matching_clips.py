@@ -1,4 +1,7 @@
-"""Matching databases of a project's clips, cached between tasks, because tasks of one evaluation share a database."""
+"""Matching databases of the clips of a job.
+
+They are cached between jobs, because all tasks of an evaluation use the same database.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ from marey_schemas.queue.job_params import EvaluateParams
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_schemas.wording import NAMES_SHOWN, counted, first_reason
 from marey_worker.context import Context, JobRefused
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
 MOST_KEPT = 1
 """Greatest number of cached databases; the database of an hour of motion takes a few hundred megabytes."""
@@ -38,7 +41,7 @@ MOST_KEPT = 1
 
 @dataclass(frozen=True)
 class MatchingClips:
-    """Matching database of clips, with its search index."""
+    """Matching database of clips, and its search index."""
 
     database: MatchingDatabase
 
@@ -65,7 +68,7 @@ class ClipSet:
     trims: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def as_tree(self) -> dict[str, Any]:
-        """Return the set as a tree that is stored with an evaluation."""
+        """Return the set as a tree, as it is stored with an evaluation."""
         return {
             "clips": [pin.model_dump(mode="json") for pin in self.clips],
             "rig": None if self.rig is None else self.rig.model_dump(mode="json"),
@@ -75,7 +78,7 @@ class ClipSet:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> ClipSet:
-        """Return the set of clips that `as_tree` has encoded."""
+        """Return the set of clips that a tree of `as_tree` describes."""
         return cls(
             clips=tuple(map(PinnedInput.model_validate, tree["clips"])),
             rig=None if tree["rig"] is None else PinnedInput.model_validate(tree["rig"]),
@@ -85,7 +88,7 @@ class ClipSet:
 
 
 def wanted_clips(context: Context, params: EvaluateParams) -> ClipSet:
-    """Return the clips that the job evaluates."""
+    """Return the clips that the job evaluates, with their trims and loops, from its inputs and parameters."""
     (rig,) = context.inputs.get("rig", ()) or (None,)
     return ClipSet(context.inputs["clips"], rig, params.loops, params.trims)
 
@@ -109,9 +112,10 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
 def read_evaluated_clips(
     context: Context, evaluation: PinnedInput, document: Mapping[str, Any], options: DatabaseOptions
 ) -> MatchingClips:
-    """Return the matching database of an evaluation's clips, with the revisions and the normaliser of the evaluation.
+    """Return the matching database of an evaluation's clips, at the revisions that were evaluated.
 
-    Raises `JobRefused` if the evaluation does not list its clips.
+    The database has the normaliser of the evaluation. Raises `JobRefused` if the evaluation does not list its clips, or
+    the clips cannot be used.
     """
     if "clip_set" not in document:
         raise JobRefused(
@@ -130,7 +134,7 @@ def read_evaluated_clips(
 
 @contextmanager
 def refusing_motion_errors() -> Iterator[None]:
-    """Turn a `MotionError`, or invalid options in a stored document, into a `JobRefused`, which is not retried."""
+    """Convert a `MotionError`, or an error of invalid options, to a `JobRefused`, so that the job is not retried."""
     try:
         yield
     except MotionError as error:
@@ -142,14 +146,14 @@ def refusing_motion_errors() -> Iterator[None]:
 def build_set(
     context: Context, wanted: ClipSet, options: DatabaseOptions, normaliser: Normaliser | None
 ) -> MatchingDatabase:
-    """Return the matching database of a set of clips.
+    """Read the clips of a set, and return their matching database.
 
-    Raises `JobRefused` if the clips have several skeletons or a trim is outside its clip. Raises `MotionError` if the
-    clips cannot be used for motion matching.
+    Without a `normaliser`, one is computed from the clips. Raises `JobRefused` if the clips have several skeletons or a
+    trim is outside its clip. Raises `MotionError` if the clips cannot be used for motion matching.
     """
     motions = list(read_motions(context, wanted.clips))
-    rigged = read_rigged(context, common_rig(context, wanted, [skeleton_of(motion) for _, motion in motions]))
-    body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+    mapped = read_mapped(context, common_rig(context, wanted, [skeleton_of(motion) for _, motion in motions]))
+    body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
     return build_clips(context, wanted, motions, body, options, normaliser)
 
 
@@ -161,7 +165,11 @@ def build_clips(
     options: DatabaseOptions,
     normaliser: Normaliser | None,
 ) -> MatchingDatabase:
-    """Return the matching database of clips; `motions` contains the digest and the motion of each clip."""
+    """Return the matching database of clips that were read.
+
+    `motions` contains, for each clip of `wanted`, the digest of its part `motion`, and the motion. `body` is the
+    skeleton with the joints for matching.
+    """
     infos = context.documents(wanted.clips, "info", required=False)
     clips = [
         SourceClip(
@@ -180,17 +188,17 @@ def build_clips(
 
 
 def is_loop(pin: PinnedInput, info: Mapping[str, Any] | None, loops: Sequence[str]) -> bool:
-    """Return whether a clip is a loop: either the job lists it in `loops`, or its part `info` has the loop tag."""
+    """Return whether a clip is a loop: the job lists its item in `loops`, or its part `info` has the loop tag."""
     return pin.item in loops or LOOP_TAG in (info or {}).get("tags", ())
 
 
 def uid_of(pin: PinnedInput) -> str:
-    """Return the unique name of a clip in a database."""
+    """Return the unique name of a clip in a database, made of item and revision, as in `clip_01h2@3`."""
     return f"{pin.item}@{pin.revision}"
 
 
 def split_uid(uid: str) -> tuple[str, int]:
-    """Return the item and the revision of a clip from its unique name in a database."""
+    """Return the item and the revision that `uid_of` has joined."""
     item, _, revision = uid.rpartition("@")
     return item, int(revision)
 
@@ -203,14 +211,15 @@ def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tupl
 
 
 def skeleton_of(motion: MotionDocument) -> RevisionRef:
-    """Return the skeleton revision of a motion."""
+    """Return the reference to the skeleton's revision that a motion uses."""
     return RevisionRef.model_validate(motion.skeleton.model_dump())
 
 
 def common_rig(context: Context, wanted: ClipSet, used: Sequence[RevisionRef]) -> Rig:
-    """Return the skeleton of all clips, at the newest of the revisions `used`, which are those of the clips.
+    """Return the skeleton that all clips have, at the newest of the revisions in `used`.
 
-    Raises `JobRefused` if there are several skeletons.
+    `used` contains the skeleton's revision for each clip of `wanted`. The joint mapping is that of `wanted.rig`, if it
+    is given. Raises `JobRefused` if there are several skeletons, or if `wanted.rig` is another skeleton.
     """
     (most, count), *others = Counter(ref.item for ref in used).most_common()
     if others:

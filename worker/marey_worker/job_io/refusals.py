@@ -1,4 +1,4 @@
-"""Refusals: inputs that a job cannot use, with reasons; the job processes its other inputs."""
+"""Inputs that a job cannot use (refusals), with the reasons; the job still processes its other inputs."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ UNUSABLE = (MotionError, ValidationError, Unreadable)
 
 
 def present(pin: PinnedInput, document: Any) -> Any:
-    """Return `document`, the document of the input `pin`.
+    """Return `document`, which was read for the input `pin`, if it is not None.
 
-    Raises `NoSuchThing` if `document` is None, because the input was deleted while the job waited.
+    Raises `NoSuchThing` if it is None, because the input was deleted while the job waited.
     """
     if document is None:
         raise NoSuchThing(f"revision {pin.revision} of the item {pin.item} no longer exists", f"no-{pin.kind}")
@@ -36,7 +36,7 @@ class Refusals:
     def add(
         self, pin: PinnedInput, error: MotionError | ValidationError | Unreadable, *, name: str | None = None
     ) -> None:
-        """Add a refused input. `name` identifies the refusal to users; by default, the path of the input does."""
+        """Add a refused input with its error. Users see `name`, by default the path of the input."""
         shown = name or pin.path
         invalid = isinstance(error, ValidationError)
         code, detail = ("bad-document", first_reason(error)) if invalid else (error.code, str(error))
@@ -44,11 +44,11 @@ class Refusals:
         self.entries.append({"name": shown, "item": pin.item, "code": code, "detail": detail})
 
     def require_some(self, made: int, count: int, done: str, *, what: str = "clip") -> None:
-        """Raise `JobRefused` if the job refused all of its `count` inputs and made nothing of them (`made` is 0).
+        """Raise `JobRefused` if the job has refused inputs and made no result.
 
-        In the message, `done` names the action of the job, such as "edited", and `what` names an input, such as "clip".
-        Tasks of a job that is split do not fail, because another task may succeed; the server decides about the whole
-        job.
+        `made` is the number of results, `count` the number of inputs. In the message, `done` names the action of the
+        job, such as "edited", and `what` names an input, such as "clip". A task of a divided job does not fail, because
+        another task may succeed; the server decides about the whole job.
         """
         if self.entries and not made and self._context.task.size == 1:
             raise JobRefused(NOTHING_DONE, f"none of {counted(count, what)} can be {done}{self.first}")

@@ -24,7 +24,7 @@ class ResultPlaces:
         self._taken: set[tuple[Kind, str, str]] = set()
 
     def take(self, kind: Kind, collection: str, *names: str) -> None:
-        """Reserve names in a collection below `into` for results.
+        """Reserve names for results in the folder `collection`, which is below the target folder of the job.
 
         Raises `MotionError` if a name is too long or already reserved, or if the result of this name would replace an
         input. Then no name is reserved.

@@ -18,7 +18,7 @@ from marey_worker.context import Context
 MOST_KEPT = 512
 
 
-class Rigged(NamedTuple):
+class MappedSkeleton(NamedTuple):
     """Skeleton with its joint mapping and axes."""
 
     skeleton: Skeleton
@@ -27,22 +27,22 @@ class Rigged(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """Revision of a skeleton, and the revision whose joint mapping is used."""
+    """Reference to a skeleton: a revision of its hierarchy, and the revision whose joint mapping is used."""
 
     skeleton: RevisionRef
     mapping: RevisionRef
 
     @classmethod
     def as_stored(cls, ref: RevisionRef) -> Rig:
-        """Return a `Rig` that uses the joint mapping of the same revision."""
+        """Return a `Rig` in which hierarchy and joint mapping come from the same revision."""
         return cls(ref, ref)
 
 
-_skeletons: LruCache[Rig, Rigged] = LruCache(max_entries=MOST_KEPT)
+_skeletons: LruCache[Rig, MappedSkeleton] = LruCache(max_entries=MOST_KEPT)
 _plans: LruCache[tuple[Rig, Rig, float | None], RetargetPlan] = LruCache(max_entries=MOST_KEPT)
 
 
-def read_rigged(context: Context, rig: Rig) -> Rigged:
+def read_mapped(context: Context, rig: Rig) -> MappedSkeleton:
     """Return a skeleton with its joint mapping, or a guessed mapping if it has none.
 
     Raises `MotionError` if the mapping contradicts the skeleton, or maps too few joints to be trusted.
@@ -53,21 +53,23 @@ def read_rigged(context: Context, rig: Rig) -> Rigged:
 def plan_between(context: Context, source: Rig, target: Rig, scale: float | None) -> RetargetPlan:
     """Return the plan for retargeting from one skeleton to another.
 
-    Raises `MotionError` if a joint mapping cannot be used, or if joints or axes that the plan needs are missing.
+    `scale` is the number of metres that the target's pelvis moves per metre of the source's pelvis; None: it is
+    computed from the skeletons. Raises `MotionError` if a joint mapping cannot be used, or if joints or axes that the
+    plan needs are missing.
     """
 
     def plan() -> RetargetPlan:
-        return plan_retarget(*read_rigged(context, source), *read_rigged(context, target), scale=scale)
+        return plan_retarget(*read_mapped(context, source), *read_mapped(context, target), scale=scale)
 
     return _plans.get_or_make((source, target, scale), plan)
 
 
-def _read(context: Context, rig: Rig) -> Rigged:
+def _read(context: Context, rig: Rig) -> MappedSkeleton:
     hierarchy = context.document(Kind.SKELETON, rig.skeleton.item, rig.skeleton.revision, "hierarchy")
     skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
     stored = context.document(Kind.SKELETON, rig.mapping.item, rig.mapping.revision, "mapping", required=False)
     if stored is None:
         mapping = require_trust(map_joints(skeleton))
-        return Rigged(skeleton, mapping, guess_axes(skeleton, mapping))
+        return MappedSkeleton(skeleton, mapping, guess_axes(skeleton, mapping))
     mapping, axes = documents.mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)
-    return Rigged(skeleton, require_trust(mapping), axes)
+    return MappedSkeleton(skeleton, require_trust(mapping), axes)

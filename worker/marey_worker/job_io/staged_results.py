@@ -1,4 +1,4 @@
-"""Staging of results in batches, which are encoded and sent while the next results are computed."""
+"""Results of a job, which are encoded and sent in batches while the job computes the next results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ _encoder = ThreadPoolExecutor(1, thread_name_prefix="marey-encode")
 
 
 class StagedResults:
-    """Results of one job, which are staged in batches; `names` contains the names of all results so far."""
+    """Results of one job; several of them are staged in one request.
+
+    `names` contains the names of all results so far.
+    """
 
     def __init__(self, context: Context) -> None:
         self.names: set[str] = set()
@@ -36,12 +39,13 @@ class StagedResults:
         return len(self.names)
 
     def add(self, output: StagedOutput) -> None:
-        """Add a result; several results are sent together.
+        """Add a result; it is sent together with others.
 
-        Raises `JobRefused` for a repeated name, because the second result would replace the first.
+        Raises `JobRefused` if an earlier result has the same name, because this one would replace it.
         """
         if output.name in self.names:
-            raise JobRefused("same-name", f"two results of the job would have the name {output.name}; rename an input")
+            detail = f"two results of the job would have the name {output.name}; rename one of the inputs"
+            raise JobRefused("same-name", detail)
         self.names.add(output.name)
         self._ready.append(_encoder.submit(_with_encoded_arrays, output))
         self._ready_bytes += _array_bytes(output.parts)
@@ -49,7 +53,7 @@ class StagedResults:
             self.flush()
 
     def flush(self) -> None:
-        """Send the results that are not yet sent."""
+        """Send the results that have not been sent yet; call this after the last result."""
         if self._ready:
             wait(self._ready)  # errors of results that are already there have one traceback, so one signature
             self._context.stage([encoding.result() for encoding in self._ready])

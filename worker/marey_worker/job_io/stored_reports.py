@@ -13,7 +13,7 @@ from marey_worker.context import Context
 
 
 def inputs_of(context: Context) -> tuple[ReportInput, ...]:
-    """Return the inputs of the job for the head of its report, in the order of the submission."""
+    """Return the inputs of the job as the head of its report lists them, in the order of the submission."""
     pins = (pin for many in context.inputs.values() for pin in many)
     return tuple(ReportInput(pin.kind.noun, pin.path, pin.revision) for pin in pins)
 
@@ -21,7 +21,10 @@ def inputs_of(context: Context) -> tuple[ReportInput, ...]:
 def store_report(
     context: Context, kind: type[Report], title: str, page: str, figures: Iterable[tuple[str | None, DrawnFigure]]
 ) -> dict[str, Any]:
-    """Store the page and the figures of a report as files; return the document that refers to these files."""
+    """Store the page and the figures of a report as files; return the report as a document.
+
+    Each figure is given with the name of its trial, or None. The document refers to the files.
+    """
     report = kind.model_validate(
         {
             "title": title,
@@ -34,7 +37,7 @@ def store_report(
 
 
 def stored_figure(context: Context, figure: DrawnFigure, trial: str | None = None) -> StoredFigure:
-    """Store a figure in all its formats as files; return the entry of a document that refers to these files."""
+    """Store a figure as files, one for each format; return the figure's entry in the document of a report."""
     files = {name: _stored(context, data) for name, data in figure.files().items()}
     tables = {table: files[f"{figure.name}-{table}.csv"] for table in figure.tables}
     return StoredFigure(

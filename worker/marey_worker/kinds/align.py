@@ -31,14 +31,14 @@ from marey_worker.job_io.chosen_metric import read_metric
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import require_different
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 from marey_worker.job_io.staged_results import StagedResults
 
 MIRRORED_NAME = " mirrored"
 
 
 class _Clip(NamedTuple):
-    """Clip that may become an example."""
+    """Clip that may become an example: its input, motion, digest of the motion, and skeleton."""
 
     pin: PinnedInput
     motion: MotionDocument
@@ -79,8 +79,8 @@ class _Job:
         clips = self._of_one_skeleton(list(self._read()))
         rig = self._rig(clips)
         with refusing_motion_errors():
-            rigged = read_rigged(self._context, rig)
-            body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+            mapped = read_mapped(self._context, rig)
+            body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
             examples = list(self._examples(clips, body))
             self._require_examples(examples, clips)
             aligned = align_clips(
@@ -101,7 +101,10 @@ class _Job:
     # -- what is aligned --
 
     def _require_names(self) -> None:
-        """Raise `JobRefused` if names of results would be equal or too long, before anything is computed."""
+        """Raise `JobRefused` if two results would have the same name, or if a name is too long.
+
+        Called before any computation.
+        """
         endings = ("", MIRRORED_NAME) if self._params.mirroring == "add" else ("",)
         names = [(pin.folder, self._name(pin, ending)) for pin in self._pins.values() for ending in endings]
         require_different(names)
@@ -128,7 +131,7 @@ class _Job:
             yield _Clip(pin, motion, document_digest(tree), RevisionRef.model_validate(motion.skeleton.model_dump()))
 
     def _of_one_skeleton(self, clips: Sequence[_Clip]) -> list[_Clip]:
-        """Return the clips that use the most frequent skeleton; refuse the other clips."""
+        """Return the clips that have the most frequent skeleton; the other clips are added to the refusals."""
         counts = Counter(clip.skeleton.item for clip in clips)
         most = min(counts, key=lambda item: (-counts[item], item), default=None)
         others = [clip for clip in clips if clip.skeleton.item != most]
@@ -144,7 +147,11 @@ class _Job:
         return [clip for clip in clips if clip.skeleton.item == most]
 
     def _rig(self, clips: Sequence[_Clip]) -> Rig:
-        """Return the skeleton at its newest revision in use, with its joint mapping."""
+        """Return the skeleton of the clips at the newest revision that they use, with its joint mapping.
+
+        The joint mapping is that of the input `rig`, if it is given. Raises `JobRefused` if there are no clips, or if
+        `rig` is another skeleton.
+        """
         if not clips:
             raise JobRefused("too-few-clips", f"none of {len(self._pins)} clips can be read{self._refusals.first}")
         skeleton = max((clip.skeleton for clip in clips), key=lambda ref: ref.revision)
@@ -171,7 +178,7 @@ class _Job:
             yield SourceExample(_uid(one.pin), one.pin.path, clip, cuts, recordings[_uid(one.pin)])
 
     def _recordings(self, clips: Sequence[_Clip]) -> dict[str, Recording]:
-        """Return take and performer of each clip, from its part `info`; a clip without `info` is a separate take."""
+        """Return take and performer of each clip, from its part `info`. A clip without `info` is a take of its own."""
         infos = self._context.documents([one.pin for one in clips], "info", required=False)
         return {
             _uid(pin): Recording(pin.item) if tree is None else _recording(pin, ClipInfo.model_validate(tree))
@@ -190,7 +197,7 @@ class _Job:
     # -- annotations --
 
     def _read_annotations(self) -> dict[str, list[_ClipAnnotation]] | None:
-        """Return the annotations of the requested layer by id of the clip, or None if no annotations are given.
+        """Return the given annotations of the requested layer, by id of the clip; None if no annotations are given.
 
         Raises `JobRefused` if a layer or labels are given without annotations.
         """
@@ -252,8 +259,8 @@ class _Job:
     def _options(self) -> AlignOptions:
         """Return the options of the alignment.
 
-        If the reference is the id of a clip, it is replaced by a name of the clip's newest revision among the inputs.
-        The name consists of the id and the number of the revision.
+        If the reference is given by the id of a clip, it becomes the name (id and revision) of this clip at its newest
+        revision among the inputs. Raises `JobRefused` if the clip is not among the inputs.
         """
         options = AlignOptions.of(self._params)
         if options.reference in (MEDOID, NEAREST_MEAN_LENGTH):
@@ -267,7 +274,10 @@ class _Job:
         return options.replace(reference=_uid(max(named, key=lambda pin: pin.revision)))
 
     def _digest(self, clips: Sequence[_Clip], examples: Sequence[SourceExample], rig: Rig) -> str:
-        """Return the digest of all inputs and options of the alignment."""
+        """Return the digest of all inputs and options of the alignment.
+
+        Clips that were aligned together have the same digest.
+        """
         contents = {aligned_documents.uid_of(one.pin.item, one.pin.revision): one.content for one in clips}
         return document_digest(
             {
@@ -290,7 +300,7 @@ class _Job:
         return self._params.model_dump(mode="json", exclude={"metric"} if self._params.metric is None else set())
 
     def _metric_tree(self) -> dict[str, Any]:
-        """Return the identity of the metric as a member of documents; empty without a metric."""
+        """Return the member `metric` of documents, which identifies the metric; empty without a metric."""
         return {} if self._metric is None else {"metric": MetricIdentity.of(self._metric).model_dump(mode="json")}
 
     # -- results --
@@ -354,8 +364,8 @@ class _Job:
 def _recording(pin: PinnedInput, info: ClipInfo) -> Recording:
     """Return take and performer of a clip.
 
-    The take of a piece that was cut from a clip is this clip. Otherwise, it is performer, day, action and take as the
-    clip records them; without a recorded take, it is the clip itself.
+    For a piece that was cut from another clip, that clip is the take. For other clips, performer, day, action and take
+    in `info` are joined; without a take in `info`, the clip counts as a take of its own.
     """
     cut_from = info.source.details.get("clip") if info.source is not None and info.source.format == "cut" else None
     item = cut_from.get("item") if isinstance(cut_from, dict) else None

@@ -36,7 +36,7 @@ from marey_schemas.studies.conducting import JudgingParticipant
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import store_document, store_file
 from marey_worker.job_io.matching_clips import refusing_motion_errors
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 from marey_worker.job_io.stored_reports import inputs_of
 
 
@@ -71,7 +71,10 @@ def run(context: Context, params: AnalyseStudyParams) -> dict[str, Any]:
 
 
 def _judgements(study: StudyDocument, people: Sequence[JudgingParticipant]) -> Judgements:
-    """Return the answered trials; participants without any are left out."""
+    """Return the answered trials of all participants; participants who answered no trial are left out.
+
+    Raises `JobRefused` if nobody has answered a trial.
+    """
     answered = [[trial for trial in one.trials if trial.chosen is not None] for one in people]
     answers = [
         (who, trial.shown, trial.chosen)
@@ -87,12 +90,18 @@ def _judgements(study: StudyDocument, people: Sequence[JudgingParticipant]) -> J
 
 
 def _measured(context: Context, study: StudyDocument) -> tuple[list[PairDifferences], list[str]]:
-    """Measure all pairs of motions; if this is impossible, return an empty list and the reason."""
+    """Return the measured differences of all pairs of motions.
+
+    If they cannot be measured, return an empty list and the reason.
+    """
     try:
         clips = [_measure(context, one.revision) for one in study.motions]
         counts = np.array([clip.frame_count for clip in clips])
         if (cells := int(counts.sum()) ** 2 // 2) > MOST_TABLE_CELLS:
-            raise MotionError(f"the motion maps of all pairs have {cells:,} cells; use shorter motions")
+            raise MotionError(
+                f"the motion maps of all pairs have {cells:,} cells together, and at most {MOST_TABLE_CELLS:,} are "
+                "possible; use shorter motions"
+            )
         return measure_pairs(clips, context.progress), []
     except MotionError as error:
         return [], [f"no metric was fitted: {error}"]
@@ -101,15 +110,15 @@ def _measured(context: Context, study: StudyDocument) -> tuple[list[PairDifferen
 def _measure(context: Context, ref: RevisionRef) -> MeasuredClip:
     document = MotionDocument.model_validate(context.document(Kind.CLIP, ref.item, ref.revision, "motion"))
     info = context.document(Kind.CLIP, ref.item, ref.revision, "info", required=False) or {}
-    rigged = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(document.skeleton.model_dump())))
-    body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
-    clip = documents.clip_from_document(document, rigged.skeleton)
+    mapped = read_mapped(context, Rig.as_stored(RevisionRef.model_validate(document.skeleton.model_dump())))
+    body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
+    clip = documents.clip_from_document(document, mapped.skeleton)
     _, measured = measure_clip(clip, body, METRIC_RATE_HZ, loop=LOOP_TAG in info.get("tags", ()))
     return measured
 
 
 def _names(context: Context, study: StudyDocument) -> list[str]:
-    """Return a name of each motion for people: its label, or the name of the clip."""
+    """Return a name for each motion, as reports show it: its label, or else the name of the clip."""
     refs = [RevisionRef.model_validate(one.clip.model_dump()) for one in study.motions]
     return [one.label or context.item(Kind.CLIP, ref.item).name for one, ref in zip(study.motions, refs, strict=True)]
 

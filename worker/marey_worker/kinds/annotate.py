@@ -24,10 +24,10 @@ from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import require_different
-from marey_worker.job_io.skeleton_cache import Rig, Rigged, read_rigged
+from marey_worker.job_io.skeleton_cache import MappedSkeleton, Rig, read_mapped
 from marey_worker.job_io.staged_results import StagedResults
 
-Propose = Callable[[Clip, Rigged], Layer]
+Propose = Callable[[Clip, MappedSkeleton], Layer]
 
 
 def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
@@ -52,8 +52,8 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
             motion = MotionDocument.model_validate(present(pin, tree))
             used = RevisionRef.model_validate(motion.skeleton.model_dump())
             edited = rigs.get(used.item)
-            rigged = read_rigged(context, Rig(used, edited.ref if edited else used))
-            layer = propose(documents.clip_from_document(motion, rigged.skeleton), rigged)
+            mapped = read_mapped(context, Rig(used, edited.ref if edited else used))
+            layer = propose(documents.clip_from_document(motion, mapped.skeleton), mapped)
             _require_name(pin, layer_name)
         except UNUSABLE as error:
             refusals.add(pin, error)
@@ -78,28 +78,33 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
 
 
 def _proposal(params: AnnotateParams) -> Propose:
-    """Return the function that proposes a layer for a clip."""
+    """Return the function that proposes segments and keyframes for a clip, as the parameters of the job request it."""
     wanted = params.proposal
     if isinstance(wanted, StepsProposal):
-        return lambda clip, rigged: propose_steps(clip, _body(rigged), wanted)
+        return lambda clip, mapped: propose_steps(clip, _body(mapped), wanted)
     if isinstance(wanted, WristContactProposal):
-        return lambda clip, rigged: propose_reaches(clip, _body(rigged), wanted)
-    return lambda clip, rigged: propose_pauses(clip, _joints(rigged, wanted.joints), wanted)
+        return lambda clip, mapped: propose_reaches(clip, _body(mapped), wanted)
+    return lambda clip, mapped: propose_pauses(clip, _joints(mapped, wanted.joints), wanted)
 
 
-def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
-    """Return the indices of joints that are given by their names or standard names. Raises `UnknownJoint`."""
+def _joints(mapped: MappedSkeleton, names: Sequence[str]) -> tuple[int, ...]:
+    """Return the indices of joints that are given by their own names or their standard names.
+
+    Raises `UnknownJoint` if neither the skeleton nor its joint mapping has such a joint.
+    """
     found = []
     for name in names:
-        own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)
+        own = name if name in mapped.skeleton else mapped.mapping.joints.get(name)
         if own is None:
-            raise UnknownJoint("neither the skeleton nor its joint mapping has a joint of this name", where=name)
-        found.append(rigged.skeleton.index_of(own))
+            raise UnknownJoint(
+                f"neither the skeleton nor its joint mapping has a joint {name!r}; give the name of a joint", where=name
+            )
+        found.append(mapped.skeleton.index_of(own))
     return tuple(found)
 
 
-def _body(rigged: Rigged) -> MatchingBody:
-    return MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+def _body(mapped: MappedSkeleton) -> MatchingBody:
+    return MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
 
 
 def _require_name(pin: PinnedInput, layer_name: str) -> None:

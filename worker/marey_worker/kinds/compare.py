@@ -22,7 +22,7 @@ from marey_worker.job_io.stored_reports import inputs_of
 
 
 def run(context: Context, params: CompareParams) -> dict[str, Any]:
-    """Compare evaluations with the first one; the result counts the changes, and refers to the document and the report.
+    """Compare evaluations with the first of them; the result has counts, and refers to the document and the report.
 
     The document compares the first two evaluations; its member `others` contains a document for each further
     evaluation. Raises `JobRefused` if normalisers, options or scenarios differ, or if there are too many evaluations.
@@ -55,9 +55,9 @@ def run(context: Context, params: CompareParams) -> dict[str, Any]:
 
 
 def _compared(pins: Sequence[PinnedInput], results: Sequence[EvaluationResult]) -> tuple[Comparison, ...]:
-    """Compare all further evaluations with the first one.
+    """Compare each further evaluation with the first one.
 
-    Raises `JobRefused` if they are not comparable; the message contains a command that makes them comparable.
+    Raises `JobRefused` if two of them cannot be compared; the message contains a command that makes a comparable one.
     """
     for pin, other in zip(pins[1:], results[1:], strict=True):
         try:

@@ -29,7 +29,7 @@ from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: CutParams) -> dict[str, Any]:
-    """Create a clip from every selected segment, and an annotation if the clip has keyframes or margins.
+    """Create a clip from every selected segment; a clip with keyframes or margins also gets an annotation.
 
     Raises `JobRefused` if no segment is selected, if two pieces would have the same name, or if no annotation can be
     used.
@@ -38,7 +38,7 @@ def run(context: Context, params: CutParams) -> dict[str, Any]:
 
 
 class _AnnotatedClip(NamedTuple):
-    """Annotation, its clip, and the segments to cut out, each with the name of its piece."""
+    """Annotation with its clip, and the segments to cut out; each segment has the name of the clip that it becomes."""
 
     pin: PinnedInput
     annotation: Annotation
@@ -102,9 +102,10 @@ class _Cutting:
     def _clip_of(self, clip: RevisionRef) -> Item | PinnedInput:
         """Return the annotated clip with its name and folder.
 
-        If clips are inputs of the job, name and folder are those at the time of submission: results are cached for jobs
-        with the same inputs, so later changes must not affect the results. Then `MotionError` is raised if this clip is
-        not among the inputs. Raises `NoSuchThing` if the clip does not exist.
+        Without an input `clips`, the clip has its present name and folder; `NoSuchThing` is raised if it does not
+        exist. With an input `clips`, the clip has the name and folder that it had at the time of submission, because
+        results are cached for jobs with the same inputs. Then `MotionError` is raised if the clip is not among the
+        inputs.
         """
         if not self._clips:
             return self._context.item(Kind.CLIP, clip.item)
@@ -117,7 +118,7 @@ class _Cutting:
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])
 
     def _named(self, annotation: Annotation, clip: Item | PinnedInput) -> Iterator[tuple[Segment, str]]:
-        """Yield each selected segment with the name of its piece; segments of one label are numbered in order."""
+        """Yield each selected segment with the name of its piece. The segments of a label are numbered in order."""
         numbers: Counter[str] = Counter()
         for one in annotation.segments:
             numbers[one.label] += 1
@@ -145,7 +146,7 @@ class _Cutting:
             )
 
     def _why_nothing(self, todo: Sequence[_AnnotatedClip]) -> str:
-        """Return the reason why no segment is cut out; it does not mention annotations that were refused."""
+        """Return the reason why no segment is cut out. The text does not mention refused annotations."""
         if not todo:
             layer = self._params.layer
             return "no annotation can be used" if layer is None else f"no annotation of the layer {layer!r} can be used"
@@ -212,7 +213,7 @@ class _Cutting:
 
 
 def _sliced(motion: MotionDocument, frames: tuple[int, int]) -> dict[str, Any]:
-    """Return the part `motion` for the frames [start, end), whose values are copied unchanged."""
+    """Return the part `motion` with only the frames in the half-open range `frames`; values are copied unchanged."""
     kept = slice(*frames)
     translations = None if motion.translations is None else np.ascontiguousarray(motion.translations[kept])
     poses = np.ascontiguousarray(motion.poses[kept])

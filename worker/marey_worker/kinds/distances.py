@@ -40,7 +40,7 @@ from marey_worker.job_io.matching_clips import (
     skeleton_of,
 )
 from marey_worker.job_io.refusals import Refusals
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 from marey_worker.job_io.stored_reports import inputs_of, stored_figure
 
 Prepared = dict[int, ComparableClip]
@@ -76,9 +76,10 @@ def run(context: Context, params: DistancesParams) -> dict[str, Any]:
 
 
 def gather(context: Context, params: DistancesParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Combine the distances; the result names the nearest and the farthest pair, and refers to document and report.
+    """Combine the distances of all tasks, and store the document, the report and its figures.
 
-    Refused clips are listed in the result. Raises `JobRefused` if fewer than two clips can be compared.
+    The result names the nearest and the farthest pair of clips, and lists refused clips. Raises `JobRefused` if fewer
+    than two clips can be compared.
     """
     document, pins = read_metric_or_default(context, params.metric), context.inputs["clips"]
     found = [decode_tree(context.blob(result["compared"]["blob"]), MSGPACK) for result in results]
@@ -124,7 +125,7 @@ def _require_count(count: int) -> None:
 
 
 def _blocks(position: int, tasks: int, clips: int) -> tuple[range, range]:
-    """Return the numbers of the clips in the two blocks that a task compares; both are the same for some tasks."""
+    """Return the positions of the clips in the two blocks that a task compares; both blocks may be the same."""
     blocks = round(((8 * tasks + 1) ** 0.5 - 1) / 2)  # the number of tasks is that of all pairs of blocks
     pair = list(combinations_with_replacement(range(blocks), 2))[position]
     first, second = (range(clips * block // blocks, clips * (block + 1) // blocks) for block in pair)
@@ -132,7 +133,7 @@ def _blocks(position: int, tasks: int, clips: int) -> tuple[range, range]:
 
 
 def _by_number(found: Sequence[Mapping[str, Any]], name: str) -> dict[int, Any]:
-    """Combine the members `name` of the files of all tasks, by the number of the clip."""
+    """Join the members `name` of the files of all tasks; the keys are positions of clips."""
     return {int(number): entry for one in found for number, entry in one[name].items()}
 
 
@@ -141,7 +142,10 @@ Moving = dict[int, tuple[PinnedInput, MotionDocument]]
 
 
 def _read(context: Context, wanted: Collection[int]) -> tuple[Rig, Moving]:
-    """Return the skeleton of all clips, and the motions of some. Raises `JobRefused` if there are several skeletons."""
+    """Return the skeleton of all clips, and the motions of the `wanted` clips by position.
+
+    Raises `JobRefused` if the clips have several skeletons.
+    """
     pins = context.inputs["clips"]
     (rig,) = context.inputs.get("rig", ()) or (None,)
     used, motions = [], Moving()
@@ -160,15 +164,18 @@ def _prepare(
     motions: Moving,
     refusals: Refusals,
 ) -> tuple[Prepared, dict[int, dict[str, str]]]:
-    """Measure clips, and cut loops out of them; also return the refusals of clips that cannot be compared."""
-    rigged = read_rigged(context, rig)
-    body, metric = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping), metric_of(document)
+    """Measure the clips to compare; if the parameters demand it, also cut one cycle out of each clip.
+
+    Return the measured clips, and the refusals of clips that cannot be compared, both by the position of the clip.
+    """
+    mapped = read_mapped(context, rig)
+    body, metric = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping), metric_of(document)
     prepared, refused = Prepared(), dict[int, dict[str, str]]()
     infos = context.documents([pin for pin, _ in motions.values()], "info", required=False)
     for done, ((number, (pin, motion)), (_, info)) in enumerate(zip(motions.items(), infos, strict=True)):
         context.progress(done, len(motions), f"measuring {pin.name}")
         try:
-            clip = documents.clip_from_document(motion, rigged.skeleton)
+            clip = documents.clip_from_document(motion, mapped.skeleton)
             loop = is_loop(pin, info, params.loops)
             prepared[number] = prepare_comparison(
                 clip, body, metric, document.frame_rate_hz, name=pin.path, cycles=params.cycles, loop=loop
@@ -231,7 +238,7 @@ def _pair_tree(subject: ComparedSet, pair: np.ndarray) -> dict[str, Any]:
 
 
 def _maps(subject: ComparedSet) -> bytes:
-    """Return motion maps and registration curves of the drawn pairs as a NumPy archive (.npz)."""
+    """Return motion maps and registration curves of the pairs that figures show, as a NumPy archive (.npz)."""
     arrays: dict[str, np.ndarray] = {}
     for number, pair in enumerate(drawn_pairs(subject.distances)):
         arrays |= {f"pair{number}_{name}": values for name, values in subject.arrays(pair).items()}

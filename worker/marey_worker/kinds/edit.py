@@ -25,7 +25,7 @@ from marey_schemas.wording import first_reason
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 from marey_worker.job_io.staged_results import StagedResults
 
 
@@ -33,8 +33,8 @@ def run(context: Context, params: EditParams) -> dict[str, Any]:
     """Apply the commands to every clip of the job.
 
     A clip that cannot be edited is listed as a refusal in the result, with code and reason. Raises `JobRefused` if no
-    clip can be edited, if the commands, or the places of the results, are missing or ambiguous, or if a clip to which a
-    command refers cannot be used.
+    clip can be edited, or if a clip to which a command refers cannot be used. Also raises `JobRefused` if the commands
+    are missing or given twice, or if it is not clear where the results go.
     """
     return _Editing(context, params).run()
 
@@ -97,7 +97,7 @@ class _Editing:
     def _edited(
         self, pin: PinnedInput, motion: MotionDocument, known: dict[str, Any] | None, sources: Mapping[str, Clip]
     ) -> Iterator[StagedOutput]:
-        """Yield the results of one clip. Raises `MotionError` or `NoSuchThing` if the clip cannot be edited."""
+        """Edit one clip, and yield the results. Raises `MotionError` or `NoSuchThing` if the clip cannot be edited."""
         if self._params.in_place:
             self._require_newest(pin)
         body = self._body(motion)
@@ -146,7 +146,10 @@ class _Editing:
         )
 
     def _body(self, motion: MotionDocument) -> EditedBody:
-        """Return the skeleton of a motion, with a function that reads its joint mapping. Raises `MotionError`."""
+        """Return the skeleton of a motion, with a function that reads its joint mapping when a command needs it.
+
+        Raises `MotionError` if the skeleton is not valid.
+        """
         used = _skeleton_of(motion)
         if used not in self._bodies:
             tree = self._context.document(Kind.SKELETON, used.item, used.revision, "hierarchy")
@@ -156,13 +159,13 @@ class _Editing:
             rig = Rig(used, mapping)
 
             def find_mapping(_skeleton: Skeleton) -> Any:
-                return read_rigged(self._context, rig).mapping
+                return read_mapped(self._context, rig).mapping
 
             self._bodies[used] = EditedBody(skeleton, find_mapping)
         return self._bodies[used]
 
     def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
-        """Return the part `info` of a result: the part `info` of the clip without checks, and the applied edit.
+        """Return the part `info` of a result: that of the clip, with the applied edit and without checks.
 
         The consent is at least as strict as the consents of the clip and of all clips to which the commands refer.
         """
@@ -182,7 +185,7 @@ class _Editing:
     # -- where results go --
 
     def _require_newest(self, pin: PinnedInput) -> None:
-        """Raise `EditError` if the clip to replace was changed, moved or renamed since the job was submitted."""
+        """Raise `EditError` if the clip to be replaced was changed, moved or renamed since the job was submitted."""
         now = self._context.item(Kind.CLIP, pin.item)
         if now.revision != pin.revision:
             raise EditError(
@@ -206,14 +209,16 @@ class _Editing:
 
 
 def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:
-    """Return the edit item and its commands; the item is None if the parameters of the job contain the commands.
+    """Return the item of the kind `edit` that contains the commands, and the commands.
 
-    Raises `JobRefused` unless exactly one of the two gives commands: the item or the parameters. Also raises
-    `JobRefused` if the item is not valid.
+    The item is None if the parameters of the job contain the commands. Raises `JobRefused` if both an item and
+    parameters give commands, or neither of them, or if the item is not valid.
     """
     (pin,) = context.inputs.get("edit", ()) or (None,)
     if (pin is None) == (not params.commands):
-        raise JobRefused("which-commands", "give either an edit or commands, and not both")
+        raise JobRefused(
+            "which-commands", "the job needs either an input `edit` or the parameter `commands`, and not both"
+        )
     if pin is None:
         return None, EditDocument(commands=params.commands)
     try:
@@ -223,7 +228,10 @@ def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | No
 
 
 def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInput]:
-    """Return the clips to which commands refer, by id. Raises `JobRefused` if a clip is missing or given twice."""
+    """Return the clips to which commands refer, from the input `sources`, by id.
+
+    Raises `JobRefused` if such a clip is missing, or given at two revisions.
+    """
     given = [pin for pin in context.inputs.get("sources", ()) if pin.item in edit.sources]
     found = {pin.item: pin for pin in given}
     if len(found) < len(given):

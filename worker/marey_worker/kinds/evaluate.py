@@ -52,7 +52,7 @@ Headline = dict[str, float | int | None]
 
 
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
-    """Simulate the trials of this task and their replicates; the result refers to the file with their records."""
+    """Simulate the trials of this task and their replicates; the result refers to a file with their records."""
     options = EvaluationOptions.of(params)
     trials = _trials(context, params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
@@ -88,7 +88,7 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
 
 
 def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Compute the measures from the records of all trials; stage the evaluation, and its report if one is requested."""
+    """Compute the measures from the records of all trials; stage the evaluation, and a report if one is requested."""
     options = EvaluationOptions.of(params)
     context.progress(0, GATHERING_STEPS, "reading the records of the trials")
     trials = _trials(context, params, options)
@@ -126,9 +126,10 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
 
 
 def _trials(context: Context, params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:
-    """Return all trials of the evaluation; clips are read only for trials along takes, which depend on them.
+    """Return all trials of the evaluation.
 
-    Raises `JobRefused` if a figure is requested for a trial that the evaluation does not have.
+    Trials along takes depend on the clips, so the clips are read if there are such trials. Raises `JobRefused` if a
+    figure is requested for a trial that the evaluation does not have.
     """
     with refusing_motion_errors():
         trials = suite_trials(options)
@@ -143,7 +144,7 @@ def _trials(context: Context, params: EvaluateParams, options: EvaluationOptions
 def _read_trials(
     context: Context, results: Sequence[Mapping[str, Any]], trials: Sequence[Trial]
 ) -> tuple[list[TrialRecord], MeasuredReplicates | None]:
-    """Read the results of the tasks: the record of each trial, and those of its further replicates, if any."""
+    """Read the files of all tasks: return the record of each trial, and the measured replicates, if there are any."""
     found = [decode_tree(context.blob(result["measured"]["blob"]), MSGPACK) for result in results]
     known = {
         name: record for one in found if "records" in one for name, record in records_from_tree(one["records"]).items()
@@ -192,7 +193,10 @@ def facets_of(result: EvaluationResult, pins: Sequence[PinnedInput]) -> tuple[It
 def write_report(
     context: Context, database: MatchingDatabase, result: EvaluationResult, params: EvaluateParams
 ) -> dict[str, Any]:
-    """Draw all figures, write the page, and store both as files; return the document that refers to these files."""
+    """Draw all figures, write the report page, and store them as files.
+
+    Return the document that refers to these files.
+    """
     figures = draw_figures(result)
     played = play_trials(database, result)
     page = render_report(result, title=params.name, figures=figures, inputs=inputs_of(context), played=played)
@@ -210,7 +214,7 @@ def _trial_figures(result: EvaluationResult, params: EvaluateParams) -> Iterator
 
 
 def play_trials(database: MatchingDatabase, result: EvaluationResult) -> list[PlayedTrial]:
-    """Make the displayed motion of the worst and of a typical trial; none if the trials have no records."""
+    """Return the motion shown in the worst and in a typical trial; empty if the trials have no records."""
     hierarchy = skeleton_to_document(database.body.skeleton).model_dump(mode="json", by_alias=True, exclude_none=True)
     played = []
     for role, judged, record in choose_played(result):
@@ -226,7 +230,10 @@ def _packed(name: str, clip: Clip, hierarchy: dict[str, Any]) -> str:
 
 
 def thinned(clip: Clip) -> Clip:
-    """Keep every n-th frame of a clip, with the least n that meets `MOST_RATE_HZ` and `MOST_BYTES`."""
+    """Return every n-th frame of a clip, as a clip with a lower frame rate.
+
+    The number n is the least that meets `MOST_RATE_HZ` and `MOST_BYTES`.
+    """
     moved = len(clip.translated_joints)
     frame_bytes = _ROTATION_BYTES * clip.skeleton.joint_count + _TRANSLATION_BYTES * (1 + moved)
     step = max(math.ceil(clip.frame_rate_hz / MOST_RATE_HZ), math.ceil(clip.frame_count * frame_bytes / MOST_BYTES))

@@ -33,10 +33,10 @@ class _File(NamedTuple):
 
 
 def run(context: Context, params: ExportParams) -> dict[str, Any]:
-    """Write the clips of the job to an archive; the result refers to it, and lists the clips that cannot be written.
+    """Write the clips of the job to an archive; the result refers to the archive, and lists clips that were refused.
 
-    The result also lists the clips whose consent has ended: these are written only if the parameters of the job allow
-    it. Raises `JobRefused` if no clip can be written.
+    Clips whose consent has ended are written only if the parameters of the job allow it; the result lists these clips,
+    too. Raises `JobRefused` if no clip can be written.
     """
     exporting = ClipFiles(context, params)
     archive = context.scratch / "archive.zip"
@@ -72,7 +72,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
 
 
 class ClipFiles:
-    """Converter of the clips of a job to files of one format; each skeleton is read only once."""
+    """Converter of clips to files of one format; each skeleton is read only once."""
 
     def __init__(self, context: Context, params: ExportParams) -> None:
         self._context = context
@@ -122,13 +122,13 @@ def _end_of_consent(pin: PinnedInput) -> str:
 
 
 def _place(pin: PinnedInput) -> str:
-    """Return the path of a clip in the archive, which is always below the folder where the archive is extracted."""
+    """Return the path of a clip in the archive; it never leads out of the folder in which the archive is extracted."""
     parts = [part for part in (*pin.collection.split("/"), pin.name) if part not in ("", ".", "..")]
     return "/".join(part.replace("\\", "_") for part in parts)
 
 
 def _free_name(pin: PinnedInput, name: str, taken: Collection[str]) -> str:
-    """Return `name` if it is not taken; otherwise, a name with the item's id, or with the item's id and revision."""
+    """Return a name that is not in `taken`: `name`, or a name with the item's id, or with id and revision."""
     file = name.rpartition("/")[2]
     candidates = (name, f"{pin.item}-{file}", f"{pin.item}-{pin.revision}-{file}")
     return next(one for one in candidates if one not in taken)

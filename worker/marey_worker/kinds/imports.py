@@ -72,10 +72,10 @@ class _Importing:
     def _import(
         self, planned: PlannedFile, sibling_axis: UpAxis | None = None, *, is_last: bool = False
     ) -> tuple[ImportEntry | None, AxisFinding | None]:
-        """Import a file; return its entry, and a finding about the up axis that the motion shows.
+        """Import a file; return its entry in the result, and the upward axis that the motion shows.
 
-        If the motion does not clearly show the up axis, the entry is None and nothing is staged, because the file is
-        read again later. With `is_last`, the file is imported in any case.
+        If the motion does not clearly show the axis, the entry is None and nothing is staged: the file must be read
+        again later. With `is_last`, the file is imported in any case.
         """
         try:
             found = self._read(planned, sibling_axis)
@@ -125,7 +125,10 @@ class _Importing:
         return GivenSkeleton(item.id, item.revision, hierarchy)
 
     def _graph_item(self, found: ImportedFile) -> ImportedItem:
-        """Return the item of the graph in a file; its models may be in the same file."""
+        """Return the item of the graph in a file; its models may be in the same file or in earlier files.
+
+        Raises `MotionError` if a model is missing or ambiguous.
+        """
         assert found.graph is not None
         before = len(self._models)
         for item in found.items:
@@ -137,9 +140,10 @@ class _Importing:
             raise
 
     def _find_models(self, name: str, collection: str | None) -> tuple[int, list[NamedModel]]:
-        """Find models of this job and of the project by name; return the number of matches, and the first few models.
+        """Find models by name, among the models of the project and those that this job creates.
 
-        If this job creates a new revision of a model, the new revision is returned.
+        Return the number of matches, and the first few models. If this job creates a new revision of a model, the new
+        revision is returned.
         """
         stored = self._context.find_items(Kind.MODEL, name, collection)
         found = {one.path: NamedModel(one.path, {"item": one.id, "revision": one.revision}) for one in stored}

@@ -1,7 +1,8 @@
 """Kind `index`: builds or updates an index of the poses of clips, for searches by example.
 
-Poses of clips that the earlier index has at the same revision are kept. Shards of which much is still needed are kept
-as they are; the poses of other shards are copied to new ones, so an update rewrites little.
+An index consists of shards, each of which has the poses of several clips. If an earlier index is given, the poses of
+clips at the same revision are used again. A shard stays as it is if much of it is still needed; the needed poses of
+other shards are copied to new shards. So an update writes little.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from marey_schemas.queue.job_params import IndexParams
 from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
 KEPT_SHARE = 0.5
 """Least share of a full shard whose poses are still needed; the poses of shards with less are copied to new shards."""
@@ -45,9 +46,9 @@ LEFT_OUT_NAMED = 100
 
 
 def run(context: Context, params: IndexParams) -> dict[str, Any]:
-    """Stage the index of the input clips.
+    """Build the index of the input clips, from an earlier index if one is given, and stage it.
 
-    Raises `JobRefused` if the earlier index is damaged, or if the new one would have too many shards.
+    Raises `JobRefused` if the earlier index is damaged, or if the new index would have too many shards.
     """
     started = time.monotonic()
     pins = {(pin.item, pin.revision): pin for pin in context.inputs["clips"]}
@@ -102,7 +103,7 @@ def _stage(context: Context, params: IndexParams, document: MotionIndexDocument)
 
 
 def _earlier_shards(context: Context, pin: PinnedInput) -> list[tuple[IndexShard, ShardClips]]:
-    """Read the shards of an earlier index and their clips; none if the index has another form.
+    """Return the shards of an earlier index, each with the list of its clips; empty if the index has another version.
 
     Raises `JobRefused` if the index is damaged, for example because somebody wrote it by hand.
     """
@@ -122,7 +123,7 @@ def _damaged(pin: PinnedInput) -> JobRefused:
 
 
 def _needed(shard: IndexShard, clips: ShardClips, pins: Mapping[tuple[str, int], PinnedInput]) -> list[int]:
-    """List the positions, in a shard, of the clips that the new index shall contain."""
+    """Return the positions, in a shard's list of clips, of the clips that the new index needs."""
     places = zip(clips.items, clips.revisions, strict=True)
     return [run for run, place in enumerate(places) if place in pins and run not in shard.dropped]
 
@@ -136,7 +137,7 @@ def _places(clips: ShardClips, runs: Sequence[int]) -> Iterator[tuple[str, int]]
 
 
 def _copy(context: Context, writer: _Writer, shard: IndexShard, clips: ShardClips, runs: Sequence[int]) -> None:
-    """Add the poses of some clips of an earlier shard. Raises `JobRefused` if the shard is damaged."""
+    """Copy the poses of some clips of an earlier shard to a new shard. Raises `JobRefused` if the shard is damaged."""
     if not runs:
         return
     file = context.scratch / "earlier"
@@ -157,14 +158,17 @@ def _copy(context: Context, writer: _Writer, shard: IndexShard, clips: ShardClip
 
 
 def _add_clips(context: Context, writer: _Writer, pins: Sequence[PinnedInput]) -> int:
-    """Add the poses of clips; return the number of clips that cannot be compared, which the log names."""
+    """Add the poses of new clips; return the number of clips that cannot be compared.
+
+    The log names the first of them.
+    """
     left_out = 0
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(done, len(pins), f"clip {done + 1} of {len(pins)}, {pin.name}")
         motion = MotionDocument.model_validate(tree)
         try:
-            rigged = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(motion.skeleton.model_dump())))
-            body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+            mapped = read_mapped(context, Rig.as_stored(RevisionRef.model_validate(motion.skeleton.model_dump())))
+            body = MatchingBody.from_mapping(mapped.skeleton, mapped.mapping)
             clip = documents.clip_from_document(motion, body.skeleton)
             features = clip_features(Motion.of(clip), body, clip.frame_rate_hz)
         except MotionError as error:
@@ -191,7 +195,10 @@ class _Writer:
     _facts: list[Mapping[str, Any]] = field(default_factory=list)
 
     def add(self, rows: Rows, facts: Mapping[str, Any]) -> None:
-        """Add the poses of a clip; `facts` are its values in the lists of `ShardClips`."""
+        """Add the poses of a clip.
+
+        `facts` contains one element for each list of `ShardClips`, by the name of the list.
+        """
         self._runs.append(rows)
         self._facts.append(facts)
         self.rows += len(rows)

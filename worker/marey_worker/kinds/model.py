@@ -69,7 +69,10 @@ def run(context: Context, params: ModelParams) -> dict[str, Any]:
 
 
 def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[MotionDocument], list[dict[str, Any]]]:
-    """Return the parts `motion` and `info` of each aligned clip. Raises `JobRefused` if an `info` is not valid."""
+    """Return the parts `motion` and `info` of all aligned clips, in order.
+
+    Raises `JobRefused` if an `info` is not valid.
+    """
     motions, infos = [], []
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(done, len(pins), f"reading {pin.name}")
@@ -84,7 +87,10 @@ def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[MotionDoc
 
 
 def _common_skeleton(pins: Sequence[PinnedInput], motions: Sequence[MotionDocument]) -> RevisionRef:
-    """Return the skeleton of all clips, at the newest revision in use. Raises `JobRefused` if there are several."""
+    """Return the skeleton that all clips have, at the newest revision in use.
+
+    Raises `JobRefused` if the clips have several skeletons.
+    """
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for motion in motions]
     for pin, ref in zip(pins, used, strict=True):
         if ref.item != used[0].item:
@@ -129,11 +135,11 @@ def write_model_report(
 ) -> dict[str, Any]:
     """Draw the figures of a model and of its alignment, and write the report page with them.
 
-    Returns the document that refers to the stored page and figures.
+    Return the document that refers to the stored page and figures.
 
     Parameters
     ----------
-    origin : field `provenance` of the part `model`: origin of the model and of its examples
+    origin : field `provenance` of the part `model`: the clips, reference and seed from which the model was trained
     """
     title = trained.primitive.name
     check = _checked(context, trained, aligned) if params.search_check else None

@@ -18,7 +18,10 @@ from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
 def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
-    """Remove and add clips while this improves the set; the result refers to the document that lists the steps."""
+    """Remove and add clips while this improves the evaluated set.
+
+    The result refers to the document that lists the steps.
+    """
     evaluated = read_evaluated_set(context)
     candidates = read_candidates(context, evaluated)
     with refusing_motion_errors():
@@ -61,7 +64,7 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
 
 
 def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> MatchingDatabase:
-    """Return one database with the clips of the set and all candidates.
+    """Return one matching database with the clips of the evaluated set and all candidates.
 
     Raises `JobRefused` if the clips cannot be combined in one database.
     """
@@ -81,7 +84,7 @@ def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> Matc
 def _simulation(
     context: Context, evaluated: EvaluatedSet, database: MatchingDatabase, replicates: range, seed: int | None = None
 ) -> Resimulation:
-    """Return a simulation of some replicates with the clips of `database`.
+    """Return a simulation of the evaluation's trials with the clips of `database`, for some of the replicates.
 
     If `database` contains only the clips of the evaluated set, the records of the evaluation are used again.
     """
@@ -100,7 +103,10 @@ def _simulation(
 def _confirming(
     context: Context, params: OptimiseParams, evaluated: EvaluatedSet, database: MatchingDatabase
 ) -> list[Resimulation]:
-    """Return simulations that confirm single steps and all steps together; none if `confirmation_replicates` is 0."""
+    """Return two simulations with other replicates: one confirms single steps, and one all steps together.
+
+    The list is empty if `confirmation_replicates` is 0.
+    """
     turns = range(2 if params.confirmation_replicates else 0)
     replicates = [confirmation_replicates(params, evaluated.result.options, turn) for turn in turns]
     return [_simulation(context, evaluated, database, numbers, params.confirmation_seed) for numbers in replicates]

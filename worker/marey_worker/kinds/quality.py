@@ -1,4 +1,4 @@
-"""Kind `quality`: measures defects of clips, with totals, beside those of recorded clips."""
+"""Kind `quality`: measures defects of clips and their totals, and compares them with those of recorded clips."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from marey_schemas.wording import counted
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import store_document, store_file
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
-from marey_worker.job_io.skeleton_cache import Rig, Rigged, read_rigged
+from marey_worker.job_io.skeleton_cache import MappedSkeleton, Rig, read_mapped
 from marey_worker.job_io.stored_reports import inputs_of, stored_figure
 
 
 def run(context: Context, params: QualityParams) -> dict[str, Any]:
-    """Measure the clips and the reference; the result has the totals, and refers to document, table and report.
+    """Measure the clips and the reference, if it is given; the result has the totals, and refers to stored files.
 
-    A clip that cannot be measured is listed as a refusal in the result. Raises `JobRefused` if no clip can be measured,
-    or no clip of a given reference.
+    These files are the document, the table and the report. A clip that cannot be measured is listed as a refusal in the
+    result. Raises `JobRefused` if no clip can be measured, or no clip of a given reference.
     """
     _require_count(sum(len(context.inputs.get(name, ())) for name in ("clips", "reference")))
     measuring = _Measuring(context, params)
@@ -67,7 +67,7 @@ def _require_count(count: int) -> None:
 
 @dataclass
 class _Found:
-    """Rows of measured clips, and the seconds of motion in bins of speed and turn rate."""
+    """Measurements of several clips: one row for each, and the seconds of motion in bins of speed and of turn rate."""
 
     rows: list[QualityRow] = field(default_factory=list)
     speed_seconds: Any = 0.0
@@ -80,7 +80,10 @@ class _Found:
 
 
 class _Measuring:
-    """Measurement of the inputs of a job. Clips are read one by one, so that memory does not grow with their number."""
+    """Measurement of the inputs of a job.
+
+    Clips are read one by one, so that the memory does not depend on their number.
+    """
 
     def __init__(self, context: Context, params: QualityParams) -> None:
         self.refusals = Refusals(context)
@@ -93,11 +96,11 @@ class _Measuring:
 
     @property
     def facets(self) -> list[ItemFacets]:
-        """The measures of all measured clips, including the clips of the reference, as facets."""
+        """The measured values of all clips, as facets (published numbers). The clips of the reference are included."""
         return list(self._facets.values())
 
     def measure(self, name: str) -> _Found:
-        """Measure the clips of an input. Raises `JobRefused` if none of them can be measured."""
+        """Measure the clips of the input `name`. Raises `JobRefused` if none of them can be measured."""
         pins, found = self._context.inputs[name], _Found()
         for done, (pin, (motion, info)) in enumerate(self._context.documents_of_each(pins, "motion", "info")):
             self._context.progress(done, len(pins), f"measuring {pin.name}")
@@ -114,8 +117,8 @@ class _Measuring:
 
     def _measured(self, pin: PinnedInput, tree: Any, info: Mapping[str, Any] | None) -> tuple[QualityRow, ClipQuality]:
         motion = MotionDocument.model_validate(present(pin, tree))
-        rigged, body = self._body(motion)
-        clip = documents.clip_from_document(motion, rigged.skeleton)
+        mapped, body = self._body(motion)
+        clip = documents.clip_from_document(motion, mapped.skeleton)
         quality = measure_quality(clip, body, self._options, self._contacts_of(pin, clip.frame_count))
         row = QualityRow(
             item=pin.item,
@@ -133,7 +136,11 @@ class _Measuring:
         return row, quality
 
     def _contacts_of(self, pin: PinnedInput, frames: int) -> NDArray[np.bool_] | None:
-        """Return the annotated contacts (frames, 2), or None if they are to be detected."""
+        """Return the annotated contacts of a clip, of shape (frames, 2) for the left and the right foot.
+
+        Return None if the job has no annotations, so that contacts are detected. Raises `AnnotationError` if it has
+        annotations, but none of this clip.
+        """
         if self._contacts is None:
             return None
         segments = self._contacts.get((pin.item, pin.revision), ())
@@ -148,18 +155,18 @@ class _Measuring:
             labelled[segment.start : segment.end] |= CONTACT_LABELS[segment.label]
         return labelled
 
-    def _body(self, motion: MotionDocument) -> tuple[Rigged, QualityBody]:
+    def _body(self, motion: MotionDocument) -> tuple[MappedSkeleton, QualityBody]:
         used = RevisionRef.model_validate(motion.skeleton.model_dump())
         edited = self._rigs.get(used.item)
         rig = Rig(used, edited.ref if edited else used)
-        rigged = read_rigged(self._context, rig)
+        mapped = read_mapped(self._context, rig)
         if rig not in self._bodies:
-            self._bodies[rig] = QualityBody.of(rigged.skeleton, rigged.mapping, rigged.axes)
-        return rigged, self._bodies[rig]
+            self._bodies[rig] = QualityBody.of(mapped.skeleton, mapped.mapping, mapped.axes)
+        return mapped, self._bodies[rig]
 
 
 def _read_contacts(context: Context) -> dict[tuple[str, int], list[SegmentDocument]] | None:
-    """Return the segments with contacts by clip and revision, or None if the job has no annotations of contacts."""
+    """Return the annotated contacts by clip and revision, as segments; None if there is no input `contacts`."""
     pins = context.inputs.get("contacts", ())
     if not pins:
         return None
@@ -173,7 +180,7 @@ def _read_contacts(context: Context) -> dict[tuple[str, int], list[SegmentDocume
 
 
 def _take_of(pin: PinnedInput, info: Mapping[str, Any]) -> str:
-    """Return a key that clips of one recording share: performer and take, or the item's id if no take is known."""
+    """Return a key that is equal for clips of one recording: performer and take, or else the item's id."""
     take = info.get("take")
     return pin.item if take is None else f"{info.get('subject') or ''}/{take}"
 

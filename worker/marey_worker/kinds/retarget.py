@@ -17,7 +17,7 @@ from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces
-from marey_worker.job_io.skeleton_cache import Rig, plan_between, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, plan_between, read_mapped
 from marey_worker.job_io.staged_results import StagedResults
 
 
@@ -47,7 +47,7 @@ class _Retargeting:
         self._target = Rig.as_stored(self._target_pin.ref)
         self._rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
         try:
-            read_rigged(context, self._target)
+            read_mapped(context, self._target)
         except MotionError as error:
             raise JobRefused(
                 error.code, f"the target skeleton {self._target_pin.name} cannot be used: {error}"
@@ -103,7 +103,7 @@ class _Retargeting:
         )
 
     def _info(self, stored: dict[str, Any] | None, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
-        """Return the part `info` of a result: the part `info` of the source with another origin and other checks."""
+        """Return the part `info` of a result: that of the source clip, with a new origin and new checks."""
         details = {
             "scale": plan.scale,
             "mapped": len(plan.pairs),

@@ -47,9 +47,10 @@ GUARD_MODULE = "marey_worker.scripts.guard"
 
 
 def run(context: Context, params: ScriptParams) -> dict[str, Any]:
-    """Run a script; the result contains its logged fields and its files. Its clips are imported.
+    """Run a script, and store its outputs; the result contains the logged fields, and refers to the files.
 
-    Raises `JobRefused` if the script fails, exceeds a limit, or does not write the files that it declares.
+    Clips that the script has written are imported. Raises `JobRefused` if the script fails, exceeds a limit, or does
+    not write the outputs that it declares.
     """
     declared = params.declaration
     if declared is None:
@@ -58,7 +59,9 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
         )
     if declared.image is not None and declared.image != os.environ.get(IMAGE_VARIABLE):
         raise JobRefused(
-            "wrong-image", f"the script needs the image {declared.image}, but this worker runs in another image"
+            "wrong-image",
+            f"the script needs the image {declared.image}, but this worker runs in another image; start a worker in "
+            "the needed image",
         )
     if landlock_version() == 0:
         raise JobRefused(
@@ -81,7 +84,10 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
 
 
 def examine() -> tuple[str, str, str]:
-    """Run an empty command as a script; return the check's name, its state (ok, warning or fault), and a detail."""
+    """Check whether this machine can run scripts, by a script that does nothing.
+
+    Return the name of the check, its state (ok, warning or fault), and a detail.
+    """
     if landlock_version() == 0:
         return "scripts", "fault", "this machine cannot confine scripts: they need Linux 5.13 with Landlock"
     with tempfile.TemporaryDirectory(prefix="marey-doctor-") as folder:
@@ -96,13 +102,14 @@ def examine() -> tuple[str, str, str]:
 def _require_program(declared: ScriptDeclaration, code: Path) -> None:
     program = code / declared.program
     if not program.resolve().is_relative_to(code.resolve()) or not program.is_file():
-        raise JobRefused("no-program", f"the commit {declared.commit} has no file {declared.program}")
+        detail = f"the commit {declared.commit} has no file {declared.program}, which the script is to run"
+        raise JobRefused("no-program", detail)
 
 
 def _order(
     context: Context, params: ScriptParams, declared: ScriptDeclaration, folder: Path, inputs: dict[str, str]
 ) -> GuardedCommand:
-    """Return the command with its limits and its environment, which contains only the variables that are named here."""
+    """Return the command of the script, with its limits and its whole environment."""
     paths = {("input", name): path for name, path in inputs.items()}
     paths |= {("output", name): output_path(name, one) for name, one in declared.outputs.items()}
     first, *rest = declared.words(paths, declared.values_of(params.values))
@@ -147,7 +154,7 @@ def _words_of(end: CommandEnd) -> str:
 
 
 def _missing(end: CommandEnd) -> list[str]:
-    """Return texts that name the protections and limits that this system did not provide."""
+    """Return the protections and limits that this system did not provide, as texts."""
     return [*([] if end.isolated else [NOT_ISOLATED]), *([] if end.bounded else [NOT_BOUNDED])]
 
 
@@ -161,7 +168,7 @@ def _failure(end: CommandEnd) -> str:
 
 
 def _publish(context: Context, params: ScriptParams, declared: ScriptDeclaration, folder: Path) -> dict[str, Any]:
-    """Store the outputs of a script that has ended; return the logged fields, the files and the number of clips."""
+    """Store the outputs of a script that has ended; return the members of the job's result about them."""
     files: dict[str, Any] = {}
     logged = LoggedFields({}, {})
     results = StagedResults(context)
@@ -189,7 +196,7 @@ def _stored(context: Context, path: Path) -> dict[str, Any]:
 
 
 def _stage_clip(context: Context, params: ScriptParams, results: StagedResults, name: str, path: Path) -> None:
-    """Import a clip that the script has written. Raises `JobRefused` if it cannot be read."""
+    """Import a clip that the script has written. Raises `JobRefused` if the file cannot be imported."""
     (planned,) = plan_imports([path.name])
     digest = context.put_file(path)
     options = ImportOptions(unit=DEFAULT_UNIT)

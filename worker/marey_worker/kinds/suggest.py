@@ -16,7 +16,7 @@ from marey_worker.job_io.matching_clips import refusing_motion_errors, split_uid
 
 
 def run(context: Context, params: SuggestParams) -> dict[str, Any]:
-    """Compute suggestions; the result counts them, and refers to the document that lists them."""
+    """Compute suggestions for the evaluated set; the result counts them, and refers to the document that lists them."""
     evaluated = read_evaluated_set(context)
     candidates = read_candidates(context, evaluated)
     with refusing_motion_errors():

@@ -23,7 +23,7 @@ SWEEP_SCHEMA = "marey/sweep@1"
 
 
 def run(context: Context, params: SweepParams) -> dict[str, Any]:
-    """Evaluate the clips with the weights of this task; the result contains the weights and the metrics."""
+    """Run the trials with each of this task's settings of feature weights; the result has the metrics of each."""
     evaluated = read_evaluated_set(context)
     settings = vary_each_group(evaluated.result.options.database, params.factors)
     with refusing_motion_errors():
@@ -40,7 +40,10 @@ def run(context: Context, params: SweepParams) -> dict[str, Any]:
 
 
 def gather(context: Context, params: SweepParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Combine the results of all tasks in order, rank groups of features by their effect, and store the document."""
+    """Combine the results of all tasks in the order of the settings, and store the document.
+
+    Groups of features are ranked by the effect of their weights on the objective.
+    """
     # Task i of n has made the settings i, i + n, i + 2n and so on.
     longest = max(len(result["rows"]) for result in results)
     found = [result["rows"][turn] for turn in range(longest) for result in results if turn < len(result["rows"])]

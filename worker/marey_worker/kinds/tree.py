@@ -1,4 +1,4 @@
-"""Kind `tree`: builds a tree over samples of a model, for searches."""
+"""Kind `tree`: builds a search tree over samples of a model, with which searches find motions faster."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
-from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
 
 def run(context: Context, params: TreeParams) -> dict[str, Any]:
-    """Build a search tree of samples of a model, and stage it as a part of the model; other parts are unchanged.
+    """Build a search tree over samples of a model, and stage it as a part of the model; other parts are unchanged.
 
-    Raises `JobRefused` if the model was moved or renamed while the job waited. Also raises `JobRefused` if the place of
-    the result is ambiguous, or if the tree cannot be built.
+    Raises `JobRefused` if the tree cannot be built, if the model was moved or renamed while the job waited, or if the
+    job names a folder for the result, because the result is stored with the model.
     """
     started = time.monotonic()
     (pin,) = context.inputs["model"]
@@ -35,7 +35,7 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
     model = context.document(Kind.MODEL, pin.item, pin.revision, "model")
     options = TreeOptions.of(params)
     with refusing_motion_errors():
-        skeleton, mapping, _axes = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(model["skeleton"])))
+        skeleton, mapping, _axes = read_mapped(context, Rig.as_stored(RevisionRef.model_validate(model["skeleton"])))
         primitive = primitive_from_tree(model, skeleton)
         known = [name for name in END_EFFECTORS if name in mapping.joints]
         context.progress(1, 2, "grouping samples")
@@ -63,7 +63,7 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
 
 
 def _require_same_place(context: Context, pin: PinnedInput) -> None:
-    """Raise `JobRefused` if the model was moved or renamed; the output would then not be its next revision."""
+    """Raise `JobRefused` if the model was moved or renamed, because the result would then not be its next revision."""
     now = context.item(Kind.MODEL, pin.item)
     if (now.collection, now.name) != (pin.collection, pin.name):
         raise JobRefused("model-moved", f"{pin.path} was moved or renamed while the job waited; submit the job again")

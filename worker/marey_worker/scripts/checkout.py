@@ -37,13 +37,13 @@ _SETTINGS = (
 
 
 class FetchFailed(Exception):
-    """A repository could not be read; a retry may succeed."""
+    """Error of a repository that could not be read; a retry may succeed."""
 
     code = "script-fetch-failed"
 
 
 def check_out(declared: ScriptDeclaration, folder: Path, environment: Mapping[str, str]) -> None:
-    """Write the files of the commit of a script to `folder`.
+    """Write the files of a script's commit to `folder`, from the cache or from the repository.
 
     Raises `JobRefused` if this worker does not allow the repository, if no branch or tag of the repository contains the
     commit, or if the commit is too large. Raises `FetchFailed` if the repository cannot be read now.
@@ -87,7 +87,7 @@ class _Git:
         }
 
     def contains(self, commit: str) -> bool:
-        """Return whether a branch or tag contains the commit.
+        """Return whether a branch or tag of the copy contains the commit.
 
         Large hosts also serve the commits of forks under the address of the original repository. So a commit that the
         host can serve is not necessarily a commit of the repository.
@@ -98,7 +98,7 @@ class _Git:
         return found.returncode == 0 and bool(found.stdout.strip())
 
     def fetch(self) -> None:
-        """Fetch all branches and tags. Raises `FetchFailed`."""
+        """Fetch all branches and tags of the repository. Raises `FetchFailed` if this fails."""
         self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         for left in (*self._folder.rglob("*.lock"), *self._folder.glob("objects/**/tmp_*")):
             left.unlink()  # of a Git command that was killed; no other one runs, because this worker holds the lock
@@ -108,7 +108,10 @@ class _Git:
         self._run("fetch", *options, "--", self._url, *refs)
 
     def extract(self, commit: str, folder: Path) -> None:
-        """Write the files of a commit; links that lead out of the folder are refused."""
+        """Write the files of a commit to `folder`.
+
+        Raises `JobRefused` if the commit is too large, or if a file or link in it leads out of the folder.
+        """
         command = self._command("archive", "--format=tar", commit)
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=self._environment) as git:  # noqa: S603 - a list without a shell
             assert git.stdout is not None
@@ -166,13 +169,16 @@ def _unpack(stream: IO[bytes], folder: Path) -> None:
 
 
 def _cache_folder(environment: Mapping[str, str]) -> Path:
-    """Return the folder of the cached repositories, below `XDG_CACHE_HOME` or `~/.cache`."""
+    """Return the folder of the cache of repositories, below `XDG_CACHE_HOME` or `~/.cache`."""
     return Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "scripts"
 
 
 @contextmanager
 def _locked(repository: Path, how: int) -> Iterator[bool]:
-    """Lock a cached repository against other workers; yield false if it is locked and `how` does not wait."""
+    """Hold the lock of a cached repository while the `with` block runs, and yield true.
+
+    `how` is a mode of `fcntl.flock`. If it does not wait, and another worker holds the lock, yield false.
+    """
     repository.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     with repository.with_suffix(".lock").open("ab") as lock:
         try:
@@ -184,9 +190,9 @@ def _locked(repository: Path, how: int) -> Iterator[bool]:
 
 
 def _shrink(cache: Path, used: Path) -> None:
-    """Delete repositories other than `used`, those first that were used longest ago, until the cache is small enough.
+    """Delete the least recently used repositories, but not `used`, until the cache is at most `CACHE_BYTES` large.
 
-    Repositories that another worker uses at this moment are kept.
+    Repositories that another worker uses at the moment are kept.
     """
     sizes = {one: sum(file.lstat().st_size for file in one.rglob("*")) for one in cache.glob("*.git")}
     total = sum(sizes.values())

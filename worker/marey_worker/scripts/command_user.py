@@ -1,4 +1,4 @@
-"""Kernel user of a script whose worker runs as root.
+"""User of the operating system that runs a script's command if the worker runs as root.
 
 The kernel limits the number of processes (RLIMIT_NPROC) of every user but root. So the command of a script runs as a
 user that no other process has. The command keeps one right of root, so that it can open files of root that Landlock
@@ -24,7 +24,7 @@ _THIS_PROCESS = struct.pack("=Ii", 0x20080522, 0)  # version 3 of the rights, pr
 
 
 def free_user() -> int | None:
-    """Return the id of a user who has no processes, or None if this process may not run commands as another user."""
+    """Return the id of a user without processes; None if this process may not run commands as another user."""
     rights = _rights("CapEff")
     if os.geteuid() != 0 or any(not rights >> one & 1 for one in NEEDED):
         return None
@@ -34,9 +34,9 @@ def free_user() -> int | None:
 
 
 def give(folder: Path, user: int) -> bool:
-    """Make `user` the owner of a folder and its contents; return false if the file system does not support owners.
+    """Make `user` the owner of a folder and its contents; return False if the file system does not support this.
 
-    Links are not followed. Raises `OSError` if only a part can be given.
+    Links are not followed. Raises `OSError` if the owner of only some of the contents can be changed.
     """
     try:
         os.chown(folder, user, -1)
@@ -49,9 +49,10 @@ def give(folder: Path, user: int) -> bool:
 
 
 def become(user: int) -> None:
-    """Run this process, and the programs that it starts, as `user`, with the right to open files of root.
+    """Change the user of this process to `user`, who keeps the right to open files of root.
 
-    Raises `OSError` and `NotConfinedError`.
+    Programs that this process starts have the same user and right. Raises `OSError` or `NotConfinedError` if this is
+    not possible.
     """
     check(libc().prctl(PR_SET_KEEPCAPS, 1, 0, 0, 0))
     os.setresuid(user, user, user)
@@ -61,9 +62,10 @@ def become(user: int) -> None:
 
 
 def look_as(user: int) -> None:
-    """Let this process, still as root, read facts about processes of `user` that the kernel shows only to `user`.
+    """Let this process, which runs as root, read data in /proc that the kernel shows only to `user`.
 
-    In some containers, root has no right to read these facts about every user. Raises `NotConfinedError`.
+    In some containers, root may not read such data about other users. Raises `NotConfinedError` if the rights cannot be
+    set.
     """
     rights = _rights("CapPrm")
     libc().setfsuid(user)  # removes the rights to files, which this process still needs
@@ -91,6 +93,6 @@ def _users_of_processes() -> Iterator[int]:
 
 
 def _exists(user: int) -> bool:
-    """Return whether this namespace has a user."""
+    """Return whether the user namespace of this process has the user with this id."""
     extents = (map(int, line.split()) for line in Path("/proc/self/uid_map").read_text().splitlines())
     return any(first <= user < first + length for first, _, length in extents)

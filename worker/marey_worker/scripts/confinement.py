@@ -30,25 +30,26 @@ DEVICES = ("/dev/null", "/dev/zero", "/dev/random", "/dev/urandom")
 
 
 class NotConfinedError(Exception):
-    """This system cannot confine a script."""
+    """Error of a system that cannot confine a script."""
 
 
 def landlock_version() -> int:
-    """Return the version of Landlock that the kernel has, and 0 if it has none."""
+    """Return the version of Landlock that the kernel supports; 0 if it does not support Landlock."""
     if sys.platform != "linux":
         return 0
     return max(0, int(libc().syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), 1)))
 
 
 def adopt_orphans() -> None:
-    """Make this process the parent of its descendants whose own parents end."""
+    """Make this process the parent of those descendants whose own parent has ended, so that it can end them."""
     libc().prctl(PR_SET_CHILD_SUBREAPER, 1)
 
 
 def confine(writable: Path, *, network: bool) -> None:
-    """Let this process and its future children write only below `writable`, and read only there and in program folders.
+    """Limit the files that this process and its future children can open.
 
-    Unless `network` is true, TCP is refused as well, if the kernel supports it. Raises `NotConfinedError`.
+    They can write only below `writable`, and read only there and in the folders of programs. Unless `network` is true,
+    TCP is refused as well, if the kernel supports it. Raises `NotConfinedError` if the kernel has no Landlock.
     """
     version = landlock_version()
     if version == 0:
@@ -69,7 +70,7 @@ def confine(writable: Path, *, network: bool) -> None:
 
 
 def _rights_of(version: int) -> int:
-    """Return all rights to files that a version of Landlock knows."""
+    """Return a bit mask with all rights to files that a version of Landlock knows."""
     newest = {1: 12, 2: 13, 3: 14, 4: 14}.get(version, 15)
     return int((1 << (newest + 1)) - 1)
 
@@ -94,5 +95,5 @@ def check(answer: int) -> int:
 
 
 def libc() -> ctypes.CDLL:
-    """Return the C library, through which this package calls the kernel."""
+    """Return the C library, with which this package makes system calls."""
     return ctypes.CDLL(None, use_errno=True)

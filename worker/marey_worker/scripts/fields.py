@@ -1,4 +1,7 @@
-"""Fields that scripts log, as one JSON object or as JSON lines with the values of one step each; not trusted."""
+"""Fields that a script logs, such as metrics; their content is not trusted.
+
+The script writes them as one JSON object, or as JSON lines, each with the values of one step.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ class LoggedFields(NamedTuple):
 
 
 def read_fields(name: str, declared: ScriptOutput, file: Path) -> LoggedFields:
-    """Return the fields that a run logged in an output. Raises `JobRefused` if the content is not as required."""
+    """Return the fields that a run has logged in an output. Raises `JobRefused` if the content is not valid."""
     if declared.format == STEPWISE:
         return _read_lines(name, file)
     if file.stat().st_size > MOST_FIELD_BYTES:
@@ -50,7 +53,7 @@ def read_fields(name: str, declared: ScriptOutput, file: Path) -> LoggedFields:
 
 
 def _read_lines(name: str, file: Path) -> LoggedFields:
-    """Read JSON lines one by one, so that a long file takes little memory."""
+    """Read fields from JSON lines, one line at a time, so that a long file needs little memory."""
     fields: dict[str, Value] = {}
     thinned: dict[str, _ThinnedCurve] = {}
     with file.open("rb") as lines:
@@ -69,7 +72,10 @@ def _read_lines(name: str, file: Path) -> LoggedFields:
 
 
 def _parse_line(where: str, line: bytes, default_step: int) -> tuple[int, dict[str, Any]]:
-    """Return the step of a line and its values."""
+    """Return the step of a line, or `default_step` if the line has none, and its values by field.
+
+    Raises `JobRefused` if the line is not a valid JSON object of fields.
+    """
     if len(line) > MOST_LINE_BYTES:
         raise _refusal(f"{where} must have at most {MOST_LINE_BYTES:,} bytes")
     try:
@@ -85,9 +91,10 @@ def _parse_line(where: str, line: bytes, default_step: int) -> tuple[int, dict[s
 
 
 def _add(where: str, fields: dict[str, Value], field: str, value: Any) -> None:
-    """Set a field to its last value; numbers that are not finite become the texts NaN, Infinity and -Infinity.
+    """Set a field to its newest value.
 
-    The result of a run with a diverging loss is that text, because the last finite loss would be misleading.
+    Numbers that are not finite become the texts NaN, Infinity and -Infinity. If the loss of a run diverges, its result
+    is such a text, because the last finite loss would be misleading.
     """
     fault = _fault_of_name(field) if field not in fields else None
     if isinstance(value, float) and not math.isfinite(value):
@@ -105,9 +112,10 @@ def _has_room(curves: Mapping[str, Any], field: str) -> bool:
 
 
 class _ThinnedCurve:
-    """Curve that keeps every 2^n-th of its values, and the last one, while values are added.
+    """Curve of a field that keeps every 2^n-th of its values and the last one, so that its length is limited.
 
-    Curves of different lengths therefore have many steps in common, so that means of replicates can be computed.
+    n grows while values are added. So curves of different lengths have many steps in common, and means of replicates
+    can be computed.
     """
 
     def __init__(self) -> None:
@@ -117,7 +125,7 @@ class _ThinnedCurve:
         self._last = (0, 0.0)
 
     def add(self, step: int, value: float) -> None:
-        """Add a value."""
+        """Add the value that was logged at a step."""
         self._last = (step, float(value))
         if self.logged % self._every == 0:
             if len(self._kept) == MOST_POINTS - 1:  # one place is for the last value
@@ -128,7 +136,7 @@ class _ThinnedCurve:
         self.logged += 1
 
     def finished(self) -> Curve:
-        """Return the curve by ascending steps; of several values of a step, the last one counts."""
+        """Return the curve in ascending order of steps; if a step has several values, the last one is kept."""
         points = sorted(dict([*self._kept, self._last]).items())
         return Curve(
             steps=tuple(step for step, _ in points),

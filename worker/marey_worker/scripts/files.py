@@ -25,12 +25,11 @@ INPUTS, OUTPUTS = "inputs", "outputs"
 def write_inputs(
     context: Context, declared: ScriptDeclaration, folder: Path, *, allow_expired_consent: bool
 ) -> tuple[dict[str, str], list[str]]:
-    """Write the inputs of a job to `inputs` below a folder; return the path of each, and the ids of the clips whose
-    consent has ended.
+    """Write the inputs of a job as files to the subfolder `inputs` of a folder.
 
-    The file `inputs.json` lists the items of each input with the names of their files. Raises `JobRefused` if the
-    consent for a clip has ended and the job does not allow exports after the end, or if a clip cannot be written in the
-    format of its input.
+    Return the path of each input, and the ids of the clips whose consent has ended. The file `inputs.json` lists the
+    items of each input with the names of their files. Raises `JobRefused` if the consent for a clip has ended and the
+    job does not allow exports after that, or if a clip cannot be written in the format of its input.
     """
     paths: dict[str, str] = {}
     listed: dict[str, list[dict[str, Any]]] = {}
@@ -61,7 +60,7 @@ def _check_consent(pin: PinnedInput, *, allowed: bool) -> None:
 
 
 def _content(context: Context, files: ClipFiles, pin: PinnedInput) -> tuple[bytes, str]:
-    """Return an item as a file, and the ending of the file's name."""
+    """Return an item as a file, and the ending of the file's name. Raises `JobRefused` if it cannot be written."""
     if pin.kind is not Kind.CLIP:
         ((_, found),) = context.documents_of_each([pin], *PARTS[pin.kind])
         parts = {name: one for name, one in zip(PARTS[pin.kind], found, strict=True) if one is not None}
@@ -80,20 +79,25 @@ def output_path(name: str, declared: ScriptOutput) -> str:
 
 
 def collect(declared: ScriptDeclaration, folder: Path, target: Path) -> dict[str, Path]:
-    """Copy the outputs of a script that has ended from its folder to `target`; return the copy of each output.
+    """Copy the outputs of a script that has ended from `folder` to `target`; return the path of each copy by output.
 
-    Raises `JobRefused` if a required output is missing, or an output is too large, a link, or not an ordinary file.
-    Only the names below `folder` are trusted: the script may have replaced any file or folder by a link.
+    Raises `JobRefused` if a required output is missing, too large, a link, or not an ordinary file. Nothing below
+    `folder` is trusted: the script may have replaced any file or folder by a link.
     """
     try:
         run = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
-        raise JobRefused("unsafe-output", "the script has made its folder unreadable") from error
+        raise JobRefused(
+            "unsafe-output", "the script has made its folder unreadable, so its outputs cannot be read"
+        ) from error
     try:
         try:
             outputs = os.open(OUTPUTS, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=run)
         except OSError as error:
-            raise JobRefused("unsafe-output", "the script has replaced the folder of its outputs") from error
+            raise JobRefused(
+                "unsafe-output",
+                "the script has replaced or removed the folder `outputs`; it must write its outputs into this folder",
+            ) from error
         try:
             target.mkdir()
             found = {
@@ -112,7 +116,9 @@ def _collect_one(name: str, declared: ScriptOutput, outputs: int, target: Path) 
         opened = os.open(name + declared.ending, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=outputs)
     except FileNotFoundError:
         if declared.required:
-            raise JobRefused("no-output", f"the script has not written its output {name!r}") from None
+            file = output_path(name, declared)
+            detail = f"the script has not written the required output {name!r} to the file {file}"
+            raise JobRefused("no-output", detail) from None
         return None
     except OSError as error:
         raise JobRefused("unsafe-output", f"the output {name!r} is a link, or cannot be read") from error
@@ -122,7 +128,7 @@ def _collect_one(name: str, declared: ScriptOutput, outputs: int, target: Path) 
         raise JobRefused("unsafe-output", f"the output {name!r} is not an ordinary file, or has several hard links")
     with os.fdopen(opened, "rb") as source:
         if facts.st_size > declared.max_bytes:
-            detail = f"the output {name!r} has {facts.st_size:,} bytes; it may have {declared.max_bytes:,}"
+            detail = f"the output {name!r} has {facts.st_size:,} bytes; it may have at most {declared.max_bytes:,}"
             raise JobRefused("output-too-large", detail)
         with target.open("xb") as copy:
             shutil.copyfileobj(source, copy)

@@ -1,8 +1,8 @@
 """Guard of a script: a process that starts the confined command, watches its limits and ends all its processes.
 
-The guard is a process of its own, because only a process with one thread can create namespaces. It reads an order from
-standard input, copies the output of the command to its own standard output, and writes an end to the pipe whose number
-is its first argument.
+The guard is a separate process, because only a process with one thread can create namespaces. It reads a
+`GuardedCommand` as JSON from standard input, and copies the output of the command to its own standard output. At the
+end, it writes a `CommandEnd` as JSON to the pipe whose descriptor is its first argument.
 """
 
 from __future__ import annotations
@@ -47,7 +47,16 @@ NO_PROGRAM_STATUS = 127
 
 @dataclass(frozen=True)
 class GuardedCommand:
-    """Command of a script, with its folder, environment and limits."""
+    """Command of a script, with its folder, environment and limits.
+
+    Parameters
+    ----------
+    seconds : time limit
+    memory_mb : limit on the memory of all processes together, in MiB
+    written_mb : limit on the size of all files below the folder, in MiB
+    processes : greatest number of processes at the same time
+    network : whether the command may use the network
+    """
 
     argv: tuple[str, ...]
     folder: str
@@ -61,10 +70,10 @@ class GuardedCommand:
 
 @dataclass(frozen=True)
 class CommandEnd:
-    """End of a command: its exit status (128 plus the number of a signal), or the reason why it was stopped.
+    """End of a command: its exit status (128 plus the number of a signal), or the reason why the guard stopped it.
 
-    `isolated` states whether the command had namespaces of its own, and `bounded` whether the kernel limited the number
-    of its processes.
+    `tail` is the last part of the command's output. `isolated` states whether the command had namespaces of its own,
+    and `bounded` whether the kernel limited the number of its processes.
     """
 
     status: int | None
@@ -75,7 +84,7 @@ class CommandEnd:
 
 
 def main() -> None:
-    """Run the command in the order from standard input, and write a `CommandEnd` to the pipe."""
+    """Run the command that standard input describes, and write a `CommandEnd` to the pipe."""
     result = int(sys.argv[1])
     os.set_inheritable(result, False)
     given = json.load(sys.stdin)
@@ -101,7 +110,10 @@ def main() -> None:
 
 
 def _prepare(order: GuardedCommand) -> Separation:
-    """Create the namespaces of the command; if it gets its own user, make this user the owner of its folder."""
+    """Create the namespaces of the command, and choose its user.
+
+    If the command gets a user of its own, this user becomes the owner of the command's folder.
+    """
     folder = Path(order.folder)
     place = separate(folder, network=order.network, user=free_user())
     if place.user is None:
@@ -113,9 +125,10 @@ def _prepare(order: GuardedCommand) -> Separation:
 
 
 def _hold(order: GuardedCommand, output: int, user: int | None, *, bounded: bool) -> NoReturn:
-    """Start the confined command, wait for it, and exit with its status.
+    """Start the confined command, wait until it has ended, and exit with its status.
 
-    In a process namespace of the command, this is the first process; when it ends, the kernel kills all others.
+    If the command has a process namespace, this process is the first one in it: when it ends, the kernel kills all
+    others.
     """
     os.setsid()
     null = os.open(os.devnull, os.O_RDONLY)
@@ -144,7 +157,7 @@ def _hold(order: GuardedCommand, output: int, user: int | None, *, bounded: bool
 
 
 def _take_precedence() -> None:
-    """Let this process always run before those of the command, if the system allows it.
+    """Let this process always run before the processes of the command, if the system allows this.
 
     If the kernel does not limit the number of processes of the command, the guard must count them. It could not count
     in time if it had to share the processors with thousands of these processes.
@@ -155,7 +168,10 @@ def _take_precedence() -> None:
 
 
 def _die_with_parent() -> None:
-    """Make the kernel kill this process when its parent ends; in a new namespace, the parent has no process id."""
+    """Let the kernel kill this process when its parent ends.
+
+    Unlike `die_with_parent`, this works in a new namespace of processes, in which the parent has no process id.
+    """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
@@ -175,7 +191,7 @@ def _limit(order: GuardedCommand, *, bounded: bool) -> None:
 
 
 class _Watch:
-    """Watch over a running command: its output and its limits."""
+    """Watch over a running command: copies its output, and checks its limits."""
 
     def __init__(self, order: GuardedCommand, held: int, output: int) -> None:
         self.status: int | None = None
@@ -188,7 +204,7 @@ class _Watch:
         self._measure_at = 0.0
 
     def run(self) -> str | None:
-        """Wait for the end of the command; return the reason if it was stopped."""
+        """Wait until the command has ended, and return None; if it exceeds a limit, stop it and return the reason."""
         os.set_blocking(self._output, False)
         with selectors.DefaultSelector() as waiting:
             waiting.register(self._output, selectors.EVENT_READ)
@@ -211,7 +227,7 @@ class _Watch:
         return bool(ended)
 
     def _copy(self) -> bool:
-        """Copy some output; return whether there was any."""
+        """Copy the next piece of output; return whether there was any output."""
         try:
             piece = os.read(self._output, 64 << 10)
         except BlockingIOError:
@@ -285,10 +301,10 @@ def _resident(one: psutil.Process) -> int:
 
 
 def nameless_bytes(family: Collection[psutil.Process]) -> int:
-    """Return the total size in bytes of files without a name: deleted files that are still in use, and memory files.
+    """Return the total size in bytes of the files without a name that processes of the command have opened or mapped.
 
-    These are files that processes have opened or mapped; a mapped file exists even if its descriptor is closed. Only
-    root may ask for the size of such a file; for other users, a file counts up to the end of its mapped part.
+    These are deleted files that are still in use, and files in memory. A mapped file exists even if its descriptor is
+    closed. Only root may ask for the size of such a file; for other users, it counts up to the end of its mapped part.
     """
     sizes: dict[tuple[int, int], int] = {}
     for one in family:
@@ -310,7 +326,7 @@ def nameless_bytes(family: Collection[psutil.Process]) -> int:
 
 
 def _mapped_files(pid: int) -> Iterator[tuple[tuple[int, int], int]]:
-    """Yield device and inode of each mapped file of a process that has no name, and the file's size in bytes."""
+    """Yield, for each mapped file of a process that has no name, its device and inode, and its size in bytes."""
     try:
         lines = Path(f"/proc/{pid}/maps").read_text(errors="replace").splitlines()
     except OSError:
@@ -329,9 +345,10 @@ def _mapped_files(pid: int) -> Iterator[tuple[tuple[int, int], int]]:
 
 
 def fault_of_files(folder: Path, nameless: int, written_mb: int) -> str | None:
-    """Return why the files below a folder are not allowed (too large, too many, too deep or unreadable), or None.
+    """Return why the files below a folder are not allowed, or None if they are allowed.
 
-    Links are not followed. `nameless` is the total size in bytes of files without a name, which is added.
+    The reason is that they are too large, too many, too deep or unreadable. Links are not followed. `nameless` is the
+    total size in bytes of files without a name, which is added to the size of these files.
     """
     total, count, waiting = nameless, 0, [(str(folder), 0)]
     while waiting:

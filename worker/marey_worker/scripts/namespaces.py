@@ -21,14 +21,14 @@ SEEN_USER, SEEN_ROOT = 1000, 1001
 
 @dataclass(frozen=True)
 class Separation:
-    """Result of `separate`: whether all namespaces were created, and the id of the user in them, if it has one."""
+    """Result of `separate`: whether all namespaces were created, and the id of the command's user in them, or None."""
 
     isolated: bool
     user: int | None
 
 
 def separate(writable: Path, *, network: bool, user: int | None = None) -> Separation:
-    """Move the next child of this process to namespaces of its own, as far as the system allows it.
+    """Give the next child of this process namespaces of its own, as far as the system allows it.
 
     This process must have only one thread. Its next child sees no other processes and, unless `network` is true, no
     network. For this process and the child, all files outside `writable` are read-only. With `user`, this process must
@@ -63,7 +63,7 @@ class _Outside:
         os.close(waiting)
 
     def finish(self, *, write: bool) -> bool:
-        """Let the helper write the ids if `write` is true, and then end; return whether the ids were written."""
+        """Let the helper map the users if `write` is true, and let it end; return whether the users were mapped."""
         if write:
             os.write(self._order, b"w")
         os.close(self._order)
@@ -72,7 +72,10 @@ class _Outside:
 
 
 def _map_both(process: int, user: int) -> bool:
-    """Map `user`, root and all groups into the namespace of a process, so that root may open files of any group."""
+    """Map `user`, root and all groups into the user namespace of a process; return whether this was possible.
+
+    Because all groups are mapped, root may open files of any group.
+    """
     groups = (line.split() for line in Path("/proc/self/gid_map").read_text().splitlines())
     maps = {
         "uid_map": f"{SEEN_USER} {user} 1\n{SEEN_ROOT} 0 1\n",
@@ -91,10 +94,10 @@ def _write_maps(process: str, maps: dict[str, str]) -> None:
 
 
 def _make_read_only(writable: Path) -> None:
-    """Make all files read-only for the namespace of this process, except those below `writable`.
+    """Make all files outside `writable` read-only in the mount namespace of this process.
 
-    Landlock does not limit changes of the modes, owners and times of files, so read-only mounts prevent them.
-    Raises `NotConfinedError`.
+    Landlock does not limit changes of the modes, owners and times of files, so read-only mounts prevent them. Raises
+    `NotConfinedError` if the system does not allow mounts.
     """
     folder = os.fsencode(writable)
     check(libc().mount(None, b"/", None, ctypes.c_ulong(MS_REC | MS_PRIVATE), None))

@@ -1,7 +1,7 @@
-"""Filter of the system calls of a script, for what Landlock does not limit.
+"""Filter of the system calls of a script; it refuses what Landlock cannot limit.
 
-Landlock limits neither Unix sockets, through which a process can order other programs to act for it, nor the keys that
-the kernel stores for a user, nor System V shared memory, which counts as the memory of no process.
+Landlock does not limit Unix sockets, through which a process can ask other programs to act for it. Nor does it limit
+the keys that the kernel stores for a user, or System V shared memory, which counts as the memory of no process.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ AF_INET, AF_INET6, AF_NETLINK = 2, 10, 16
 
 
 class _Machine(NamedTuple):
-    """Numbers of an architecture: its own, that of `socket`, and those of the calls that are always refused."""
+    """Numbers of a processor architecture for the filter: its own, that of `socket`, and those of refused calls."""
 
     architecture: int
     socket: int
@@ -39,14 +39,15 @@ _MACHINES = {  # refused: shmget, add_key, request_key, keyctl, io_uring_setup (
 
 
 def filter_system_calls() -> None:
-    """Refuse certain system calls to this process and its future children; call this after setting "no new privileges".
+    """Refuse certain system calls to this process and its future children; set "no new privileges" before.
 
     Sockets other than IP and netlink sockets are refused. Pairs of connected Unix sockets remain possible. Raises
-    `NotConfinedError`.
+    `NotConfinedError` if the system does not support the filter.
     """
     machine = _MACHINES.get(platform.machine())
     if machine is None:
-        raise NotConfinedError(f"scripts run on {' and '.join(_MACHINES)}, not on {platform.machine()}")
+        known = " or ".join(_MACHINES)
+        raise NotConfinedError(f"scripts can run only on {known}; this machine is {platform.machine()}")
     code = b"".join(_steps(machine))
     steps = ctypes.create_string_buffer(code, len(code))
     program = struct.pack("@HP", len(code) // 8, ctypes.addressof(steps))

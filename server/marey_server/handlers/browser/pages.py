@@ -53,7 +53,7 @@ class WebFile:
 
 
 def built_files() -> dict[str, WebFile]:
-    """Return the built files by their path in the folder; nothing if the pages were not built.
+    """Return the built files by their path in the build folder; empty if the pages were not built.
 
     They are read again after each build, so that a developer need not restart the server.
     """
@@ -79,7 +79,10 @@ def _read(file: Path) -> WebFile:
 
 @dataclass(frozen=True, slots=True)
 class PackedPlayer:
-    """Page that plays motion, as reports contain it: compressed by zlib, in base64; and the digest of its script."""
+    """Page that plays motion, in the form in which reports contain it.
+
+    `content` is the HTML page, compressed by zlib, in base64. `script` is the digest of the page's script.
+    """
 
     content: str
     script: str
@@ -127,8 +130,8 @@ class ViewQuery(AnyQuery):
     """Parameters in the address of the page that shows clips."""
 
     clip: str | None = Field(None, description="The clip: `project/item`, or `project/item@revision`.")
-    beside: str | None = Field(None, description="Another clip, to be shown on the same clock.")
-    frame: str | None = Field(None, description="Number of the frame of the clip to begin with, from 0.")
+    beside: str | None = Field(None, description="Second clip, which is shown with the first one at the same time.")
+    frame: str | None = Field(None, description="Frame of the first clip to begin with, counted from 0.")
     camera: str | None = Field(
         None, description="Yaw and pitch of the camera in degrees, and its distance in body heights, as in `35,12,2.6`."
     )

@@ -96,7 +96,7 @@ class JobsQuery(CountedPageQuery):
     )
 
     def filters(self) -> JobFilters:
-        """Return the filters for the store."""
+        """Convert the query parameters to the `JobFilters` by which the store selects jobs."""
         return JobFilters(self.state, self.kind, self.parent, self.author)
 
 
@@ -145,7 +145,7 @@ class ProjectJobs(Resource):
 
 
 def accepted(job: Job) -> Reply:
-    """Return the answer to a submission: the new job, its address and when to look again."""
+    """Return the answer to a submission: the new job, its address, and the time after which to look again."""
     headers = {} if job.state.terminal else {"Retry-After": "1"}
     return Reply(job, location=f"/jobs/{job.id}", headers=headers)
 

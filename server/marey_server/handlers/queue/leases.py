@@ -48,7 +48,7 @@ class Leases(Resource):
 
     @writes(access=Access.WORKER, scope="work", body=ClaimRequest, answer=LeaseList, reserved=True)
     async def post(self, body: ClaimRequest) -> Reply:
-        """Claim jobs; if there are none, wait for jobs up to `wait_s` seconds. A lease that is not renewed expires."""
+        """Claim jobs; if no job is available, wait up to `wait_s` seconds. A lease that is not renewed expires."""
         services = self.services
         loop = asyncio.get_running_loop()
         deadline = loop.time() + body.wait_s
@@ -77,8 +77,9 @@ class Workers(Resource):
     async def get(self) -> Rendered:
         """List the workers, in one page.
 
-        The list contains workers that claimed jobs from this server process in the last 24 hours, until the process is
-        restarted, and all workers that run jobs. Workers that wait for jobs of another process are missing.
+        The list contains all workers that run jobs. It also contains the workers that claimed jobs from this server
+        process in the last 24 hours, but not before its last start. Idle workers that claim jobs from another process
+        of the server are missing.
         """
         heard, policy = self.services.worker_memory.heard(), self.services.queue_policy
         return await self.answer_with(lambda workers: Reply(Page(items=workers)), list_workers, heard, policy)

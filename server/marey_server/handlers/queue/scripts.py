@@ -41,10 +41,10 @@ class ProjectScripts(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: ScriptCreate) -> Rendered:
-        """Register a script: a command of a pinned commit of a repository that the setting `script_repositories`
-        allows.
+        """Register a script: a command that is run in a pinned commit of a Git repository.
 
-        Contributors of the project can then run it as jobs.
+        The setting `script_repositories` must allow the repository. Contributors of the project can then run the script
+        as jobs.
         """
         return await self.answer_with(
             lambda made: Reply(made, location=f"/projects/{project}/scripts/{made.name}"),
@@ -73,7 +73,7 @@ class ScriptResource(Resource):
 
 
 class OrderQuery(Request):
-    """Query parameter with the order of runs."""
+    """Query parameters that select the order of runs."""
 
     sort: str = Field(
         "-created_at",
@@ -97,7 +97,10 @@ class ScriptRuns(Resource):
 
     @reads(access=Access.READER, query=RunsQuery, answer=ScriptRun, paged=True, public=False)
     async def get(self, project: str, script: str, query: RunsQuery) -> Rendered:
-        """List the first runs of a script in an order, with their parameters and logged fields, in one page."""
+        """List the runs of a script, in the requested order, with their parameters and logged fields.
+
+        The answer is a single page with the first `limit` runs.
+        """
         return await self.answer(runs.list_runs, project, script, sort=query.sort, limit=query.limit)
 
     @writes(

@@ -22,10 +22,10 @@ class IndexSearcher(Resource):
     """Base of resources that search an index of motions."""
 
     async def searched(self, project: str, kind: Kind, filters: ItemFilters) -> ItemFilters:
-        """Return the filters with the clips that meet each condition `like(...)` of the query in `filters`.
+        """Evaluate the conditions `like(...)` in the query of `filters`.
 
-        Only clips can meet such a condition; items of other kinds have no motion. A query for deleted items may not
-        contain such conditions.
+        Return the filters, to which the clips that meet each condition are added. Only clips can meet such a condition;
+        items of other kinds have no motion. A query for deleted items may not contain such conditions.
         """
         if not likeness.may_compare_motion(filters.query) or filters.deleted:
             return filters
@@ -45,7 +45,10 @@ class IndexSearcher(Resource):
         return replace(filters, alike=alike)
 
     async def files_of(self, index: FoundIndex) -> tuple[ShardFiles, ...]:
-        """Copy missing files of an index to this server, and return the paths of all files, by shard."""
+        """Copy missing files of an index to this server, and return the paths of all files, by shard.
+
+        Raises `StorageFullProblem` if the disk is full.
+        """
         files = self.services.index_files
         missing = await self.compute(files.missing, index.document)
         if missing:
@@ -72,9 +75,10 @@ class SimilarMoments(IndexSearcher):
     async def post(self, project: str, body: SimilarRequest) -> Reply:
         """Return the moments of the project's clips that resemble some frames of a clip, the most similar first.
 
-        An index of motions is searched, which a job of the kind `index` builds and updates. The result is that of a
-        comparison with all windows of all clips in the index. Clips that were deleted or changed since the update are
-        left out; `behind` is the number of clips that were created or changed since then.
+        An index of motions is searched, which a job of the kind `index` builds and updates. The result is the same as
+        if the example were compared with every window of every clip in the index. Clips that were deleted or changed
+        after the last update of the index are left out; `behind` is the number of clips that were created or changed
+        after it.
         """
         example = await self.look_up(similar.read_example, project, body)
         metric = await self.look_up(similar.read_metric, project, body.metric)

@@ -83,7 +83,10 @@ class OneStudyParticipant(Resource):
 
     @writes(access=Access.MAINTAINER)
     async def delete(self, project: str, kind: str, item: str, participant: str) -> Rendered:
-        """Delete consent and trials of a participant, named by id, who then counts as withdrawn; the link ends."""
+        """Delete the consent and the trials of a participant, who then counts as withdrawn.
+
+        `participant` in the address is the id of the participant. The participant's link is no longer valid.
+        """
         return await self.answer(conducting.withdraw_participant, project, kind_of(kind), item, participant)
 
 
@@ -95,7 +98,7 @@ class StudyProgressResource(Resource):
 
     @reads(access=Access.READER, answer=StudyProgress)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
-        """Return numbers of participants and trials of a study, without anything about single participants."""
+        """Return how many participants and trials a study has, without data of single participants."""
         return await self.answer(conducting.read_progress, project, kind_of(kind), item)
 
 
@@ -127,9 +130,10 @@ class StudyDifferencesResource(Resource):
 
     @reads(access=Access.MAINTAINER, query=DifferencesQuery, answer=StudyDifferences, public=False)
     async def get(self, project: str, kind: str, item: str, query: DifferencesQuery) -> Reply:
-        """Return how different the motions of a study look by the answers so far, without data of participants.
+        """Return how different the motions of a study look to the participants, according to the answers so far.
 
-        The job kind `analyse_study` computes the same differences, groups of the motions, and metrics.
+        The answer contains no data of single participants. The job kind `analyse_study` computes the same differences,
+        groups of the motions, and metrics.
         """
         collected = await self.look_up(
             judgements.collect_answers, project, kind_of(kind), item, revision=query.revision

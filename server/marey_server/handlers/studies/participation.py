@@ -23,7 +23,7 @@ from marey_server.errors import NotFoundProblem
 from marey_server.handlers.access import MAX_LOGIN_BYTES, PasswordResource
 from marey_server.http.caching import IMMUTABLE, WITH_SECRET
 from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
-from marey_server.http.reply import Lasting, Rendered, Reply
+from marey_server.http.reply import Rendered, Reply, UnchangingDocument
 from marey_server.http.resource import Resource
 from marey_server.store import items
 from marey_server.store.studies import participants, poses, trials
@@ -119,7 +119,7 @@ class ParticipationTrial(Resource):
 def read_shown_part(tx: Transaction, clip: int, part: ShownPart) -> Reply:
     """Return a document of one motion of the caller's study; the document never changes."""
     found = poses.find_shown_part(tx, clip, part)
-    content = Lasting(found.digest, partial(items.load_part, tx, found), found.size_bytes)
+    content = UnchangingDocument(found.digest, partial(items.load_part, tx, found), found.size_bytes)
     return Reply(content, rev=f"r{found.revision}", headers={"Cache-Control": IMMUTABLE})
 
 
@@ -136,7 +136,8 @@ class ParticipationPart(Resource):
         Motions are numbered from 0, as in trials. The documents are the same as those of the clip and its skeleton.
         """
         if part not in get_args(ShownPart):
-            raise NotFoundProblem(f"A motion of a study has no part {part!r}.")
+            known = ", ".join(get_args(ShownPart))
+            raise NotFoundProblem(f"A motion of a study has no part {part!r}; the parts are {known}.")
         return await self.answer_with(lambda reply: reply, read_shown_part, clip, cast(ShownPart, part))
 
 

@@ -101,8 +101,8 @@ class DatasetRef(Resource):
     async def delete(self, project: str, dataset: str, ref: str) -> Rendered:
         """Delete a branch or a tag; no commit is deleted.
 
-        A tag is not deleted while a job that has not ended, or an item that a job made, cites its version, unless
-        another tag names this version.
+        A tag cannot be deleted while something cites its version, unless another tag names the same version. Jobs that
+        have not ended, and items that a job made, can cite versions.
         """
         citing = await self.look_up(purging.find_citations, project, dataset, ref)
         expected_rev = self.precondition.expected_rev
@@ -248,8 +248,8 @@ class FolderCheckout(Resource):
     async def post(self, project: str, dataset: str, body: CheckoutRequest) -> Rendered:
         """Bring the folder of the dataset to the state of a version: items are added, changed, moved and removed.
 
-        With `query` or `paths`, only the selected entries are checked out. The folder remembers this: its commits keep
-        all other entries of the version.
+        With `query` or `paths`, only the selected entries are checked out. The server stores the selection with the
+        folder: later commits of the folder keep all other entries of the version.
 
         If the folder has changes that no commit has recorded, the request is refused with 409, unless it asks to
         discard them. Removed items can be restored, and earlier revisions of items remain.

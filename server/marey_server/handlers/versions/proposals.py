@@ -106,7 +106,7 @@ class WaitingProposal(Resource):
 
     tag = "Proposals"
 
-    async def settle(
+    async def answer_with_merge(
         self, function: Callable[..., Any], project: str, dataset: str, proposal: int, body: Request
     ) -> Rendered:
         """Prepare the merge of the proposal, call `function` with the prepared merge, and answer with the result.
@@ -147,7 +147,7 @@ class ProposalReviews(WaitingProposal):
 
         If the proposal waits to be merged and meets all other requirements, an approval merges it.
         """
-        return await self.settle(proposals.add_review, project, dataset, proposal, body)
+        return await self.answer_with_merge(proposals.add_review, project, dataset, proposal, body)
 
 
 class ProposalChecks(WaitingProposal):
@@ -161,7 +161,7 @@ class ProposalChecks(WaitingProposal):
 
         If the proposal waits to be merged and meets all other requirements, a successful check merges it.
         """
-        return await self.settle(proposals.report_check, project, dataset, proposal, body)
+        return await self.answer_with_merge(proposals.report_check, project, dataset, proposal, body)
 
 
 class ProposalMerges(Resource):

@@ -32,7 +32,7 @@ _OF_OBJECT = frozenset({400, 403, 413, 422})
 
 
 class VersionGone(EngineError):
-    """Error of a watch that begins at a version that the cluster has forgotten; list the objects again."""
+    """Error of a watch whose start version the cluster no longer has; list the objects again, and watch from there."""
 
 
 class ObjectRefused(EngineError):
@@ -40,11 +40,11 @@ class ObjectRefused(EngineError):
 
 
 class NoSuchObject(EngineError):
-    """Error of a request about an object that does not exist."""
+    """Error of a request about an object that does not exist in the cluster."""
 
 
 class ObjectExists(EngineError):
-    """Error of a creation whose name is in use."""
+    """Error of a request to create an object whose name another object has already."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Listed:
 
 @dataclass(frozen=True)
 class Change:
-    """Change of an object; `deleted` says whether it no longer exists."""
+    """Change of an object that a watch reports; `deleted` says whether the object no longer exists."""
 
     document: Manifest
     deleted: bool
@@ -82,46 +82,49 @@ class Cluster:
             await self._api.close()
 
     async def create_job(self, job: Manifest) -> Manifest:
-        """Create a Job. Raises `ObjectExists`."""
+        """Create a Job. Raises `ObjectExists` if a Job has this name already."""
         body = client.V1Job.model_validate(job)
         return await self._answer(lambda api: _batch(api).create_namespaced_job_without_preload_content(
             self._namespace, body, field_validation="Strict", _request_timeout=self._timeout_s
         ))  # fmt: skip
 
     async def read_job(self, name: str) -> Manifest:
-        """Return a Job. Raises `NoSuchObject`."""
+        """Return a Job by its name. Raises `NoSuchObject` if there is no such Job."""
         return await self._answer(lambda api: _batch(api).read_namespaced_job_without_preload_content(
             name, self._namespace, _request_timeout=self._timeout_s
         ))  # fmt: skip
 
     async def delete_job(self, name: str) -> None:
-        """Delete a Job and, afterwards, its pods and its Secret. Raises `NoSuchObject`."""
+        """Delete a Job; the cluster then deletes its pods and its Secret.
+
+        Raises `NoSuchObject` if there is no such Job.
+        """
         await self._answer(lambda api: _batch(api).delete_namespaced_job_without_preload_content(
             name, self._namespace, propagation_policy="Background", _request_timeout=self._timeout_s
         ))  # fmt: skip
 
     async def delete_pod(self, name: str) -> None:
-        """Delete a pod, which gets SIGTERM first. Raises `NoSuchObject`."""
+        """Delete a pod, whose processes get SIGTERM first. Raises `NoSuchObject` if there is no such pod."""
         await self._answer(lambda api: _core(api).delete_namespaced_pod_without_preload_content(
             name, self._namespace, _request_timeout=self._timeout_s
         ))  # fmt: skip
 
     async def create_secret(self, secret: Manifest) -> None:
-        """Create a Secret. Raises `ObjectExists`."""
+        """Create a Secret. Raises `ObjectExists` if a Secret has this name already."""
         body = client.V1Secret.model_validate(secret)
         await self._answer(lambda api: _core(api).create_namespaced_secret_without_preload_content(
             self._namespace, body, field_validation="Strict", _request_timeout=self._timeout_s
         ))  # fmt: skip
 
     async def read_log(self, pod: str) -> str:
-        """Return the last lines of a pod's log. Raises `NoSuchObject`."""
+        """Return the last lines of a pod's log. Raises `NoSuchObject` if there is no such pod."""
         async with self._response(lambda api: _core(api).read_namespaced_pod_log_without_preload_content(
             pod, self._namespace, tail_lines=LOG_LINES, limit_bytes=8192, _request_timeout=self._timeout_s
         )) as response:  # fmt: skip
             return await response.text(errors="replace")
 
     async def list(self, kind: Kind, selector: str) -> Listed:
-        """Return all objects of a kind with the given labels."""
+        """Return all objects of a kind that have the labels in `selector`, and the version of this list."""
         objects: dict[str, Manifest] = {}
         token: str | None = None
         while True:
@@ -139,9 +142,9 @@ class Cluster:
         )
 
     async def watch(self, kind: Kind, selector: str, version: str, seconds: int) -> AsyncIterator[Change]:
-        """Yield the changes since `version` for a number of seconds, or until the connection ends.
+        """Yield the changes after `version`, for a number of seconds or until the connection ends.
 
-        Raises `VersionGone`.
+        Raises `VersionGone` if the cluster no longer has this version; then list the objects again.
         """
         async with self._response(lambda api: _lister(api, kind)(
             self._namespace, label_selector=selector, resource_version=version, watch=True, timeout_seconds=seconds,
@@ -171,7 +174,7 @@ class Cluster:
                     raise _error(response.status, await _problem(response))
                 yield response
         except TimeoutError:
-            raise EngineError("the cluster does not answer in time") from None
+            raise EngineError("the Kubernetes cluster does not answer in time") from None
         except (aiohttp.ClientError, ConfigException, OSError, ValueError) as error:
             raise EngineError(f"no valid answer from the cluster: {type(error).__name__}: {error}") from error
 
@@ -195,7 +198,9 @@ async def _configuration(options: ClusterOptions) -> client.Configuration:
                 persist_config=False,
             )
     except (ConfigException, OSError) as error:
-        raise EngineError(f"the access to the cluster is not configured: {error}") from error
+        raise EngineError(
+            f"the access to the cluster is not configured: {error}; check the launcher option `kubeconfig`"
+        ) from error
     return configuration
 
 
@@ -214,7 +219,7 @@ def _lister(api: client.ApiClient, kind: Kind) -> Callable[..., Awaitable[aiohtt
 
 
 async def _problem(response: aiohttp.ClientResponse) -> Manifest:
-    """Return the document in which the cluster explains a refusal; proxies may answer with other text."""
+    """Return the JSON document in the cluster's answer to a failed request, or else one with the answer's text."""
     text = await response.text(errors="replace")
     try:
         found = json.loads(text)

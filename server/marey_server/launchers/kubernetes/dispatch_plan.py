@@ -1,4 +1,4 @@
-"""Decision which waiting jobs of the queue get pods now, given the Jobs that the cluster has already."""
+"""Decisions which waiting jobs get pods of their own now, and which waiting pods are deleted again."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ PAUSES = Backoff(first_s=5.0, longest_s=600.0, jitter=0.25)
 
 @dataclass(frozen=True)
 class Started:
-    """Start of a job of the queue; `job` describes the job itself or, for a parent job, one of its tasks."""
+    """Start of pods for a job of the queue.
+
+    `job` is one of the waiting jobs to start; if these are tasks of a parent job, it is the first of them.
+    """
 
     job: WaitingJob
     dispatch: Dispatch
@@ -36,9 +39,10 @@ class Started:
 
 @dataclass
 class _StartGroup:
-    """Single job, or tasks that start together; `size` is the number of all tasks of the parent job.
+    """Single job, or tasks of a parent job that start together in one Kubernetes Job.
 
-    The group can use at most `most` pods, and gets `places` of them.
+    `job` is the single job, or the first of the tasks. `size` is the number of all tasks of the parent job, and None
+    for a single job. The group can use at most `most` pods; `places` counts the pods that it gets.
     """
 
     job: WaitingJob
@@ -49,10 +53,11 @@ class _StartGroup:
 
 @dataclass
 class DispatchPlan:
-    """Decisions of a dispatcher, from the times since which pods wait, and at which pods ended without a claim.
+    """Plan of a dispatcher: decides which jobs get pods, and which pods are deleted.
 
-    At most `most` pods exist, and at most `most_of_project` pods of each project. If no node runs a pod for
-    `patience_s` seconds, and other jobs wait for a place, the pod is deleted.
+    At most `most` pods exist at the same time, and at most `most_of_project` pods of each project. If no node runs a
+    pod for `patience_s` seconds, and other jobs wait for a pod, the pod is deleted. The plan remembers since when such
+    pods have waited, and when the next pod of a job may start after pods ended without a claim.
     """
 
     most: int
@@ -72,13 +77,13 @@ class DispatchPlan:
     def decide(
         self, now_s: float, waiting: Sequence[WaitingJob], jobs: Mapping[str, Mapping[str, Any]]
     ) -> list[Started]:
-        """Return the starts that are due.
+        """Return the starts of pods that are due now.
 
         Parameters
         ----------
         now_s : time of a monotonic clock, in seconds
-        waiting : jobs that wait for a pod, in the order of claims
-        jobs : Jobs of the cluster, by name
+        waiting : jobs of the queue that wait for a pod, in the order of claims
+        jobs : Kubernetes Jobs that the cluster has, by name
         """
         served = {place for job in jobs.values() for place in places_of(job)}
         numbers = _newest_numbers(jobs.values())
@@ -87,9 +92,10 @@ class DispatchPlan:
         return [_start(group, numbers) for group in self._share(_grouped(due, numbers), jobs.values())]
 
     def step_back(self, now_s: float, stuck: Mapping[str, Mapping[str, Any]]) -> list[str]:
-        """Return the names of the Jobs in `stuck` to delete so that waiting jobs get their places; the oldest first.
+        """Return the names of Kubernetes Jobs to delete, oldest first, so that other waiting jobs get their places.
 
-        `stuck` contains the Jobs that no node runs, by name.
+        `stuck` contains the Kubernetes Jobs whose pods no node runs, by name. Only Jobs that have been stuck for
+        `patience_s` seconds are deleted, and not more than waiting jobs lack a place.
         """
         self._stuck_since_s = {name: self._stuck_since_s.get(name, now_s) for name in stuck}
         late = [name for name, since_s in self._stuck_since_s.items() if now_s - since_s >= self.patience_s]
@@ -106,7 +112,7 @@ class DispatchPlan:
         return chosen
 
     def _share(self, groups: Iterable[_StartGroup], jobs: Iterable[Mapping[str, Any]]) -> list[_StartGroup]:
-        """Give each free place to the project that has the fewest pods; return the groups that got at least one."""
+        """Give each free place to the project that has the fewest pods; return the groups that got a place."""
         pods: Counter[str] = Counter()
         for job in jobs:
             pods[project_of(job)] += pods_of(job)
@@ -136,7 +142,7 @@ class DispatchPlan:
     def _held_back(
         self, now_s: float, waiting: Sequence[WaitingJob], jobs: Mapping[str, Mapping[str, Any]]
     ) -> set[str]:
-        """Return the ids of the jobs whose pods ended without a claim, and whose pause is not over yet."""
+        """Return the ids of jobs whose pods ended without a claim, and which must wait before their next pod."""
         fences = {one.id: one.fence for one in waiting}
         unclaimed: dict[str, list[str]] = {}
         for name, job in jobs.items():
@@ -150,7 +156,7 @@ class DispatchPlan:
 
 
 def _places_of(one: WaitingJob) -> Iterable[PodPlace]:
-    """Yield the places in which a job may run: as a single job, and as a task of its parent job."""
+    """Yield the ways in which a pod can run a job: as a single job, or, for a task, as a task of its parent job."""
     yield PodPlace(one.id)
     if one.parent is not None:
         yield PodPlace(one.parent, one.position)

@@ -1,8 +1,8 @@
 """Dispatcher: starts a pod of its own for each job that needs one, and deletes the pods of jobs that have ended.
 
 The dispatcher stores only the time until which a job waits, and the reason, both in the job. It reads from the cluster
-which pods it has started, and computes the names of Jobs and the tokens of pods from the ids of jobs. So a server may
-end at any moment: the next server finds all pods.
+which pods it has started, and computes the names of Kubernetes Jobs and the tokens of pods from the ids of jobs. So a
+server may end at any moment: the next server finds all pods.
 """
 
 from __future__ import annotations
@@ -60,7 +60,10 @@ DELETE_AFTER_S = 10.0
 
 
 class Dispatcher:
-    """Dispatcher of a server whose workers reach it at `url`. `clock_s` is a monotonic clock in seconds."""
+    """Task that starts and deletes the pods of jobs that need a pod of their own.
+
+    Workers reach the server at `url`. `clock_s` is a monotonic clock in seconds.
+    """
 
     def __init__(
         self, settings: Settings, database: Database, url: str, *, clock_s: Callable[[], float] = time.monotonic
@@ -89,7 +92,7 @@ class Dispatcher:
         await repeat("own pods", self.adjust, ROUND_S)
 
     async def close(self) -> None:
-        """Close the connections, and let another server dispatch; the pods continue."""
+        """Close the connections, and give up the lead, so that another server can dispatch; the pods continue."""
         try:
             await self._jobs.close()
             await self._lead.give_up()
@@ -97,7 +100,10 @@ class Dispatcher:
             log.warning("own pods: %s", getattr(error, "detail", error))
 
     async def adjust(self) -> None:
-        """Start and delete pods once, if this process is the leader. Raises `EngineError` and `ApiProblem`."""
+        """Start and delete pods once, if this process is the leader.
+
+        Raises `EngineError` if the cluster refuses a request, and `ApiProblem` if the database cannot be used.
+        """
         if not await self._leads():
             self._explained = None
             return
@@ -133,7 +139,7 @@ class Dispatcher:
             await self._postpone(asked[name], f"the cluster refused the pod: {reason}", AFTER_REFUSAL_S)
 
     async def _step_back(self) -> None:
-        """Delete pods that no node has run for long if other jobs wait for a place; they are started again later."""
+        """Delete pods that no node has run for long if other jobs wait for a place; their jobs start again later."""
         jobs = dict(self._jobs.view.jobs)
         stuck = stuck_jobs(jobs, self._jobs.view.pods.values())
         pause_s = self._rules.patience_s
@@ -143,7 +149,10 @@ class Dispatcher:
                 await ask(self._jobs.delete(name))
 
     async def _postpone(self, job: Manifest, reason: str, pause_s: float) -> bool:
-        """Delay the job of a Job, or its tasks, by at least `pause_s` seconds; return False if none is queued."""
+        """Delay the next start of a Kubernetes Job's queue job, or of its tasks, by at least `pause_s` seconds.
+
+        Return False if none of these jobs is queued.
+        """
         of_job = partial(postpone, job_id=job_of(job), reason=reason, pause_s=pause_s, tasks=is_split(job))
         postponed = await asyncio.wrap_future(self._database.submit_write(SYSTEM, of_job))
         if postponed:
@@ -151,7 +160,7 @@ class Dispatcher:
         return postponed
 
     def _is_allowed(self, one: WaitingJob) -> bool:
-        """Return whether the image of a job is still allowed; a refusal is logged once."""
+        """Return whether the settings still allow the image of a job; if not, log this once for each job."""
         if one.image is None or is_allowed_image(one.image, self._rules.images):
             return True
         if one.id not in self._refused:
@@ -188,7 +197,7 @@ class Dispatcher:
     # -- ends --
 
     async def _delete_finished(self) -> None:
-        """Delete the Jobs that are still running some seconds after their job of the queue has ended or was purged."""
+        """Delete the Kubernetes Jobs that still run some seconds after their queue job has ended or was purged."""
         alive = {name: job_of(job) for name, job in self._jobs.view.jobs.items() if not is_over(job)}
         unfinished = await self._read(lambda tx: read_unfinished(tx, sorted(set(alive.values()))))
         over = [name for name, job_id in alive.items() if job_id not in unfinished]
@@ -204,7 +213,7 @@ class Dispatcher:
             log.info("own pods: deleted %s, whose jobs have ended", ", ".join(late))
 
     def _explain_ends(self) -> None:
-        """Log why Jobs have failed since the last round."""
+        """Log why Kubernetes Jobs have failed since the last round."""
         over = {name: job for name, job in self._jobs.view.jobs.items() if is_over(job)}
         pods = group_pods(self._jobs.view.pods.values())
         for name in sorted(over.keys() - (over.keys() if self._explained is None else self._explained)):

@@ -39,7 +39,7 @@ def make_kubernetes_launcher(context: LaunchContext) -> KubernetesLauncher:
 
 
 class KubernetesLauncher:
-    """Launcher whose workers are pods. They continue when the server ends."""
+    """Launcher that runs workers as pods of a cluster. The pods continue when the server ends."""
 
     outlives_server = True
 
@@ -51,7 +51,7 @@ class KubernetesLauncher:
         self._stopped: dict[str, None] = {}
 
     async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
-        """Create the Jobs of `count` workers. Jobs with these names that exist already are left as they are."""
+        """Create the Jobs of `count` workers. If a Job with the same name exists already, it is left unchanged."""
         context = self._context
         pool = Pool(context.pool, context.url, self._options, request, context.log_form, context.log_level)
         base = f"{self._options.instance}-{context.pool}-{key}"
@@ -68,7 +68,10 @@ class KubernetesLauncher:
         return tuple(launched_workers(self._view.jobs.values(), self._view.pods.values()))
 
     async def stop(self, names: tuple[str, ...]) -> None:
-        """Delete the Jobs of workers, or their pods if other workers of an Indexed Job continue."""
+        """Delete the Jobs of workers, or their pods if other workers of an Indexed Job continue.
+
+        Raises `EngineError` for workers of such an Indexed Job that have no pods yet.
+        """
         await self._view.refresh()
         wanted = set(names)
         deletions: list[Awaitable[None]] = []
@@ -88,7 +91,8 @@ class KubernetesLauncher:
                     without_pod.append(name)
         await self._jobs.all(deletions)
         if without_pod:
-            raise EngineError(f"workers of a larger Job that have no pods yet cannot be stopped: {sorted(without_pod)}")
+            listed = ", ".join(sorted(without_pod))
+            raise EngineError(f"workers of an Indexed Job cannot be stopped before they have pods: {listed}")
 
     async def why_ended(self, name: str) -> WorkerEnd | None:
         """Return why a worker ended, from its pod or its Job; `unknown` if the cluster has deleted both."""

@@ -1,4 +1,4 @@
-"""Documents of the objects that run workers: Job, Secret of its token, and the Deployment of a fixed pool."""
+"""Manifests of the objects that run workers: a Job, the Secret with its token, and a Deployment of a fixed pool."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STOP_S = 45
 
 @dataclass(frozen=True)
 class Pool:
-    """Workers with the same properties, and the address of their server."""
+    """Workers with the same properties, and the facts that they need: address of the server, and form of their log."""
 
     name: str
     url: str

@@ -1,4 +1,4 @@
-"""Documents of the Jobs of a cluster: each Job runs one job of the queue, or one of its tasks in each pod."""
+"""Kubernetes Jobs that run one job of the queue: in one pod, or, for a parent job, one task in each pod."""
 
 from __future__ import annotations
 
@@ -22,10 +22,16 @@ PULL_S = 1800
 
 @dataclass(frozen=True)
 class Dispatch:
-    """Start of pods for a job: the `number` of the start, and the number of claims of the job until then.
+    """Start of pods for a job of the queue.
 
-    With `size`, the job is a parent job, and each of its tasks has a pod; at most `parallel` of them run at once.
-    `project` is the id of the job's project.
+    Parameters
+    ----------
+    job : id of the job
+    number : number of the start, counted for each job
+    fence : number of claims of the job until this start
+    size : number of tasks of a parent job, each of which has a pod; None for a single job
+    parallel : greatest number of the tasks' pods that run at once
+    project : id of the job's project
     """
 
     job: str
@@ -36,30 +42,31 @@ class Dispatch:
     project: str = ""
 
     def name(self, options: ClusterOptions) -> str:
-        """Return the name of the Job; a repetition of this start gives the same name."""
+        """Return the name of the Kubernetes Job of this start; if the start is repeated, the name is the same."""
         return f"{options.instance}-{self.job.replace('_', '-')}-{self.number}"
 
 
 @dataclass(frozen=True)
 class PodPlace:
-    """A job, or a task of a parent job, that a pod runs."""
+    """Job that a pod runs: the job `job`, or, with `position`, the task with this position of the parent job `job`."""
 
     job: str
     position: int | None = None
 
 
 def own_pod_labels(options: ClusterOptions) -> dict[str, str]:
-    """Return the labels of all Jobs that run one job of the queue."""
+    """Return the labels of all Kubernetes Jobs that run one job of the queue."""
     return job_labels(OWN_PODS, options)
 
 
 def own_pod_job(
     pool: Pool, dispatch: Dispatch, *, time_limit_s: int, environment: Mapping[str, str] | None = None
 ) -> Manifest:
-    """Return the Job that runs a job of the queue.
+    """Return the Kubernetes Job that runs a job of the queue.
 
-    Each pod knows the id of its job and a token that can only claim this job. A pod whose worker is refused by the
-    server ends the Job (of its index) at once; a pod that the cluster ended is replaced, and counts as no failure.
+    Each pod knows the id of its job and a token that can only claim this job. If the server refuses a pod's worker, the
+    Kubernetes Job, or its index for this pod, fails at once. If the cluster ends a pod, the pod is replaced, and this
+    does not count as a failure.
 
     Parameters
     ----------
@@ -91,18 +98,18 @@ def own_pod_job(
 
 
 def job_of(job: Mapping[str, Any]) -> str:
-    """Return the id of the job of the queue that a Job runs."""
+    """Return the id of the queue job that a Kubernetes Job runs."""
     return str(job["metadata"]["labels"][JOB_ID_LABEL])
 
 
 def dispatch_of(job: Mapping[str, Any]) -> tuple[int, int]:
-    """Return the number of the start that created a Job, and the number of claims of its job until this start."""
+    """Return `number` and `fence` of the `Dispatch` for which a Kubernetes Job was created."""
     stored = _dispatch(job)
     return int(stored.get("number", 0)), int(stored.get("fence", 0))
 
 
 def project_of(job: Mapping[str, Any]) -> str:
-    """Return the id of the project of a Job; it is empty if an older server started the Job."""
+    """Return the id of the project to which a Kubernetes Job belongs; empty if an older server started the Job."""
     return str(_dispatch(job).get("project", ""))
 
 
@@ -112,7 +119,7 @@ def _dispatch(job: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def places_of(job: Mapping[str, Any]) -> Iterator[PodPlace]:
-    """Yield the job or the tasks that the pods of a Job still run or will run."""
+    """Yield the job or the tasks that the pods of a Kubernetes Job still run or will run."""
     if is_over(job):
         return
     size, ended = _size_of(job), ended_indexes(job)
@@ -123,13 +130,13 @@ def places_of(job: Mapping[str, Any]) -> Iterator[PodPlace]:
 
 
 def pods_of(job: Mapping[str, Any]) -> int:
-    """Return the greatest number of pods that a Job can still run at once."""
+    """Return the greatest number of pods that a Kubernetes Job can still run at the same time."""
     left = sum(1 for _ in places_of(job))
     return min(left, int(job["spec"].get("parallelism", 1)))
 
 
 def is_split(job: Mapping[str, Any]) -> bool:
-    """Return whether each pod of a Job runs a task."""
+    """Return whether a Kubernetes Job runs a parent job, one task in each pod."""
     return _size_of(job) is not None
 
 

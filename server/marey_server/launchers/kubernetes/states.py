@@ -21,7 +21,7 @@ _SIGNALS_FROM = 128
 
 
 def worker_names(job: Document) -> list[str]:
-    """Return the names of the workers that a Job runs."""
+    """Return the names of the workers that a Job runs: one, or for an Indexed Job one for each index."""
     name: str = job["metadata"]["name"]
     if job["spec"].get("completionMode") != "Indexed":
         return [name]
@@ -29,14 +29,14 @@ def worker_names(job: Document) -> list[str]:
 
 
 def worker_of(pod: Document) -> str | None:
-    """Return the name of the worker that a pod of a Job runs."""
+    """Return the name of the worker that a pod of a Job runs; None if the pod belongs to no Job."""
     labels = pod["metadata"].get("labels") or {}
     job, index = labels.get(JOB_LABEL), labels.get(INDEX_LABEL)
     return job if job is None or index is None else f"{job}-{index}"
 
 
 def launched_workers(jobs: Iterable[Document], pods: Iterable[Document]) -> Iterator[LaunchedWorker]:
-    """Yield the workers of Jobs."""
+    """Yield the workers that Jobs run, with their states according to `pods`."""
     pods_of = group_pods(pods)
     for job in jobs:
         labels = json.loads((job["metadata"].get("annotations") or {}).get(LABELS_ANNOTATION, "{}"))
@@ -55,7 +55,7 @@ def group_pods(pods: Iterable[T]) -> dict[str, list[T]]:
 
 
 def _state(job: Document, name: str, pods: Sequence[Document]) -> tuple[WorkerState, datetime | None]:
-    """Return the state of a worker, and the time at which it started to run."""
+    """Return the state of a worker, and the time at which it started to run; None if it has not started."""
     started_at = next((at for pod in reversed(pods) if (at := _started(pod)) is not None), None)
     if has_ended(job, name):
         return "ended", started_at
@@ -73,7 +73,7 @@ def has_ended(job: Document, worker: str) -> bool:
 
 
 def is_over(job: Document) -> bool:
-    """Return whether a Job has ended."""
+    """Return whether a Job has completed or failed."""
     return _condition(job, "Complete") is not None or _condition(job, "Failed") is not None
 
 
@@ -107,7 +107,7 @@ def end_of(job: Document | None, pods: Sequence[Document]) -> WorkerEnd | None:
 
 
 def has_terminated(pod: Document) -> bool:
-    """Return whether a pod has ended."""
+    """Return whether a pod has ended: its container has terminated, or its phase is `Failed`."""
     return _terminated(pod) is not None or pod.get("status", {}).get("phase") == "Failed"
 
 
@@ -139,7 +139,7 @@ def _reason(pod: Document, ended: Document, signal: int) -> tuple[EndReason, str
 
 
 def blocked_reason(pod: Document) -> str | None:
-    """Return why a pod cannot start, such as a missing image or no suitable node, or None."""
+    """Return the reason why a pod cannot start, such as a missing image or no suitable node; None if it can start."""
     waiting = (_container_status(pod).get("state") or {}).get("waiting") or {}
     conditions = pod.get("status", {}).get("conditions") or ()
     unscheduled = (one for one in conditions if one["type"] == "PodScheduled" and one["status"] == "False")
@@ -151,7 +151,10 @@ def blocked_reason(pod: Document) -> str | None:
 
 
 def stuck_jobs(jobs: Mapping[str, Document], pods: Iterable[Document]) -> dict[str, str]:
-    """Return the Jobs that no node runs, by name, with the reason: their pods are blocked, or have not been created."""
+    """Return the reason for each Job that no node runs, by the name of the Job.
+
+    The reason is that the pods of the Job are blocked, or have not been created.
+    """
     pods_of = group_pods(pods)
     found: dict[str, str] = {}
     for name, job in jobs.items():

@@ -43,7 +43,10 @@ class ClusterView:
         self._deleted: deque[str] = deque(maxlen=MOST_DELETED)
 
     async def refresh(self) -> None:
-        """Make sure that the copy is not outdated. Raises `EngineError` if the cluster does not answer."""
+        """Follow the cluster, and list objects again if their copy is too old.
+
+        Raises `EngineError` if the cluster does not answer.
+        """
         if not self._tasks:
             self._tasks = [asyncio.create_task(self._follow(kind)) for kind in KINDS]
         for kind in KINDS:
@@ -51,7 +54,7 @@ class ClusterView:
                 await self._list(kind)
 
     async def list_now(self) -> None:
-        """List all objects. Raises `EngineError`."""
+        """List all Jobs and pods, and replace the copies. Raises `EngineError` if the cluster does not answer."""
         for kind in KINDS:
             await self._list(kind)
 
@@ -66,11 +69,11 @@ class ClusterView:
         return self._objects["pods"]
 
     def put_job(self, job: Manifest) -> None:
-        """Add a Job that was just created; a list that was requested before does not remove it."""
+        """Add a Job that was just created; a list that was requested before its creation does not remove it."""
         self._put("jobs", job["metadata"]["name"], job)
 
     def drop_job(self, name: str) -> None:
-        """Remove a Job that was just deleted; neither a list nor a watch that began before brings it back."""
+        """Remove a Job that was just deleted; no list or watch that began before its deletion adds it again."""
         if (job := self.jobs.get(name)) is not None:
             self._deleted.append(job["metadata"]["uid"])
         self._put("jobs", name, None)
@@ -83,7 +86,7 @@ class ClusterView:
         self._tasks = []
 
     async def _list(self, kind: Kind) -> str:
-        """Replace the copies of a kind by those that the cluster has now; return the version of the list."""
+        """Replace the copies of the objects of a kind by a new list; return the version of the list."""
         with self._noting_changes() as changed:
             listed = await self._cluster.list(kind, self._selector)
         self._objects[kind] = {name: one for name, one in listed.objects.items() if not self._is_deleted(one)}
@@ -94,7 +97,10 @@ class ClusterView:
         return listed.version
 
     async def _follow(self, kind: Kind) -> None:
-        """Keep the copies of a kind current until this task is cancelled; log each failure, and pause after it."""
+        """Keep the copies of one kind of objects up to date until the task is cancelled.
+
+        Log each failure, and pause after it.
+        """
         failures = 0
         while True:
             began = time.monotonic()
@@ -132,7 +138,7 @@ class ClusterView:
 
     @contextmanager
     def _noting_changes(self) -> Iterator[_Changed]:
-        """Collect the changes that arrive while a list is under way."""
+        """Collect the changes that watches report while a list is requested; they are newer than the list."""
         changed: _Changed = []
         self._changing.append(changed)
         try:

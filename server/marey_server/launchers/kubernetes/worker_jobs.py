@@ -23,8 +23,8 @@ REQUESTS_AT_ONCE = 8
 class WorkerJobs:
     """Jobs with certain labels, and their Secrets. All methods raise `EngineError`.
 
-    `token_of` returns the token of the workers of a Job. It must return the same token again for the same Job, because
-    a server may end between the creation of a Job and that of its Secret.
+    `token_of` returns the token of the workers of a Job. It must always return the same token for the same Job: if a
+    server ends after it has created a Job, the next server creates the Secret of the Job.
     """
 
     def __init__(self, options: ClusterOptions, labels: Mapping[str, str], token_of: Callable[[Manifest], str]) -> None:
@@ -37,17 +37,23 @@ class WorkerJobs:
         self._requests = asyncio.Semaphore(REQUESTS_AT_ONCE)
 
     async def refresh(self) -> None:
-        """Make sure that the copies of Jobs and pods are not outdated, and that no Job lacks its Secret."""
+        """Update the copies of Jobs and pods if they are too old, and create missing Secrets of Jobs."""
         await self.view.refresh()
         await self._supply_tokens()
         self._log_blocked()
 
     async def create(self, jobs: Iterable[Manifest]) -> Sequence[Manifest]:
-        """Create Jobs with their Secrets, and return them. Jobs with these names that exist already are returned."""
+        """Create Jobs with their Secrets, and return them.
+
+        A Job whose name exists already is not created, but returned.
+        """
         return await self.all(self._create(job) for job in jobs)
 
     async def create_allowed(self, jobs: Iterable[Manifest]) -> tuple[list[Manifest], dict[str, str]]:
-        """Create Jobs as `create` does; return those that exist now, and by name the reasons for refused Jobs."""
+        """Create Jobs as `create` does, except those that the cluster refuses.
+
+        Return the Jobs that exist now, and the reason for each refused Job by its name.
+        """
         refused: dict[str, str] = {}
 
         async def create(job: Manifest) -> Manifest | None:
@@ -61,7 +67,7 @@ class WorkerJobs:
         return [job for job in made if job is not None], refused
 
     async def delete(self, job: str) -> bool:
-        """Delete a Job with its pods and its Secret; return whether it existed."""
+        """Delete a Job with its pods and its Secret; return whether the Job existed."""
         existed = True
         try:
             await self.cluster.delete_job(job)
@@ -77,7 +83,7 @@ class WorkerJobs:
         await self.cluster.close()
 
     async def all(self, calls: Iterable[Awaitable[T]]) -> Sequence[T]:
-        """Wait for all calls, several at a time, and return their results; raise the first error after all calls."""
+        """Run all calls, several at a time, and return their results; raise the first error after all have ended."""
 
         async def limited(call: Awaitable[T]) -> T:
             async with self._requests:
@@ -96,14 +102,19 @@ class WorkerJobs:
         except ObjectExists:
             made = await self.cluster.read_job(name)
             if not job["metadata"]["labels"].items() <= made["metadata"].get("labels", {}).items():
-                raise ObjectRefused(f"the cluster has another Job with the name {name}") from None
+                raise ObjectRefused(
+                    f"the cluster has another Job with the name {name}; delete it, or set another `instance`"
+                ) from None
         self.view.put_job(made)
         faults.point("dispatch.before_token")
         await self._supply_token(made)
         return made
 
     async def _supply_tokens(self) -> None:
-        """Create the Secrets of Jobs whose server died between the creation of the Job and of its Secret."""
+        """Create missing Secrets of Jobs.
+
+        A server may have died after it created a Job and before it created the Secret.
+        """
         jobs = self.view.jobs
         self._with_token &= jobs.keys()
         waiting = {worker.name for worker in launched_workers(jobs.values(), self.view.pods.values())
@@ -126,7 +137,7 @@ class WorkerJobs:
         self._with_token.add(name)
 
     def _log_blocked(self) -> None:
-        """Log why workers cannot start, such as a missing image; only once for as long as a worker is blocked."""
+        """Log why workers cannot start, such as a missing image; once for each worker until it can start."""
         blocked = {name: reason for pod in self.view.pods.values()
                    if (reason := blocked_reason(pod)) is not None and (name := worker_of(pod)) is not None}  # fmt: skip
         for name, reason in blocked.items():

@@ -61,7 +61,7 @@ class BlobSettings(BaseSettings):
     @classmethod
     def _check_bucket(cls, bucket: str | None, others: ValidationInfo) -> str | None:
         if bucket is None and others.data.get("blobs") == "s3":
-            raise ValueError('blobs = "s3" needs the name of a bucket')
+            raise ValueError('blobs = "s3" needs the name of a bucket in s3_bucket')
         return bucket
 
     @field_validator("s3_endpoint")

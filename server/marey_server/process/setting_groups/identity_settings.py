@@ -106,7 +106,7 @@ class IdentitySettings(BaseSettings):
         if client_id is None and others.data.get("oidc_issuer") is not None:
             raise ValueError("oidc_issuer needs the setting oidc_client_id")
         if client_id is not None and not (client_id and client_id.isascii() and client_id.isprintable()):
-            raise ValueError("the id must consist of printable ASCII characters")
+            raise ValueError("the client id must consist of printable ASCII characters")
         return client_id
 
     @field_validator("oidc_client_secret_file")

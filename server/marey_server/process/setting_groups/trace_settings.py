@@ -57,8 +57,9 @@ class TraceSettings(BaseSettings):
     def open_tracer(self) -> Tracer | None:
         """Return the sender of traces, or None if no collector is configured.
 
-        If traces cannot be sent, for example without the extra, this raises `TracesUnusable` if `traces_endpoint` is
-        set. If only variables of OpenTelemetry are set, which may be meant for other programs, it logs the reason.
+        If traces cannot be sent, for example because the extra `traces` is not installed, the setting `traces_endpoint`
+        decides: if it is set, `TracesUnusable` is raised. If only variables of OpenTelemetry are set, which may be
+        meant for other programs, the reason is logged.
         """
         if self.traces_endpoint is None:
             return open_optional_tracer(SERVICE, os.environ, share=self.traces_share)
