@@ -211,10 +211,11 @@ def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.fl
 
 
 def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float64]) -> None:
-    """Add the offsets to the values of position channels below the root that contain displacements from the offsets.
+    """Convert displacements in the position channels below the root to positions, by adding the offsets in place.
 
-    Some exporters write displacements. They are detected by their size: for most joints, the values stay within a tenth
-    of the bone's length from zero. If such values were positions, every bone would have nearly no length.
+    Some exporters write the displacement of a joint from its OFFSET instead of its position. The values of a file are
+    displacements if, for most joints, they stay within a tenth of the bone's length from zero. As positions, such
+    values would give bones nearly no length. Other values are left unchanged.
     """
     offsets = source.offsets[list(source.translated_joints)]
     lengths = np.linalg.norm(offsets, axis=1)

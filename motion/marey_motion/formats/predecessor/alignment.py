@@ -102,7 +102,7 @@ def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[
     Parameters
     ----------
     time_function : (N,) float64    source frame of each canonical frame
-    sections : sequence of (int, int)    canonical frames [start, end) of each
+    sections : sequence of (int, int)    canonical frames [start, end) of each section
 
     Returns
     -------

@@ -56,7 +56,7 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
 
 
 def decode_content(data: bytes, file: str) -> dict[str, Any] | list[Any]:
-    """Decode a file like `decode_document`, but accept a JSON list as well as a document.
+    """Decode a document, or a list in JSON; nothing larger than `MOST_UNPACKED_BYTES` is unpacked.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def decode_content(data: bytes, file: str) -> dict[str, Any] | list[Any]:
 
     Raises
     ------
-    FormatError    if the bytes are in none of the three encodings or contain neither
+    FormatError    if the bytes are in none of the three encodings, or contain neither a document nor a list
     """
     if data.startswith(_BZ2_MARK):
         data = _decompressed(data, file)
@@ -100,5 +100,5 @@ def _decompressed(data: bytes, file: str) -> bytes:
     if len(document) > MOST_UNPACKED_BYTES:
         raise FormatLimit(f"the document unpacks to more than {MOST_UNPACKED_BYTES} bytes", file=file)
     if not decompressor.eof:
-        raise FormatError("the bz2 data is cut off", code="file-truncated", file=file)
+        raise FormatError("the bz2 data is cut off; copy or export the file again", code="file-truncated", file=file)
     return document

@@ -32,8 +32,8 @@ def write_predecessor_model(
 ) -> bytes:
     """Write a primitive.
 
-    A primitive without components gets one that changes nothing, because the predecessor's reader rejects a mixture of
-    no dimensions.
+    A primitive without components gets a component of zeros, because the predecessor's reader rejects a mixture with
+    zero dimensions.
 
     Parameters
     ----------

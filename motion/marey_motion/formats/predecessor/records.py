@@ -119,7 +119,7 @@ def _secrets_of(value: Mapping[str, Any]) -> set[str]:
 
 
 def _is_secret(value: Any) -> bool:
-    """Return whether a value contains a credential: in a text, or in a list as a text or after its name."""
+    """Return whether a text contains a credential, or a list contains one, either in a text or after its name."""
     if isinstance(value, str):
         return tells_credential(value)
     if not isinstance(value, list):

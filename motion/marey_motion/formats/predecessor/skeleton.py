@@ -94,11 +94,13 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
     for node in document["jointDescs"]:
         name = field_of(node, "name", str, file)
         if name in listed:
-            raise FormatError("jointDescs contains the joint twice", file=file, joint=name)
+            raise FormatError("jointDescs contains this joint twice; remove one entry", file=file, joint=name)
         listed[name] = node
         for child in text_list(node, "children", file):
             if child in parents:
-                raise FormatError("two joints list this joint as their child", file=file, joint=child)
+                raise FormatError(
+                    "two joints list this joint as their child; remove it from one of them", file=file, joint=child
+                )
             parents[child] = name
     unknown = next((child for child in parents if child not in listed), None)
     roots = [name for name in listed if name not in parents]
@@ -112,7 +114,7 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
         nodes.append((name, parents.get(name), listed[name]))
         waiting.extend(reversed(text_list(listed[name], "children", file)))
     if len(nodes) != len(listed):
-        raise FormatError("the joints are not a tree: some are not connected to the root", file=file)
+        raise FormatError("the joints are not a tree: some joints are not connected to the root", file=file)
     return nodes
 
 

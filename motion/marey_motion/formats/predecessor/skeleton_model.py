@@ -1,9 +1,9 @@
 """Skeleton models of Marey's predecessor: standard joints, and anatomical axes of joints.
 
 A document is `{"joints": {standard joint: joint or null}, "cos_map": {joint: {"x": swing or null, "y": twist or null}},
-...}`, often inside `{"name", "model"}`. Its names of standard joints are those of Marey, and its axes are directions in
-the joint's local frame, too. Other members, such as limits of joints and shapes of feet, have no counterpart in Marey;
-they are stored unchanged.
+...}`, often inside `{"name", "model"}`. The names of the standard joints are the same as in Marey. An axis is a
+direction in the joint's local frame, as in Marey. Other members, such as joint limits and foot shapes, have no
+counterpart in Marey; they are stored unchanged.
 """
 
 from __future__ import annotations

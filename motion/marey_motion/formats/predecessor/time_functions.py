@@ -103,12 +103,11 @@ def as_log_slopes(
 
 
 def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variances: Floats) -> FunctionalComponents:
-    """Make components from the change of the coefficients for each unit of each score.
+    """Make functional components from their directions: the change of the spline coefficients per unit of each score.
 
-    The pseudo-inverse of these changes gives the projections, which compute scores from coefficients.
-
-    The variance that the components do not explain is unknown. Therefore, `energy` contains cumulative shares not of
-    the total variance, but of the variance that all components explain together.
+    The projections, which compute scores from coefficients, are the pseudo-inverse of the directions. The variance
+    that the components do not explain is unknown. Therefore, `energy` contains cumulative shares of the variance that
+    all components explain together, not of the total variance.
 
     Parameters
     ----------
@@ -178,8 +177,8 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
 def _written_count(primitive: MotionPrimitive) -> int:
     """Return the number of spline coefficients of a written time function: one for each canonical frame, if possible.
 
-    With fewer coefficients, such as the eight that the predecessor's training uses, its two forms and Marey's form
-    represent different functions, and a time function would be up to a tenth of a frame off.
+    The predecessor's training uses eight coefficients. With so few coefficients, the two forms of the predecessor and
+    the form of Marey represent different functions, and a time function would be up to a tenth of a frame off.
     """
     return max(DEGREE + 1, min(KNOTS_AT_MOST, primitive.frame_count))
 

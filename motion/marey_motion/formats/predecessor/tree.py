@@ -168,7 +168,7 @@ def _held(node: Node, place: str, count: int, file: str) -> Ints:
     """Read the samples of a node; `place` is its path from the root, `count` the number of samples in the document."""
     held = number_array(field_of(node, "indices", list, file), file, f"{place}: indices")
     if held.ndim != 1 or not len(held) or (held != np.floor(held)).any():
-        raise FormatError(f"{place}: the field `indices` must contain at least one sample", file=file)
+        raise FormatError(f"{place}: the field `indices` must list at least one sample, by whole numbers", file=file)
     if held.min() < 0 or held.max() >= count:
         raise FormatError(f"{place}: each number in the field `indices` must be from 0 to {count - 1}", file=file)
     return held.astype(np.int64)
