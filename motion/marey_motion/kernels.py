@@ -28,7 +28,8 @@ contracted_inlined = _options(forceinline=True, fastmath={"contract"})
 def product(a, b):
     """Return the rotation that applies `b`, then `a`.
 
-    The function is inlined before types are inferred, so that the caller's rules of arithmetic apply to the function.
+    The function is inlined before types are inferred, so that the caller's options for floating-point arithmetic, such
+    as fused multiply-add, also apply to this function.
     """
     return (
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],

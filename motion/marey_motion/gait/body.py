@@ -53,7 +53,7 @@ class GaitMoments:
         Parameters
         ----------
         values : (n,)    any unit
-        window_s : float    seconds before and after
+        window_s : float    half of the window: seconds before and after each point in time
 
         Returns
         -------
@@ -75,7 +75,7 @@ class GaitMoments:
         Parameters
         ----------
         limits : (n,)    any unit
-        window_s : float    seconds before and after
+        window_s : float    half of both windows: seconds before and after each point in time
 
         Returns
         -------
@@ -237,7 +237,11 @@ def _bend_leg(
 
 
 def _pose_trunk(style: GaitStyle, moments: GaitMoments, rotations: dict[str, AnyFloats]) -> None:
-    """Pose the trunk: it leans into speed and turns, the shoulders swing against the legs, the head looks ahead."""
+    """Pose trunk, neck and head, and add their rotations in the world to `rotations`.
+
+    The trunk leans forward or backward with the speed in this direction, and to the inner side of turns. The shoulders
+    turn against the legs, and the head faces ahead.
+    """
     root = moments.root
     forward = moments.settled(root.speeds * np.cos(root.travel_angles))
     bank = style.lean * moments.settled(styles.bank_rad(root.speeds, root.turn_rates))
@@ -257,7 +261,7 @@ def _pose_trunk(style: GaitStyle, moments: GaitMoments, rotations: dict[str, Any
 
 
 def _pose_arm(style: GaitStyle, moments: GaitMoments, side: str, sign: int, rotations: dict[str, AnyFloats]) -> None:
-    """Pose an arm that swings against the leg; the elbow bends with speed."""
+    """Pose an arm that swings opposite to the leg of its side; at higher speeds, the elbow is bent more."""
     speeds = moments.settled(moments.root.speeds)
     swing = style.arm_swing * sign * np.sin(2.0 * np.pi * moments.phases)
     angle = swing * styles.blended(0.38 * eased(speeds / 1.4), 0.55, speeds) - styles.blended(0.04, 0.10, speeds)

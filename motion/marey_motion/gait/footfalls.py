@@ -248,7 +248,7 @@ class Footfalls:
 
     @cached_property
     def _leaving_pitch_rates(self) -> AnyFloats:
-        """Pitch rate at the end of the push-off of each stance, radians per second."""
+        """Pitch rate of the foot in radians per second, when it leaves the floor after each stance."""
         return np.asarray(self._leaving_pitches / ((1.0 - PUSH_OFF_START) * (self.leaves_s - self.strikes_s)))
 
     def _standing(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:

@@ -76,7 +76,7 @@ SKATE_SPEED_M_S = 0.6
 IN_PLACE_FOOT_SPEED_M_S = 0.4
 TELEPORT_SPEED_M_S = 15.0
 REST_JUMP_M_S = 8.0
-"""Speed of the fastest point of the body above which a step between rest pose and motion is a jump."""
+"""Speed in metres per second: if a point of the body is faster between rest pose and motion, the body jumps there."""
 JUMP_RAD = np.radians(60.0)
 # Cosine of half an angle a little smaller, beyond any rounding of the one that is compared.
 _SURELY_NO_JUMP = np.cos(JUMP_RAD / 2) + 1e-3

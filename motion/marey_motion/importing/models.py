@@ -49,7 +49,7 @@ _NEEDED: dict[str, str] = {
     "skeleton model": "a skeleton model must be imported together with its skeleton, and be called like it: for "
     "example, body_skeleton_model.json needs body_skeleton.json or body.skeleton",
 }
-"""Error for a file that can only be read together with another file, by the subject of the file."""
+"""Error message, by kind of content, for a file that was imported without the motion or skeleton that it belongs to."""
 
 
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:

@@ -87,7 +87,7 @@ def _as_json(rest: Mapping[str, Any], file: str) -> Tree:
 
 
 def _mapping_of(model: PredecessorSkeletonModel, guessed: Tree) -> Tree:
-    """Return the members of a document `mapping` that a skeleton model replaces.
+    """Return the members of a document `mapping` that replace those guessed from the skeleton.
 
     If the model contains only one of the two axes of a joint (twist and swing), the second axis is computed from the
     guessed axis: its component perpendicular to the first axis.
@@ -185,7 +185,8 @@ def motion_content(file: FileToImport, imported: ImportedMotion, motion: Tree) -
 
     Returns
     -------
-    str or None    the digest; None if the format is another one, or if frames, floor, unit, axes or rate were changed
+    str or None    the digest; None if the file has another format, if the import dropped frames or moved the floor, or
+        if the options set the unit, an axis or the frame rate
     """
     options, source = file.options, imported.source
     unchanged = source.format == FORMAT and source.trimmed_frames == (0, 0) and source.floor_shift_m == 0.0

@@ -96,8 +96,8 @@ def infer_conversion(
 
     Raises
     ------
-    AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
-    ContradictedOption    when the body clearly contradicts a given unit or axis
+    AmbiguousUnits    if the body does not determine the unit or axis; the error names the option to set, and candidates
+    ContradictedOption    if the body clearly contradicts a given unit or axis
     """
     body = measure_body(source, anatomy, file)
     up_axis = choose_up_axis(source, body, options, sibling_axis)
@@ -127,8 +127,9 @@ def _choose_unit(source: SourceMotion, body: BodyMeasures, options: ImportOption
             return stated
     if body.leg is None:
         raise AmbiguousUnits(
-            "the unit of length is not clear, because no two legs were found whose length could be measured; "
-            "set the unit with --unit (unit), such as cm, or with --unit-scale-m (unit_scale_m), in metres",
+            "the unit of length is not clear: the file does not state it, and the skeleton has no two legs whose "
+            "length could be measured; set the unit with --unit (unit), such as cm, or with --unit-scale-m "
+            "(unit_scale_m), in metres",
             file=body.file,
         )
     return _unit_of_leg(body, hip_height, up_axis, stated)

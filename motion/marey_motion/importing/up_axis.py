@@ -58,8 +58,8 @@ def choose_up_axis(
 
     Raises
     ------
-    AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
-    ContradictedOption    when the body clearly stands along another axis than the given one
+    AmbiguousUnits    if the body does not determine the axis; the error names the option to set, and candidates
+    ContradictedOption    if the body clearly stands along another axis than the given one
     """
     if options.up_axis is not None:
         _compare_with_body(options.up_axis, body, trusted=options.trust_options)
@@ -171,12 +171,11 @@ def _compare_with_body(given: UpAxis, body: BodyMeasures, *, trusted: bool) -> N
 
 
 def _settle_up_axis(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
-    """Choose the upward axis if the body is not upright along y.
-
-    The body may lie or climb, or another axis may point up.
+    """Choose the upward axis of a body that is not upright along y: it lies or climbs, or another axis points up.
 
     `axis` is the axis nearest to the direction from feet to head, and `cosine` is the cosine of the angle between this
-    axis and the direction. `flat` is the result of `_flat_axis`.
+    axis and the direction. `flat` is the axis along which the lowest point of the body hardly moves, with the evidence
+    in words; None if there is no such axis.
     """
     rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
     told = _told((axis, cosine), (rest_axis, rest_cosine))

@@ -67,8 +67,8 @@ class ControllerConstants(NamedTuple):
 
     Parameters
     ----------
-    follow : constant of `controller_kernels`, which says whether the path is followed by time, by position or in open
-        loop
+    follow : number that selects how the path is followed: by time, by position or in open loop (constants in
+        `controller_kernels`)
     by_distance : whether poses are compared by the distances between their joints instead of by their features
     period : number of ticks from one search to the next
     window : number of rows on each side of the displayed row that a search may not choose
@@ -77,7 +77,7 @@ class ControllerConstants(NamedTuple):
     blends_root : whether the velocity of the root is blended at a switch
     decay : (2, 2) matrix that advances an offset of the root's velocity, and the offset's change per second, by one
         tick
-    holds : whether the root is pulled to the desired path
+    holds : whether the root is pulled towards the desired path
     pull, clamp_m : share of the distance from the path that each tick removes, and largest distance that may remain
     tick_s : duration of a tick
     """

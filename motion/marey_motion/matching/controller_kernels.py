@@ -263,9 +263,9 @@ def _advance(playback, rules, row, offsets, root):
 
 @compiled
 def _hold(rules, wish, when, root):
-    """Pull `root` (x, z, heading) towards a place on the desired path, and limit its distance from this place.
+    """Pull `root` (x, z, heading) towards the place and heading of the desired path at the time `when`, in ticks.
 
-    The path reaches this place after `when` ticks. The limit is `rules.clamp_m`, in metres.
+    Afterwards, the distance of the root from this place is limited to `rules.clamp_m`, in metres.
     """
     x, z, heading = _wished(wish, when)
     turn = heading - root[2]

@@ -183,7 +183,7 @@ def extract_features(
 
     Returns
     -------
-    (F, D) float64    metres and metres per second in the frame of each frame's root
+    (F, D) float64    metres and metres per second, relative to the root in the same frame of the motion
     """
     features = np.empty((len(positions), layout.dimension_count))
     for group in layout.groups:

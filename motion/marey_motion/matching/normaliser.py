@@ -72,7 +72,7 @@ class Normaliser:
 
         Raises
         ------
-        MotionError    if the dimensions differ
+        MotionError    if the number or the names of the dimensions differ
         """
         if len(self.offset) != layout.dimension_count:
             raise MotionError(

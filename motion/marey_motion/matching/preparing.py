@@ -137,9 +137,10 @@ def _wanted_frames(
 
 
 def _moves(clip: Clip, skeleton: Skeleton) -> bool:
-    """Return whether the poses of a clip fit `skeleton`, because the clip's own skeleton has the same joints.
+    """Return whether the poses of a clip are also poses of `skeleton`.
 
-    End sites may differ, and so may the offsets of the root and of joints whose translations the clip contains.
+    The skeletons must be equal, except in end sites and in the offsets of the root and of joints whose translations
+    the clip contains.
     """
     own = clip.skeleton
     if own is skeleton:

@@ -231,8 +231,8 @@ def nearest(index, query, warm_row, skip_start, skip_stop):
 
     Returns the row and its cost, or (-1, inf) if there is none.
 
-    Of several nearest rows, the lowest is returned. `warm_row` is a row likely to be near, or -1: it changes the time
-    taken, not the answer.
+    Of several nearest rows, the row with the lowest number is returned. `warm_row` is a row that is likely to be near,
+    or -1; it changes only the time of the search, not its result.
     """
     return _nearest(index, query, np.ones(query.shape[0]), warm_row, skip_start, skip_stop)
 
