@@ -195,7 +195,7 @@ def channel_weights(
     ----------
     aligned : AlignedSet    the examples
     basis : SplineBasis    splines with n coefficients
-    poses : (m, N, D) float64    poses; their quaternions have consistent signs
+    poses : (m, N, D) float64    poses of D = 3 + 4·J channels; their quaternions have consistent signs
     coefficients : (m, n, D) float64    coefficients of the poses
     keep : Keep    number of components
     options : ModelOptions    options
@@ -239,17 +239,20 @@ def _assemble(
 
 
 def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
-    """Compute the allowed range of durations of samples: a fifth beyond the range of the examples at both ends."""
+    """Compute the shortest and the longest duration of samples in seconds.
+
+    The range is that of the examples, extended by a fifth at both ends.
+    """
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     return float(durations.min()) * (1.0 - DURATION_MARGIN), float(durations.max()) * (1.0 + DURATION_MARGIN)
 
 
 def _log_slope_range(aligned: AlignedSet, temporal: PrincipalExamples) -> tuple[float, float]:
-    """Compute the range to which the logarithms of time steps are clipped in motions of the model.
+    """Compute the least and the greatest logarithm of a time step in motions of the model.
 
-    The range covers the time steps of the examples and of the examples rebuilt from the kept components, and is
-    extended by `LOG_SLOPE_MARGIN` at both ends. Clipping therefore changes no rebuilt example. The range never exceeds
-    ±`MOST_LOG_SLOPE`.
+    A time step is the number of real frames from one canonical frame to the next. The range contains the time steps of
+    the examples, and of the examples rebuilt from the kept components. It is extended by `LOG_SLOPE_MARGIN` at both
+    ends, but never beyond ±`MOST_LOG_SLOPE`.
     """
     functions = temporal.functions
     rebuilt = functions.basis.at_frames @ functions.coefficients(_kept_scores(temporal))[..., 0].T

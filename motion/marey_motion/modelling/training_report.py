@@ -129,7 +129,7 @@ def report_on(
     ----------
     primitive : MotionPrimitive    the model
     aligned : AlignedSet    m examples
-    poses : (m, N, D) float64    poses of the examples; their quaternions have consistent signs
+    poses : (m, N, 3 + 4·J) float64    poses of the examples; their quaternions have consistent signs
     spatial, temporal : PrincipalExamples    all components of the examples, also those that the model does not keep
     latents : (m, L) float64    latent vectors of the examples
     fitted : FittedMixture    mixture and candidates

@@ -58,7 +58,8 @@ class ClipDistances:
     Parameters
     ----------
     totals : (N, N) float64    perceptual distances, symmetric, 0 on the diagonal
-    by_component : (C, N, N) float64    distances by each component of the metric alone, not multiplied by its share
+    by_component : (C, N, N) float64    distances by each of the C components of the metric alone, before the
+        multiplication by the component's share in the total
     """
 
     totals: Floats
@@ -209,7 +210,8 @@ def compare_pairs(
 
     Returns
     -------
-    (R, 1 + C) float64    distance of each pair, and its distances by each component alone, not multiplied by its share
+    (R, 1 + C) float64    total distance of each pair, then its distance by each component alone, before the
+        multiplication by the component's share in the total
 
     Raises
     ------
@@ -239,8 +241,8 @@ def _distance(clips: Mapping[int, MeasuredClip], metric: PerceptualMetric, pair:
         if error.code != "alignment-impossible":
             raise
         raise MotionError(
-            f"clips {pair[0] + 1} and {pair[1] + 1} have {one.frame_count} and {other.frame_count} frames, and the "
-            "moments of clips whose lengths differ so much cannot be matched; compare loops of one cycle, or cut the "
-            "longer clip",
+            f"clips {pair[0] + 1} and {pair[1] + 1} have {one.frame_count} and {other.frame_count} frames; the frames "
+            "of clips whose lengths differ so much cannot be matched; compare loops of one cycle, or cut the longer "
+            "clip",
             code="lengths-differ",
         ) from error

@@ -96,7 +96,8 @@ def fit_component(
     perceived : (R,) float64    perceived difference of each pair; pairs with NaN are left out
     shaping : str    the shaping F
     exponent : float    exponent of the shaping `power`
-    weights : (R,) float64, optional    weights of the pairs in the sum of squares, such as shown / (p (1 - p))
+    weights : (R,) float64, optional    weights of the pairs in the sum of squares, such as the inverse variances of the
+        perceived differences; 1 if None
 
     Returns
     -------

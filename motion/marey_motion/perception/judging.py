@@ -16,7 +16,10 @@ from marey_schemas.documents.studies import SHOWN
 
 TRIALS = 63
 LEAST_REPEATS = 30
-"""Least number of repeated answers (those after the first about each pair), which give the noise within a quarter."""
+"""Least number of repeated answers from which the noise can be estimated to within a quarter.
+
+An answer about a pair of motions is repeated if the pair was shown before.
+"""
 _CANDIDATE_DRAWS = 24
 _FIRST, _SECOND = np.triu_indices(SHOWN, 1)
 _PAIR_OF = {(int(one), int(other)): pair for pair, (one, other) in enumerate(zip(_FIRST, _SECOND, strict=True))}
@@ -125,7 +128,7 @@ def draw_trials(
     """Draw the motions of a study's trials so that all motions, and all pairs, are shown about equally often.
 
     The numbers of times that a participant sees each motion differ by at most one. For each participant, several draws
-    are made. The draw is kept with which the counts of all pairs, over the participants so far, differ least.
+    are made; the kept draw is the one with which the counts of all pairs differ least over the participants so far.
 
     Parameters
     ----------

@@ -125,7 +125,7 @@ class StudyAnalysis:
 
 
 def measure_pairs(clips: Sequence[MeasuredClip], progress: Progress) -> list[PairDifferences]:
-    """Measure the differences of the joint classes of all pairs of clips along their registration curves.
+    """Measure, for all pairs of clips, the differences of each joint class along the pair's registration curve.
 
     Parameters
     ----------

@@ -92,8 +92,9 @@ class ClipQuality:
     ----------
     values : value of each measure of `marey_schemas.documents.quality.MEASURES`; None if it is undefined
     frames : number of measured frames
-    speed_seconds, turn_seconds : (bins,) float64    seconds of one-second windows (1 / rate for each) by bins of speed
-        and of turn rate; their sum is about a second less than the clip, and 0 for a clip of a second or less
+    speed_seconds, turn_seconds : (bins,) float64    seconds of motion in each bin of speed and of turn rate. Both are
+        measured over windows of one second, each of which counts 1 / rate seconds. The sum over the bins is therefore
+        about one second less than the clip, and 0 for a clip of one second or less
     """
 
     values: Mapping[str, float | None]

@@ -72,7 +72,10 @@ def _add_shaped(x, weight, shaping, exponent, raw):
 
 @contracted_inlined
 def _add_constant(constant, always, raw, total):
-    """Add the distances by a component, raw (n,) and the constant, to total (n,)."""
+    """Add the distances by a component to total (n,): raw (n,) plus the constant of the component.
+
+    Where raw is 0, the constant is added only if `always` is true.
+    """
     for j in range(raw.shape[0]):
         total[j] += raw[j] + (constant if always or raw[j] > np.float32(0.0) else np.float32(0.0))
 
