@@ -36,8 +36,9 @@ class MergeConflict(NamedTuple):
     clash: AnnotationClash | None = None
     """The reason why an annotation could not be merged segment by segment."""
     no_way_back: str | None = None
-    """Path to which an entry would have to return, but at which another entry is. Set only if a resolution has decided
-    the conflict; the conflict remains, because the entry would be lost.
+    """Path to which one of two entries would return after a resolution, but at which there is another entry; else None.
+
+    In this case, the conflict remains in spite of the resolution, because the first entry would be lost.
     """
 
     @property
@@ -166,7 +167,7 @@ class _Decided(NamedTuple):
         return self.merged
 
     def place_beside(self, key: str) -> str | None:
-        """Return the path to which this entry returns if another entry gets `key`, or None if there is no such path.
+        """Return the earlier path of this entry, for the case that another entry gets `key`; None without such a path.
 
         This is the path of the entry on our side. If our side does not have the entry, or has it at `key`, it is the
         path in the base.
@@ -257,10 +258,10 @@ def _decide(sides: _Sides, choices: Choices) -> _Decided | MergeConflict:
 
 
 def _apply(decided: Sequence[_Decided], mine: Iterable[ComparedEntry], choices: Choices, merged: MergedEntries) -> None:
-    """Add changes of our tree to `merged`; if another entry already has the new key of an entry, add a conflict.
+    """Add the changes of our tree to `merged`, and a conflict for each key that two entries should get.
 
-    If two entries should get the same key, and this cannot be resolved, a conflict is added. `mine` contains the
-    entries that our side has changed.
+    A resolution in `choices` can decide which of the two entries gets the key; then no conflict is added. `mine`
+    contains the entries that our side has changed.
     """
     held = {one.after.key: _Decided(one.before, one.after, one.before, one.after) for one in mine if one.after}
     for one in decided:
@@ -312,11 +313,12 @@ def _collide(one: _Decided, held: dict[str, _Decided], choices: Choices) -> Merg
 
 
 def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None) -> tuple[str, ...]:
-    """Return the parts that both sides have changed in different ways.
+    """Return the names of the parts that both sides have changed in different ways.
 
-    If a part is computed from another part, the two count as one. If one side has changed the first part and the other
-    side the second part, both parts are returned. For example, our sample tree does not fit the model of their side.
-    Then everything else that was computed from the model is returned, too, because it must come from the same side.
+    A part and a part that is computed from it, such as a model and its sample tree, count as one part: if one side has
+    changed the model and the other side the tree, both names are returned, because our tree would not fit their model.
+    All other changed parts that are computed from a returned part are also returned, since they must come from the same
+    side.
     """
     if ours is None or theirs is None:
         return ("entry",)
