@@ -168,7 +168,8 @@ def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
     joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
     if not any({f"{side}_{joint}" for side in SIDES} <= joints.keys() for joint in ("hip", "shoulder")):
         raise MappingError(
-            "the mapping needs both hips or both shoulders, from which axes are computed", where="left_hip"
+            "the axes are computed from both hips or both shoulders; add one of these pairs to the mapping",
+            where="left_hip",
         )
     return _PosedBody(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
 
@@ -176,7 +177,7 @@ def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
 def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _PosedBody:
     if not same_hierarchy(skeleton, motion.skeleton):
         raise ClipError(
-            "the skeleton of this motion differs from the skeleton whose axes are computed; use a motion of the latter",
+            "the motion has another skeleton than the one whose axes are computed; use a motion of that skeleton",
             where="motion",
         )
     count = min(motion.frame_count, FRAMES_READ)
@@ -242,7 +243,8 @@ class _PosedBody:
         levels = [level for level in map(self._level, _LEVELS) if level is not None]
         if len(levels) < 2:
             raise MappingError(
-                "the mapping needs the hips and a joint above or below them, from which axes are computed",
+                "the upward direction is computed from joints at two of three heights: spine, neck, head or shoulders; "
+                "pelvis or hips; knees or ankles; add the missing joints to the mapping",
                 where="pelvis",
             )
         trunk = levels[0] - levels[1]
