@@ -24,7 +24,7 @@ ratios stay finite.
 
 
 class Point(NamedTuple):
-    """Field of a setting: its summary, and the number of each counted run."""
+    """Values of one field in one setting: index of the setting, summary, and the number of each counted run."""
 
     setting: int
     summary: FieldSummary
@@ -42,7 +42,7 @@ class ComparedSubject:
 
     Parameters
     ----------
-    comparison : the comparison as the server answered it
+    comparison : the comparison, as the server returns it
     log : whether axes of fields with positive values are logarithmic
     """
 

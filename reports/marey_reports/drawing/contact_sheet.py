@@ -153,7 +153,10 @@ def _head_centre(body: StickFigure, bones: AnyFloats) -> AnyFloats:
 
 
 def _arrow_tip(camera: Camera, facing: AnyFloats, spot_m: float) -> AnyFloats:
-    """Return where the camera sees the tips of arrows in facing directions (..., 2), (..., 3) in metres."""
+    """Return the tips (..., 3) of the arrows in the facing directions (..., 2), as the camera sees them, in metres.
+
+    `spot_m` is the radius of the patch of floor under the body; the arrows end a little outside it.
+    """
     ahead = np.stack((facing[..., 0], np.zeros_like(facing[..., 0]), facing[..., 1]), axis=-1)
     return camera.seen(1.15 * spot_m * ahead)
 

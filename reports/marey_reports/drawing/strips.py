@@ -154,7 +154,7 @@ class PoseRow:
     label, note : texts to the left of the row
     poses : one frame of the motion for each moment
     ghost : one frame of another motion for each moment, drawn in grey behind the poses
-    headings_rad : (T,) headings to which the poses are turned, about +Y, 0 for +z; None: the poses are not turned
+    headings_rad : (T,) headings to which the poses are turned, about +Y, 0 for +z; if None, poses are not turned
     """
 
     label: str
@@ -174,7 +174,7 @@ def draw_pose_rows(
     Parameters
     ----------
     names, labels : two texts for each of the T columns, written below the column
-    ghost : name of the ghosts in the legend; empty: there are none
+    ghost : name of the ghosts in the legend; empty if there are none
     about : text above the rows
     """
     body = body_of(rows[0].poses[0].skeleton)
