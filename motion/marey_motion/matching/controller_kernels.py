@@ -53,7 +53,7 @@ def _outward(heading, left, forward):
 
 
 @compiled
-def _wished(wish, when):
+def _desired_root(wish, when):
     """Compute x, z and heading of the desired path at `when` ticks.
 
     After its end, the path continues with its last speed and turn rate.
@@ -80,12 +80,12 @@ def _progress(wish, when, x, z):
     window = int(PATH_WINDOW_S / wish.tick_s)
     best, best_square = 0, np.inf
     for tick in range(max(0, int(when) - window), int(when) + window + 1):
-        path_x, path_z, _ = _wished(wish, float(tick))
+        path_x, path_z, _ = _desired_root(wish, float(tick))
         square = (path_x - x) ** 2 + (path_z - z) ** 2
         if square < best_square:
             best, best_square = tick, square
-    here_x, here_z, _ = _wished(wish, float(best))
-    next_x, next_z, _ = _wished(wish, best + 1.0)
+    here_x, here_z, _ = _desired_root(wish, float(best))
+    next_x, next_z, _ = _desired_root(wish, best + 1.0)
     step_x, step_z = next_x - here_x, next_z - here_z
     square = step_x * step_x + step_z * step_z
     if square == 0.0:
@@ -133,7 +133,7 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):
         if rules.follow == OPEN_LOOP:
             left, forward, turn = _arc(wish.speeds[now], wish.turn_rates[now], playback.horizons_s[h])
         else:
-            path_x, path_z, path_heading = _wished(wish, when + playback.horizons_ticks[h])
+            path_x, path_z, path_heading = _desired_root(wish, when + playback.horizons_ticks[h])
             left = (path_x - x) * cosine - (path_z - z) * sine
             forward = (path_x - x) * sine + (path_z - z) * cosine
             turn = path_heading - heading
@@ -267,7 +267,7 @@ def _hold(rules, wish, when, root):
 
     Afterwards, the distance of the root from this place is limited to `rules.clamp_m`, in metres.
     """
-    x, z, heading = _wished(wish, when)
+    x, z, heading = _desired_root(wish, when)
     turn = heading - root[2]
     root[0] += rules.pull * (x - root[0])
     root[1] += rules.pull * (z - root[1])
@@ -322,5 +322,5 @@ def run(index, playback, wish, rules, skipped, record):
         when = _moment(rules, wish, when, tick + 1, root[0], root[1])
         if rules.holds:
             _hold(rules, wish, when, root)
-            # What is wished next is seen from where the character was put.
+            # The next desired positions are relative to the place to which the character was moved.
             when = _moment(rules, wish, before, tick + 1, root[0], root[1])
