@@ -262,7 +262,7 @@ def _advance(playback, rules, row, offsets, root):
 
 
 @compiled
-def _hold(rules, wish, when, root):
+def _pull_to_path(rules, wish, when, root):
     """Pull `root` (x, z, heading) towards the place and heading of the desired path at the time `when`, in ticks.
 
     Afterwards, the distance of the root from this place is limited to `rules.clamp_m`, in metres.
@@ -321,6 +321,6 @@ def run(index, playback, wish, rules, skipped, record):
         row, before = following, when
         when = _moment(rules, wish, when, tick + 1, root[0], root[1])
         if rules.holds:
-            _hold(rules, wish, when, root)
+            _pull_to_path(rules, wish, when, root)
             # The next desired positions are relative to the place to which the character was moved.
             when = _moment(rules, wish, before, tick + 1, root[0], root[1])
