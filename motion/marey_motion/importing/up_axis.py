@@ -96,8 +96,8 @@ def _infer_up_axis(body: BodyMeasures, sibling_axis: UpAxis | None) -> UpAxis:
         body.axis_is_clear = True
         return "y"
     if sibling_axis is not None:
-        told = _told(standing, resting)
-        body.evidence.append(f"up axis {sibling_axis}: other files with this skeleton have it; {told}")
+        observed = _observed_axes(standing, resting)
+        body.evidence.append(f"up axis {sibling_axis}: other files with this skeleton have it; {observed}")
         return sibling_axis
     if is_person:
         axis = _axis_of_person(body, standing, resting, flat, on_fours=on_fours)
@@ -139,10 +139,10 @@ def _axis_of_person(
         votes[standing[0]] += _UPRIGHT_VOTE
     best, *others = sorted(votes, key=lambda axis: -votes[axis])
     borne = f"; the ground through the origin bears the body along {' and '.join(ground)}" if ground else ""
-    told = _told(standing, resting) + borne + ("" if flat is None else f"; {flat[1]}")
+    observed = _observed_axes(standing, resting) + borne + ("" if flat is None else f"; {flat[1]}")
     if others and votes[best] - votes[others[0]] < _CLEAR_LEAD:
-        raise _unclear_axis(body, told, standing, resting)
-    body.evidence.append(f"up axis {best}: the joints have the names of a known rig; {told}")
+        raise _unclear_axis(body, observed, standing, resting)
+    body.evidence.append(f"up axis {best}: the joints have the names of a known rig; {observed}")
     return best
 
 
@@ -178,23 +178,23 @@ def _settle_up_axis(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple
     in words; None if there is no such axis.
     """
     rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
-    told = _told((axis, cosine), (rest_axis, rest_cosine))
+    observed = _observed_axes((axis, cosine), (rest_axis, rest_cosine))
     agreed = rest_axis == axis and cosine + rest_cosine >= _AGREEING_COSINES
     if agreed and (flat is None or flat[0] == axis or min(cosine, rest_cosine) >= _CLEAR_COSINE):
-        body.evidence.append(f"up axis {axis}: {told}")
+        body.evidence.append(f"up axis {axis}: {observed}")
         return axis
     if flat is not None:
-        body.evidence.append(f"up axis {flat[0]}: {flat[1]}; {told}")
+        body.evidence.append(f"up axis {flat[0]}: {flat[1]}; {observed}")
         return flat[0]
     if cosine >= _CLEAR_COSINE:
         grounded = [candidate for candidate in (axis, rest_axis) if _stands_on_origin(body, candidate)]
         if len(set(grounded)) == 1:
-            body.evidence.append(f"up axis {grounded[0]}: the ground through the origin bears the body; {told}")
+            body.evidence.append(f"up axis {grounded[0]}: the ground through the origin bears the body; {observed}")
             return grounded[0]
-    raise _unclear_axis(body, told, (axis, cosine), (rest_axis, rest_cosine))
+    raise _unclear_axis(body, observed, (axis, cosine), (rest_axis, rest_cosine))
 
 
-def _told(standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]) -> str:
+def _observed_axes(standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]) -> str:
     """Describe the upward axes that the motion and the rest pose show, for a message."""
     motion = f"mean direction from feet to head is {standing[0]} with cosine {standing[1]:.2f}"
     if standing[1] == 0.0:
@@ -204,11 +204,11 @@ def _told(standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]) -> str:
 
 
 def _unclear_axis(
-    body: BodyMeasures, told: str, standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]
+    body: BodyMeasures, observed: str, standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]
 ) -> AmbiguousUnits:
     return AmbiguousUnits(
-        f"the file does not show clearly which axis points up ({told}); name the axis with --up-axis (up_axis), one "
-        f"of {_likely_axes(standing, resting)}",
+        f"the file does not show clearly which axis points up ({observed}); name the axis with --up-axis (up_axis), "
+        f"one of {_likely_axes(standing, resting)}",
         code="up-axis-ambiguous",
         file=body.file,
     )
