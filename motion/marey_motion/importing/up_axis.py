@@ -102,7 +102,7 @@ def _infer_up_axis(body: BodyMeasures, sibling_axis: UpAxis | None) -> UpAxis:
     if is_person:
         axis = _axis_of_person(body, standing, resting, flat, on_fours=on_fours)
     else:
-        axis = _settle_up_axis(body, *standing, flat)
+        axis = _axis_of_tilted_body(body, *standing, flat)
     body.axis_is_clear = axis == standing[0] and standing[1] >= _CLEAR_COSINE
     return axis
 
@@ -170,7 +170,7 @@ def _compare_with_body(given: UpAxis, body: BodyMeasures, *, trusted: bool) -> N
     body.warnings.append(CheckWarning("up-axis-doubtful", reason, values={"up_axis": axis, "cosine": cosine}))
 
 
-def _settle_up_axis(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
+def _axis_of_tilted_body(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
     """Choose the upward axis of a body that is not upright along y: it lies or climbs, or another axis points up.
 
     `axis` is the axis nearest to the direction from feet to head, and `cosine` is the cosine of the angle between this
