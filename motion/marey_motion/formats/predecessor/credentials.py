@@ -66,7 +66,7 @@ def has_text(value: Any) -> bool:
     return False
 
 
-def tells_credential(text: str) -> bool:
+def contains_credential(text: str) -> bool:
     """Check whether a text contains a credential: `TOKEN=abc`, `--password abc`, `Bearer abc` or `//user:abc@host`.
 
     Parameters
@@ -79,7 +79,7 @@ def tells_credential(text: str) -> bool:
 
     Examples
     --------
-    >>> [tells_credential(text) for text in ("run --password hunter2", "run --max_token_length 512")]
+    >>> [contains_credential(text) for text in ("run --password hunter2", "run --max_token_length 512")]
     [True, False]
     """
     small = text.lower()
