@@ -80,7 +80,7 @@ def search_windows(
     examples = [example] if not mirror else [example, Example(mirrored(example.poses), example.offsets)]
     with ThreadPoolExecutor(threads) as pool:
         search = _Searches(shards, [grouped(one, tables) for one in examples], metric, count, pool)
-        return [search.told(shards[number], number, window) for window, number in search.best()]
+        return [search.as_hit(shards[number], number, window) for window, number in search.best()]
 
 
 def search_clips(
@@ -200,7 +200,7 @@ class _Searches:
         best = self._best
         return best[-1][0].distance if len(best) == self._count else np.inf
 
-    def told(self, searched: SearchedShard, number: int, window: RankedWindow) -> Hit:
+    def as_hit(self, searched: SearchedShard, number: int, window: RankedWindow) -> Hit:
         """Convert a window to a hit, and find whether the example or its mirrored copy is nearer to the window."""
         hit = Hit(number, window.run, window.row, window.distance, False)
         if len(self._examples) == 1:
