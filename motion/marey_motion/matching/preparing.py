@@ -120,7 +120,7 @@ def _wanted_frames(
     Returns the cut clip, the index of its first frame in the source, and whether the body walks in place.
     """
     clip, first = source.clip, 0
-    if not _moves(clip, body.skeleton):
+    if not _fits_skeleton(clip, body.skeleton):
         raise MotionError(
             "the clip has a different skeleton from the database; retarget the clip first", code="skeleton-mismatch"
         )
@@ -136,7 +136,7 @@ def _wanted_frames(
     return clip, first, bool(in_place)
 
 
-def _moves(clip: Clip, skeleton: Skeleton) -> bool:
+def _fits_skeleton(clip: Clip, skeleton: Skeleton) -> bool:
     """Return whether the poses of a clip are also poses of `skeleton`.
 
     The skeletons must be equal, except in end sites and in the offsets of the root and of joints whose translations
