@@ -20,7 +20,7 @@ from marey_motion.modelling.scaling import jacobian_weights, root_max_weights
 from marey_motion.modelling.splines import SplineBasis, coefficient_count
 from marey_motion.modelling.time_model import equalising_weight, fit_log_slopes
 from marey_motion.modelling.training_report import TrainingReport, report_on
-from marey_motion.modelling.training_warnings import Warned, warnings_of
+from marey_motion.modelling.training_warnings import ModelWarning, warnings_of
 from marey_schemas.options.modelling import ModelOptions
 
 Progress = Callable[[int, int | None, str], None]
@@ -43,7 +43,7 @@ class TrainedPrimitive:
 
     primitive: MotionPrimitive
     report: TrainingReport
-    warnings: tuple[Warned, ...]
+    warnings: tuple[ModelWarning, ...]
     options: ModelOptions
     weights: Floats
 
