@@ -18,7 +18,7 @@ from marey_motion.modelling.search.optimise import DEFAULT_REFINING, Refined, re
 from marey_motion.modelling.search.samples import FoundSamples, search_closely
 from marey_motion.modelling.search.steps import (
     DEFAULT_TRANSITIONS,
-    CarriedOn,
+    StepStart,
     Measured,
     SeveralSteps,
     Step,
@@ -84,7 +84,7 @@ def search_steps(
     problem = SeveralSteps.of(steps, start, transitions)
     searched: list[FoundSamples] = []
     for step, tree in zip(steps, trees, strict=True):
-        begun = problem.carried_on([one.latents[0] for one in searched])
+        begun = problem.start_of_next([one.latents[0] for one in searched])
         searched.append(_search_step(step, tree, begun, candidates, passes, transitions))
     stacked = np.concatenate([one.latents[0] for one in searched])
     measured = sampled = problem.measure(stacked)
@@ -105,7 +105,7 @@ def _require_finite(*found: Floats) -> None:
 
 
 def _search_step(
-    step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, passes: int, transitions: TransitionOptions
+    step: Step, tree: SampleTree, begun: StepStart, candidates: int, passes: int, transitions: TransitionOptions
 ) -> FoundSamples:
     """Find the best motion in the tree of a step that starts at `begun`, where the previous step ended."""
     _require_finite(*begun.joints.values())

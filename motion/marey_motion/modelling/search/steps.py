@@ -47,7 +47,7 @@ class Step:
 DEFAULT_TRANSITIONS = TransitionOptions()
 
 
-class CarriedOn(NamedTuple):
+class StepStart(NamedTuple):
     """Start of a step that continues the previous step.
 
     The fields are the placement at which the step begins in the world, and the positions of the transition joints at
@@ -194,7 +194,7 @@ class SeveralSteps:
         slopes = [part for one, jump in zip(walked, jumps, strict=True) for part in (one.found.slopes, jump)]
         return np.concatenate(residuals), np.concatenate(slopes)
 
-    def carried_on(self, latents: Sequence[Floats]) -> CarriedOn:
+    def start_of_next(self, latents: Sequence[Floats]) -> StepStart:
         """Compute the start of a step that continues the motion of given steps.
 
         Parameters
@@ -203,14 +203,14 @@ class SeveralSteps:
 
         Returns
         -------
-        CarriedOn    position and heading at the end of the last given step, and its transition joints
+        StepStart    position and heading at the end of the last given step, and its transition joints
         """
         if not latents:
-            return CarriedOn(self.start, {})
+            return StepStart(self.start, {})
         *_, last = self._walk(np.concatenate(latents), len(latents))
         ended = last.found.points[2 + len(self.joints) :]
         placement = Placement(_heading(ended[1]), float(ended[0, 0]), float(ended[0, 2]))
-        return CarriedOn(placement, dict(zip(self.joints, ended[2:], strict=False)))
+        return StepStart(placement, dict(zip(self.joints, ended[2:], strict=False)))
 
     def measure(self, stacked: Floats) -> Measured:
         """Compute placements, errors and jumps.
