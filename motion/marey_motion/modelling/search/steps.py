@@ -90,7 +90,7 @@ class _Link(NamedTuple):
     first: int
 
 
-class _Walked(NamedTuple):
+class _PlacedStep(NamedTuple):
     """A step placed in the world after the steps before it; W is the total length of the latent vectors of all steps.
 
     Parameters
@@ -188,10 +188,10 @@ class SeveralSteps:
         residuals : (r,) float64    errors in multiples of their tolerances
         derivatives : (r, W) float64    of the residuals with respect to the latent vectors
         """
-        walked = list(self._walk(stacked, len(self.links)))
-        residuals = [part for one in walked for part in (one.found.residuals, self._scale * one.jumps.ravel())]
-        jumps = [self._scale * one.jump_slopes.reshape(one.jumps.size, len(stacked)) for one in walked]
-        slopes = [part for one, jump in zip(walked, jumps, strict=True) for part in (one.found.slopes, jump)]
+        placed = list(self._place_steps(stacked, len(self.links)))
+        residuals = [part for one in placed for part in (one.found.residuals, self._scale * one.jumps.ravel())]
+        jumps = [self._scale * one.jump_slopes.reshape(one.jumps.size, len(stacked)) for one in placed]
+        slopes = [part for one, jump in zip(placed, jumps, strict=True) for part in (one.found.slopes, jump)]
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def start_of_next(self, latents: Sequence[Floats]) -> StepStart:
@@ -207,7 +207,7 @@ class SeveralSteps:
         """
         if not latents:
             return StepStart(self.start, {})
-        *_, last = self._walk(np.concatenate(latents), len(latents))
+        *_, last = self._place_steps(np.concatenate(latents), len(latents))
         ended = last.found.points[2 + len(self.joints) :]
         placement = Placement(_heading(ended[1]), float(ended[0, 0]), float(ended[0, 2]))
         return StepStart(placement, dict(zip(self.joints, ended[2:], strict=False)))
@@ -223,19 +223,19 @@ class SeveralSteps:
         -------
         Measured    metres, radians and seconds
         """
-        walked = list(self._walk(stacked, len(self.links)))
-        placements = tuple(Placement(*one.placement.tolist()) for one in walked)
+        placed = list(self._place_steps(stacked, len(self.links)))
+        placements = tuple(Placement(*one.placement.tolist()) for one in placed)
         errors = tuple(
             replace(link.objective, placement=placement).errors(latent[None])[0]
             for link, placement, latent in zip(self.links, placements, self.parts(stacked), strict=True)
         )
-        return Measured(placements, errors, tuple(np.linalg.norm(one.jumps, axis=1) for one in walked[1:]))
+        return Measured(placements, errors, tuple(np.linalg.norm(one.jumps, axis=1) for one in placed[1:]))
 
     @cached_property
     def _scale(self) -> float:
         return float(np.sqrt(self.transitions.weight) / self.transitions.tolerance_m)
 
-    def _walk(self, stacked: Floats, count: int) -> Iterator[_Walked]:
+    def _place_steps(self, stacked: Floats, count: int) -> Iterator[_PlacedStep]:
         """Place the first `count` steps, each at the end of the one before; `stacked` (W,) are all latent vectors."""
         ends = 2 + len(self.joints)
         jumping = [0, *range(2, ends)]
@@ -246,11 +246,11 @@ class SeveralSteps:
                 placement, moved = _carry_on(before.points[ends:], before.point_slopes[ends:], link, stacked)
             found = link.objective.linearise(stacked, link.first, placement, moved)
             if before is None:
-                yield _Walked(placement, found, np.zeros((0, 3)), np.zeros((0, 3, len(stacked))))
+                yield _PlacedStep(placement, found, np.zeros((0, 3)), np.zeros((0, 3, len(stacked))))
             else:
                 ended = [ends + place for place in jumping]
                 jumps = found.points[jumping] - before.points[ended]
-                yield _Walked(placement, found, jumps, found.point_slopes[jumping] - before.point_slopes[ended])
+                yield _PlacedStep(placement, found, jumps, found.point_slopes[jumping] - before.point_slopes[ended])
             before = found
 
 
