@@ -263,18 +263,18 @@ def _apply(decided: Sequence[_Decided], mine: Iterable[ComparedEntry], choices: 
     A resolution in `choices` can decide which of the two entries gets the key; then no conflict is added. `mine`
     contains the entries that our side has changed.
     """
-    held = {one.after.key: _Decided(one.before, one.after, one.before, one.after) for one in mine if one.after}
+    placed = {one.after.key: _Decided(one.before, one.after, one.before, one.after) for one in mine if one.after}
     for one in decided:
         if one.ours is not None:
-            held.pop(one.ours.key, None)
+            placed.pop(one.ours.key, None)
             merged.changes[one.ours.key] = None
-    held.update((one.result.key, one) for one in decided if one.merged is not None and not one.moves)
+    placed.update((one.result.key, one) for one in decided if one.merged is not None and not one.moves)
     # Entries that go back to the base come first, so that a conflict never lists an entry of theirs as ours.
     moving = sorted((one for one in decided if one.moves), key=_gets_place_of_theirs)
-    colliding = [one for one in moving if held.setdefault(one.result.key, one) is not one]
+    colliding = [one for one in moving if placed.setdefault(one.result.key, one) is not one]
     # Collisions come last, so that no entry goes back to a place that another entry gets.
-    merged.conflicts += (conflict for one in colliding if (conflict := _collide(one, held, choices)) is not None)
-    for key, one in held.items():
+    merged.conflicts += (conflict for one in colliding if (conflict := _collide(one, placed, choices)) is not None)
+    for key, one in placed.items():
         if one.merged == one.ours:
             merged.changes.pop(key, None)
             continue
@@ -287,15 +287,15 @@ def _gets_place_of_theirs(one: _Decided) -> bool:
     return one.theirs is not None and one.merged is not None and one.theirs.key == one.merged.key
 
 
-def _collide(one: _Decided, held: dict[str, _Decided], choices: Choices) -> MergeConflict | None:
+def _collide(one: _Decided, placed: dict[str, _Decided], choices: Choices) -> MergeConflict | None:
     """Decide which of two entries gets a key; the other entry returns to its earlier path.
 
-    `held` contains entries by key; one of them has the key that `one` should get. If a side has added the entry that
+    `placed` contains entries by key; one of them has the key that `one` should get. If a side has added the entry that
     does not get the key, this entry has no earlier path and is dropped. The result is a conflict if there is no
     resolution, or if the earlier path is taken.
     """
     key = one.result.key
-    other = held[key]
+    other = placed[key]
     conflict = MergeConflict(None, other.merged, one.merged, ("path",))
     choice = choices.take(key, {"path": ("path",)}, tuple(Side))
     if not isinstance(choice, Side):
@@ -305,10 +305,10 @@ def _collide(one: _Decided, held: dict[str, _Decided], choices: Choices) -> Merg
     winner, loser = (one, other) if choice is Side.THEIRS else (other, one)
     if (back := loser.place_beside(key)) is not None:
         moved = loser.at(back)
-        if moved.result.key in held:
+        if moved.result.key in placed:
             return conflict._replace(no_way_back=back)
-        held[moved.result.key] = moved
-    held[key] = winner
+        placed[moved.result.key] = moved
+    placed[key] = winner
     return None
 
 
