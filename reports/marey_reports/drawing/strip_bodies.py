@@ -61,10 +61,10 @@ class Look(NamedTuple):
 GHOST = Look(LINE_POINTS, 0.55, REFERENCE)
 
 
-def draw_way(axes: Axes, way: Floats, frame: BboxBase) -> None:
+def draw_path(axes: Axes, path: Floats, frame: BboxBase) -> None:
     """Draw a path (N, 2) on the floor, in inches on the page."""
-    if len(way):
-        (line,) = axes.plot(way[:, 0], way[:, 1], color=QUIET, lw=0.9, alpha=0.8)
+    if len(path):
+        (line,) = axes.plot(path[:, 0], path[:, 1], color=QUIET, lw=0.9, alpha=0.8)
         line.set_clip_box(frame)
 
 

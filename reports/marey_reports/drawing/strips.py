@@ -28,7 +28,7 @@ from marey_reports.drawing.strip_bodies import (
     Look,
     StripCell,
     draw_body,
-    draw_way,
+    draw_path,
     shapes_of,
 )
 
@@ -58,14 +58,14 @@ class StripRow:
     ----------
     label, note : texts to the left of the row; `note` is written below `label`, in small letters
     bodies : (m, T, P, 3) points of m motions in T frames, metres, drawn on top of each other
-    ways : (m, N, 3) paths of the root in metres, drawn on the floor; N may be 0
+    paths : (m, N, 3) paths of the root in metres, drawn on the floor; N may be 0
     ghost : (T, P, 3) points of a motion for comparison, drawn in grey behind the bodies
     """
 
     label: str
     note: str
     bodies: Floats
-    ways: Floats
+    paths: Floats
     ghost: Floats | None = None
 
 
@@ -282,8 +282,8 @@ def _draw_cell(axes: Axes, stage: StripCell, shapes: BodyShapes, row: StripRow, 
     # One box for all artists: each `set_clip_path` would make another one, which takes a tenth of the time of a strip.
     frame = TransformedBbox(Bbox.from_bounds(left, bottom - GAP, width, height + 2 * GAP), axes.transData)
     axes.plot([left + 0.03, left + width - 0.03], [floor] * 2, color=HAIRLINE, lw=0.8)
-    for way in row.ways:
-        draw_way(axes, stage.placed(way * (1.0, 0.0, 1.0)), frame)
+    for path in row.paths:
+        draw_path(axes, stage.placed(path * (1.0, 0.0, 1.0)), frame)
     if row.ghost is not None:
         draw_body(axes, shapes, stage, row.ghost[column], GHOST, frame)
     count = len(row.bodies)

@@ -21,7 +21,7 @@ def draw_mean(subject: ModelSubject) -> Sketch:
     frames, moments = subject.moments()
     points = subject.points(subject.mean_poses[frames])
     duration_s = float(subject.primitive.durations_s(np.zeros((1, subject.primitive.dimensions)))[0])
-    row = StripRow("mean", f"{duration_s:.2f} s", points[None], _ways(subject, subject.mean_poses[None]))
+    row = StripRow("mean", f"{duration_s:.2f} s", points[None], _paths(subject, subject.mean_poses[None]))
     figure = draw_strips(subject.body, [row], moments, subject.seen_from_rad, cell_in=(CELL_IN[0], 1.9))
     caption = (
         f"The mean motion of the model: {duration_s:.2f} s, at {len(frames)} moments of canonical time, seen from the "
@@ -37,7 +37,7 @@ def draw_component(subject: ModelSubject, component: int) -> Sketch:
     points = subject.points(swept[:, frames])
     rows = [
         StripRow(
-            written(deviation), "", points[[place]], _ways(subject, swept[[place]]), points[2] if deviation else None
+            written(deviation), "", points[[place]], _paths(subject, swept[[place]]), points[2] if deviation else None
         )
         for place, deviation in enumerate(DEVIATIONS)
     ]
@@ -78,5 +78,5 @@ def most_moved(subject: ModelSubject, points: Floats) -> tuple[str, float]:
     return joints[joint], 100.0 * float(apart[joint])
 
 
-def _ways(subject: ModelSubject, poses: Floats) -> Any:
+def _paths(subject: ModelSubject, poses: Floats) -> Any:
     return subject.points(poses)[:, :, subject.body.pelvis]
