@@ -177,7 +177,7 @@ def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
 def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _PosedBody:
     if not same_hierarchy(skeleton, motion.skeleton):
         raise ClipError(
-            "the motion has another skeleton than the one whose axes are computed; use a motion of that skeleton",
+            "the skeleton of this motion differs from the given skeleton; use a motion of the given skeleton",
             where="motion",
         )
     count = min(motion.frame_count, FRAMES_READ)
