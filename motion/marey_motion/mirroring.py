@@ -75,7 +75,7 @@ def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
 
 
 def mirror_motion(skeleton: Skeleton, partners: AnyInts, motion: Motion) -> Motion:
-    """Reflect a motion in x, like `mirror_clip`, but in double precision.
+    """Reflect a motion in x, which exchanges the motion of left and right limbs, in double precision.
 
     Parameters
     ----------

@@ -139,7 +139,10 @@ class _Foot(NamedTuple):
     ----------
     ground : (n,) complex    ground position of the ball of the foot, z + i·x in metres
     heights : (n,)    height of the ball above its height in the rest pose, metres
-    pitches, toe_pitches, yaws, freedom : (n,)    as in `FootMotion`
+    pitches, toe_pitches, yaws : (n,)    angles of the foot, of its toes, and of its heading, in radians; toes up is
+        positive
+    freedom : (n,)    0 in stance, rising to 1 in the middle of the swing: how gradually a foot that is out of reach is
+        moved towards the hip
     """
 
     ground: Complexes

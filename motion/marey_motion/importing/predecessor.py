@@ -41,7 +41,7 @@ IMPORTED_LAYER = "imported"
 
 
 def described_skeleton(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
-    """Make the item of a skeleton that has a file of its own, with its mapping.
+    """Make the item of a skeleton that was imported from a skeleton file, including the joint mapping.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ class Tracks:
 
     @cached_property
     def floor_height(self) -> float:
-        """The height of the floor in metres: the 5 % quantile of the heights of the lowest point of both feet."""
+        """Height of the floor in metres: in 5 % of the frames, the lowest point of both feet is lower."""
         return float(low_quantile(self.lowest))
 
 

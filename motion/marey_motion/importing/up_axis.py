@@ -118,8 +118,8 @@ def _axis_of_person(
     """Choose the upward axis of a known rig by weighing rest pose, motion and ground together.
 
     `standing` and `resting` are the axes nearest to the direction from feet to head in the motion and in the rest pose,
-    with cosines. `flat` is the result of `_flat_axis`; `on_fours` is true if hands and feet are below the hips along
-    its axis.
+    with cosines. `flat` is the axis along which the lowest point of the body hardly moves, with the evidence in words,
+    or None. `on_fours` is true if hands and feet are below the hips along this axis.
     """
     votes: dict[UpAxis, float] = defaultdict(float)
     votes[resting[0]] += _REST_VOTE

@@ -101,9 +101,11 @@ class DatabaseArrays(NamedTuple):
 
     Parameters
     ----------
-    successors, steps, starts : as in `RootMotion` and `MatchingDatabase`
-    points : (N, P, 3) positions of the pose joints of each row, in metres
-    offset, scale : (D,) as in the normaliser
+    successors : (N,) row that follows each row; -1 for the last row of a clip that does not wrap
+    steps : (N, 3) step of the root to the next row: metres to the left and forward, and radians to the left
+    starts : (C + 1,) first row of each clip, and N
+    points : (N, P, 3) positions of the pose joints of each row, in metres, in the frame of the row's root
+    offset, scale : (D,) normalised features are (features - offset) / scale
     horizons_s, horizons_ticks : (H,) times ahead at which the trajectory is compared, in seconds and in ticks
     """
 

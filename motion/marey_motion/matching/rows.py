@@ -28,7 +28,7 @@ CLAMPED_S = 1 / 3
 
 
 class ClipRows(NamedTuple):
-    """The rows of one clip; shapes and meanings as in `MatchingDatabase`."""
+    """The rows that one clip adds to a `MatchingDatabase`, in arrays with the same names, shapes and units."""
 
     features: Floats
     selectable: NDArray[np.bool_]

@@ -219,7 +219,7 @@ def find_nearest(
 
     Raises
     ------
-    MotionError    if the queries or weights have invalid values or a different number of dimensions from the index
+    MotionError    if the queries or weights have invalid values or another number of dimensions than the index
     """
     from marey_motion.matching import search_kernels as kernels
 
@@ -247,17 +247,18 @@ def find_best(
     index : SearchIndex    N rows of D dimensions
     query : (D,) float64    normalised like the rows
     count : int    number of rows to find; fewer are returned if fewer are selectable
-    weights : (D,) float64, optional    as for `find_nearest`
+    weights : (D,) float64, optional    factors by which the squared differences are multiplied, one per dimension and
+        not negative; 1 if None
     skip : (int, int)    rows [start, stop) that may not be chosen
 
     Returns
     -------
-    rows : (count,) int64    the rows
-    costs : (count,) float64    the same costs as in `find_nearest`, bit for bit
+    rows : (count,) int64    numbers of the rows
+    costs : (count,) float64    squared distances, equal to those of `find_nearest` to the last bit
 
     Raises
     ------
-    MotionError    as for `find_nearest`
+    MotionError    if the query or the weights have invalid values or another number of dimensions than the index
     """
     from marey_motion.matching import search_kernels as kernels
 

@@ -1,4 +1,4 @@
-"""Choice of the mixture of normal distributions over latent vectors: number of distributions and kind of covariance."""
+"""Choice of a mixture of normal distributions for latent vectors: number of distributions and kind of covariance."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ class MotionPrimitive:
 
     @property
     def log_slope_bounds(self) -> tuple[float, float]:
-        """Limits of the temporal function: `log_slope_range`, by default -`MOST_LOG_SLOPE` to `MOST_LOG_SLOPE`."""
+        """Limits of the temporal function: `log_slope_range` or, if it is None, ±`MOST_LOG_SLOPE`."""
         return self.log_slope_range or (-MOST_LOG_SLOPE, MOST_LOG_SLOPE)
 
     @cached_property

@@ -75,7 +75,7 @@ class TrainingReport:
     ----------
     spatial_energy, temporal_energy : cumulative share of the variance, over all components of the examples
     takes, subjects : number of takes and of performers; 0 performers if they are unknown or fewer than three
-    mixture_covariance : kind of covariance, see `FittedMixture`
+    mixture_covariance : kind of covariance: "full", "tied", "diagonal", or "point" for examples that do not vary
     candidates : mixtures compared, with their criteria
     log_likelihood : mean log-likelihood of the examples
     held_out_log_likelihood : mean of the examples' `held_out_log_likelihood`; None if it was not computed

@@ -26,7 +26,7 @@ from marey_motion.resampling import resample_motion
 MOST_COMPARED_FRAMES = 3600
 """Greatest number of frames of a clip, at the rate of the metric."""
 MOST_TABLE_CELLS = 2_000_000_000
-"""Greatest number of cells of all motion maps of a table of distances."""
+"""Greatest number of cells in all motion maps together that are computed for one table of distances."""
 
 Progress = Callable[[float, float | None, str], None]
 
@@ -73,7 +73,7 @@ class ClipDistances:
         ----------
         count : int    number of clips N
         pairs : (R, 2) int64    all pairs of the clips, each once
-        found : (R, 1 + C) float64    distances of the pairs, as `compare_pairs` returns them
+        found : (R, 1 + C) float64    total distance of each pair, then its distance by each of the C components
 
         Returns
         -------
@@ -181,7 +181,7 @@ def compare_clips(
 
     Raises
     ------
-    MotionError    as for `compare_pairs`
+    MotionError    if clips cannot be compared, or the motion maps of all pairs have more than `MOST_TABLE_CELLS` cells
     """
     pairs = np.stack(np.triu_indices(len(clips), 1), axis=1)
     by_number = dict(enumerate(clips))

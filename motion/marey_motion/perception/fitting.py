@@ -136,7 +136,7 @@ def fit_power(differences: PairDifferences, perceived: Floats) -> Component:
 
     Raises
     ------
-    MotionError    for the same reasons as in `fit_component`
+    MotionError    if too few pairs have a perceived difference, or if the best fit gives every class the weight 0
     """
     known = np.isfinite(perceived)
 

@@ -193,7 +193,10 @@ def _raw(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric, component: 
 
 
 def _layout(clip: MeasuredClip, metric: PerceptualMetric, component: Component) -> tuple[Ints, Floats]:
-    """Find the ranges (K + 1,) of the classes' points, and the factors (K,) of the sums of their distances."""
+    """Return the first point of each class and the number of points, as one array (K + 1,), and factors (K,).
+
+    The difference of a class is its factor times the sum of the distances of its points.
+    """
     kept = classes_measured(clip, component.measurement)
     counts = np.diff(clip.starts)[[name in kept for name in clip.classes]]
     starts = np.concatenate(([0], np.cumsum(counts))).astype(np.int64)

@@ -173,11 +173,12 @@ def clip_distance(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric) ->
 
     Returns
     -------
-    ClipDistance    distance, and its components
+    ClipDistance    total distance, and the distance by each component
 
     Raises
     ------
-    MotionError    for the same reasons as in `registration_curve`
+    MotionError    if the clips cannot be compared, if their lengths differ too much for the slope limit of the curve,
+        or if a cycle has too many frames for trying all shifts
     """
     directions = np.array([_directed(*pair, metric) for pair in ((a, b), (b, a))])
     raw = directions.mean(axis=0)
@@ -203,7 +204,8 @@ def differences_along_curve(a: MeasuredClip, b: MeasuredClip, metric: Perceptual
 
     Raises
     ------
-    MotionError    for the same reasons as in `registration_curve`
+    MotionError    if the clips cannot be compared, if their lengths differ too much for the slope limit of the curve,
+        or if a cycle has too many frames for trying all shifts
     """
     pairs = [(one, other.at(registration_curve(one, other, metric).times)) for one, other in ((a, b), (b, a))]
     return tuple(

@@ -82,7 +82,7 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
 
 
 def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOptions | None = None) -> RetargetedClip:
-    """Retarget a clip as `retarget` does, and report the corrections.
+    """Retarget a clip to the plan's target skeleton, and report the corrections.
 
     Parameters
     ----------

@@ -149,7 +149,8 @@ def plan_retarget(
         mapped joints
     target : Skeleton    the skeleton to which clips are transferred
     target_mapping : JointMapping    its standard joints
-    target_axes : mapping of str to JointAxes    twist and swing axes of the target, like `source_axes`
+    target_axes : mapping of str to JointAxes    twist and swing axes of the target by joint name, at least of the
+        mapped joints
     scale : float, optional    metres that the target's pelvis moves per metre that the source's pelvis moves; the ratio
         of the hip heights if None
 

@@ -157,7 +157,7 @@ def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ..
 
     Raises
     ------
-    MappingError    for the same reasons as in `guess_axes`
+    MappingError    if the mapping lacks the joints that define left and up, or if joints of an arm coincide
     """
     rest = _resting_body(skeleton, mapping)
     parts = dict.fromkeys(_part(standard) for standard in STANDARD_JOINTS if standard in rest.joints)

@@ -107,11 +107,12 @@ def search_clips(
 
     Returns
     -------
-    list of tuple of int    indices of shard and run of each clip, ascending; the result is exact
+    list of (int, int)    for each clip, the index of its shard and of its run in the shard, ascending; the result is
+        exact
 
     Raises
     ------
-    MotionError    as for `search_windows`
+    MotionError    if the metric superposes pairs of poses, or needs joints that the example does not have
     """
     most = float(np.nextafter(distance, -np.inf)) if below else distance
     examples = [grouped(example, _tables_for(example, metric))]

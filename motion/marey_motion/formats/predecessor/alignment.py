@@ -60,7 +60,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
 
 
 def alignment_of_document(document: Mapping[str, Any], file: str) -> PredecessorAlignment:
-    """Read an alignment from a decoded document, as `read_predecessor_alignment` does.
+    """Read the alignment of a clip from a decoded document of Marey's predecessor.
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ def layer_of_document(
     end_index: EndIndex = DEFAULT_END_INDEX,
     labels: Sequence[str] | None = None,
 ) -> Layer:
-    """Read an annotation from a decoded document, as `read_predecessor_annotation` does.
+    """Read an annotation of a clip from a decoded document of Marey's predecessor, in any of its three forms.
 
     Parameters
     ----------

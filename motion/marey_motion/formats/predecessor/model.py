@@ -89,7 +89,7 @@ def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None 
 
 
 def model_of_document(document: Document, file: str, *, skeleton: Skeleton | None = None) -> PredecessorModel:
-    """Read a model from a decoded document, as `read_predecessor_model` does.
+    """Read a model of any layout from a decoded document of Marey's predecessor.
 
     Parameters
     ----------

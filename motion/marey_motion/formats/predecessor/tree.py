@@ -60,7 +60,7 @@ def read_predecessor_tree(data: bytes, file: str) -> SampleTree:
 
 
 def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
-    """Read a cluster tree from a decoded document, as `read_predecessor_tree` does.
+    """Read a cluster tree from a decoded document of Marey's predecessor.
 
     Parameters
     ----------

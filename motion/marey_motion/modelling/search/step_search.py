@@ -68,7 +68,8 @@ def search_steps(
     steps : sequence of Step    the steps
     trees : sequence of SampleTree    samples of each step's primitive
     start : Placement    position and heading in the world at which the first step begins
-    candidates, passes : int    see `search_closely`
+    candidates : int    nodes of a tree that are followed from each level to the next
+    passes : int    searches of each tree; every search after the first one moves the samples closer to the best one
     refining : RefineOptions or None    None to keep the samples that were found
     transitions : TransitionOptions    continuity between steps
 
