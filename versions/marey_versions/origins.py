@@ -82,8 +82,8 @@ def find_origins(
 ) -> dict[str, FoundOrigin]:
     """Return the origin of each part of an entry, of its path and of its tags, by name.
 
-    A merge is the origin of a part only if the part differs from the same part in both parents. An entry that was moved
-    is recognised by its content, as in `compare_entries`.
+    A merge is the origin of a part only if the part differs from the same part in both parents. A moved entry is
+    recognised by the equal content of at least one of its parts.
 
     Parameters
     ----------
