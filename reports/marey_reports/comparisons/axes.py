@@ -27,7 +27,7 @@ _REACH = 0.4
 
 
 def add_chart(figure: Figure, place: Place, *, title: str, x: str, y: str = "") -> Axes:
-    """Add a panel like `add_panel`, but write the names in its texts literally, without mathematical notation."""
+    """Add a panel to a figure, and write its texts literally: dollar signs do not begin mathematical notation."""
     panel = add_panel(figure, place, title=title, x=plain(x), y=plain(y))
     for axis in (panel.xaxis, panel.yaxis):
         axis.label.set_parse_math(False)
