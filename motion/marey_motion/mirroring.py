@@ -127,7 +127,8 @@ def _mirror_of(skeleton: Skeleton, pairing: tuple[int, ...]) -> _Mirror:
 def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.bool_], joint: int) -> Floats:
     """Return the improper matrix (3, 3) that maps the local axes of a joint's source to those of the joint.
 
-    The source is the joint from which the joint gets its motion. `sources` and `carried` are described in `_Mirror`.
+    The source is the joint from which the joint gets its motion. `sources` (J,) are the sources of all joints;
+    `carried` (J,) is True for joints without a counterpart, which keep their local motion.
     """
     source = sources[joint]
     rest = quaternions.as_matrix(skeleton.rest_global_rotations[[joint, source]])

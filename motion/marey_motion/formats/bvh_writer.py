@@ -159,7 +159,7 @@ def _hierarchy(clip: Clip, order: list[int], axes: NDArray[np.int64], scale: flo
 
 
 def _written_name(name: str) -> str:
-    """Write underscores for the characters that BVH does not allow in a joint name."""
+    """Return a joint name with underscores in place of the characters that BVH does not allow."""
     return "".join("_" if character in "{}\n\r" else character for character in name)
 
 
@@ -209,7 +209,7 @@ def format_table(values: NDArray[np.float64]) -> bytes:
 
 @compiled
 def _format(values, text):
-    """Write `values` into `text`; return the number of bytes written."""
+    """Fill `text` (bytes,) with `values` (F, C) as F lines of decimal numbers; return the number of bytes written."""
     digits = np.empty(24, np.uint8)
     at = 0
     for frame in range(values.shape[0]):

@@ -185,7 +185,10 @@ def model_parts(
 
 
 def _time(time: PredecessorTime, model: Tree) -> Tree:
-    """Record a time function of the predecessor, from which the time function in the document `model` was converted."""
+    """Convert a time function of the predecessor to plain values, with the digest of the document `model`.
+
+    The time function of this document was converted from the time function of the predecessor.
+    """
     return {
         "form": time.form,
         "knots": time.basis.knots,

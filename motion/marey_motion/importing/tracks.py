@@ -66,7 +66,7 @@ class Tracks:
 
     @cached_property
     def lowest(self) -> NDArray[np.float32]:
-        """Heights (F,) of the lowest point of both feet."""
+        """Height (F,) of the lowest point of the two feet in each frame, in metres."""
         lowest: NDArray[np.float32] = self.soles[..., 1].min(axis=1)
         return lowest
 

@@ -248,7 +248,11 @@ def nearest(index, query, warm_row, skip_start, skip_stop):
 
 @compiled
 def nearest_weighted(index, query, weights, skip_start, skip_stop):
-    """Find the nearest row, as `nearest` does, with squared differences multiplied by non-negative weights (D,)."""
+    """Find the selectable row of least weighted cost outside [skip_start, skip_stop).
+
+    The squared differences are multiplied by the non-negative `weights` (D,). Returns the row and its cost, or (-1,
+    inf) if there is none.
+    """
     return _nearest(index, query, weights, -1, skip_start, skip_stop)
 
 
@@ -265,7 +269,9 @@ def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):
 
 @compiled
 def all_costs(index, query, weights, costs):
-    """Fill `costs` (N,) with the cost of every row, selectable or not; `weights` (D,) multiply the squared differences.
+    """Fill `costs` (N,) with the cost of every row, selectable or not.
+
+    The squared differences are multiplied by `weights` (D,).
     """
     for row in range(costs.shape[0]):
         costs[row] = _cost(index.rows[row], query, weights)
@@ -273,7 +279,10 @@ def all_costs(index, query, weights, costs):
 
 @compiled
 def boxes_within(index, query, cost):
-    """Count the blocks whose box is at most `cost` away from the query; any search must visit at least these blocks."""
+    """Count the blocks whose box has a squared distance of at most `cost` from the query.
+
+    Any search for a row of this cost must visit at least these blocks.
+    """
     prepared = _prepared(index, query, np.ones(query.shape[0]), 0, 0)
     limit = _limit(prepared, cost)
     count = 0

@@ -14,7 +14,7 @@ from marey_motion.arrays import Ints
 LEAST_SUBJECTS = 3
 LEAST_FOLDS = 2
 LEAST_TRAINED = 4
-"""Least number of examples that must remain when a group is left out."""
+"""Least number of examples that must remain for training when a group is left out."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ MOST_CELLS = 50_000_000
 """Maximum number of cells of a map that `motion_map` returns; compute a larger map by `map_blocks`."""
 SHAPING_NUMBERS = {"euclid": 0, "manhattan": 1, "sigmoid": 2, "power": 3}
 ANGLE_NUMBERS = {"half_angle": 0, "log_norm": 0, "angle": 1, "one_minus_dot": 2}
-"""Numbers of shapings (`SHAPING_NUMBERS`) and of measures of angles (`ANGLE_NUMBERS`) in kernels."""
+"""Numbers that stand for shapings (`SHAPING_NUMBERS`) and for measures of angles (`ANGLE_NUMBERS`) in kernels."""
 _BLOCK_CELLS = 4_000_000
 _NO_POINTS = np.empty((1, 0, 2))
 

@@ -25,7 +25,7 @@ from marey_schemas.wording import counted
 
 _OPTIONS = PlantOptions()
 FAST_KNEES = 1.25
-"""Greatest knee speed in the result, divided by the greatest in the source, above which the result has a warning."""
+"""Ratio of the greatest knee speed in the result to that in the source; above it, the result has a warning."""
 
 
 class CorrectedFeet(NamedTuple):

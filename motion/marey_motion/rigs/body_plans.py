@@ -44,9 +44,9 @@ class Build:
     """Usual proportions of an arm or a leg of a person.
 
     `ratio` is the length of the upper long bone divided by that of the lower one. `end` is the length from wrist or
-    ankle to the farthest tip, and `before` the length before the upper long bone; both are divided by the length of the
-    long bones together. `ratio` and `end` each consist of a usual value and the spread of its logarithm; `before` is an
-    upper limit.
+    ankle to the farthest tip, and `before` the length from the start of the chain to the upper long bone; both are
+    divided by the length of the long bones together. `ratio` and `end` each consist of a usual value and the spread of
+    its logarithm; `before` is an upper limit.
     """
 
     ratio: tuple[float, float]  # upper by lower long bone

@@ -182,7 +182,7 @@ def _row_distances(sample, row, vectors, measure, distances):
 def row_bound(sample, row, tables, vectors, distances):
     """Compute a lower bound of the distance between two rows in single precision; distances (41,) is a scratch array.
 
-    The bound differs from the distance by rounding, and by chords in place of angles.
+    The bound differs from the distance by rounding errors, and because chords are used instead of angles.
     """
     rotated, places, factors, weights, starts, constants, shapings, exponents, measure, always = tables
     _row_distances(sample, row, vectors, measure, distances)

@@ -29,7 +29,7 @@ from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationFor
 
 SEMANTIC, KEYFRAMES = "semantic_annotation", "keyframes"
 MOST_LAYERS = 64
-"""Greatest number of annotations that one document may become."""
+"""Greatest number of annotations that are made from one document with overlapping labels: one for each label."""
 
 
 def read_predecessor_annotation(

@@ -118,7 +118,7 @@ def _is_secret(words: Sequence[str]) -> bool:
 
 
 def _is_given(name: str, value: str) -> bool:
-    """Return whether a name and its value are a credential.
+    """Return whether a value is a credential, judged by the name to which it is assigned.
 
     A whole number counts only if the name ends with a word for a credential: `PASSWORD=12`, but not `TOKEN_COUNT=12`.
     """
