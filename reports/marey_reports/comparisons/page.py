@@ -154,7 +154,7 @@ def render_page(subject: ComparedSubject, plot: Plot | None, parameter: str | No
 
 
 def _verdict(subject: ComparedSubject) -> str:
-    """Describe the best setting for the first field with a goal; mention an overlap with other intervals."""
+    """Describe which setting is best for the first field with a goal, and whether chance may explain the difference."""
     column = next((one for one in subject.fields if one.goal is not None and one.best_mean is not None), None)
     if column is None:
         return f"{counted(len(subject.comparison.runs), 'run')} are compared."

@@ -124,9 +124,11 @@ class _SheetRow:
 
     @property
     def seen_extent_m(self) -> tuple[float, float, float]:
-        """Lowest and highest point in the picture and greatest distance to a side, from the floor under the pelvis.
+        """Extent of the row's figures in the picture, in metres from the point of the floor under the pelvis.
 
-        Bones, heads, patches of floor and arrows count. The camera looks down, so what is near is lower in the picture.
+        The three numbers are the lowest point, the highest point, and the greatest distance to a side. They contain
+        bones, heads, patches of floor and arrows. The lowest point can be below the floor line, because the camera
+        looks down.
         """
         spot, head = FLOOR_SHARE * self.height_m, HEAD_SHARE * self.height_m
         corners = [np.array([[spot, spot * np.sin(self.camera.tilt_rad)]]), self._arrow_tips(spot)]
@@ -146,7 +148,7 @@ class _SheetRow:
 
 
 def _head_centre(body: StickFigure, bones: AnyFloats) -> AnyFloats:
-    """Return the centre of the head from the ends (..., n, 2, k) of all bones, (..., k)."""
+    """Return the centre (..., k) of the head, computed from the ends (..., n, 2, k) of all n bones."""
     assert body.head is not None
     bone, share = body.head
     return share * bones[..., bone, 0, :] + (1.0 - share) * bones[..., bone, 1, :]

@@ -71,7 +71,7 @@ def page(head: ReportHead, lead: Content, sections: Sequence[Section], *, plays_
 
 
 def scripts_of(page: str) -> tuple[str, ...]:
-    """Return the digest of the script of a page in the syntax of Content-Security-Policy; nothing without a script.
+    """Return the digest of the script of a page in the syntax of Content-Security-Policy; empty without a script.
 
     The script is the last `<script>` in the page, because earlier ones can be parts of names of clips.
     """

@@ -69,7 +69,12 @@ def draw_path(axes: Axes, path: Floats, frame: BboxBase) -> None:
 
 
 class BodyShapes(NamedTuple):
-    """Shapes of a body: for each side, lines of joined bones (`runs`) and the single bones (n, 2); and the head."""
+    """Shapes of a body, as indices of points.
+
+    `runs` are the lines of joined bones, and `bones` the single bones (n, 2), both by side of the body. `head` contains
+    the points of the head's bone, and the place of the head's centre on this bone as in `StickFigure`; None without a
+    head. `head_m` is the radius of the head in metres.
+    """
 
     runs: dict[int, list[Indices]]
     bones: dict[int, Indices]
@@ -78,7 +83,7 @@ class BodyShapes(NamedTuple):
 
 
 def shapes_of(body: StickFigure, drawn: Iterable[Floats]) -> BodyShapes:
-    """Return the shapes of a body that is drawn with the points (m, T, P, 3) of several rows."""
+    """Return the shapes of a body; the size of the head is computed from the drawn points (m, T, P, 3) of each row."""
     shown = np.ones(len(body.bones), dtype=bool)
     if body.head is not None and body.head[1] < 1.0:
         shown[body.head[0]] = False  # the circle stands for it

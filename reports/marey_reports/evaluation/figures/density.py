@@ -182,7 +182,10 @@ def _least_ranges(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float
 
 
 def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell: tuple[float, float]) -> Floats:
-    """Compute the smoothed seconds of data in an area of size `cell` around each point of the map, (FINE, FINE)."""
+    """Compute the smoothed seconds of data (FINE, FINE) in the area of size `cell` around each point of the map.
+
+    The size `cell` is given along both axes of `plane`, in the units of the axes.
+    """
     from scipy.ndimage import gaussian_filter
 
     coverage = subject.result.coverage

@@ -17,7 +17,7 @@ CELL_IN = (1.2, 1.3)
 
 
 def draw_mean(subject: ModelSubject) -> Sketch:
-    """Draw the mean motion."""
+    """Draw the mean motion as a strip: the body at several moments of canonical time, and the path of the root."""
     frames, moments = subject.moments()
     points = subject.points(subject.mean_poses[frames])
     duration_s = float(subject.primitive.durations_s(np.zeros((1, subject.primitive.dimensions)))[0])
@@ -31,7 +31,10 @@ def draw_mean(subject: ModelSubject) -> Sketch:
 
 
 def draw_component(subject: ModelSubject, component: int) -> Sketch:
-    """Draw one spatial component, with the mean motion in grey behind every figure."""
+    """Draw the effect of a spatial component as five strips, with the mean motion in grey behind every figure.
+
+    The motions are two and one standard deviations below the mean, the mean, and one and two above it.
+    """
     frames, moments = subject.moments()
     swept = sweep(subject, component)
     points = subject.points(swept[:, frames])
@@ -55,7 +58,7 @@ def draw_component(subject: ModelSubject, component: int) -> Sketch:
 
 
 def sweep(subject: ModelSubject, component: int) -> Floats:
-    """Compute the poses (5, N, 3 + 4·J) of five motions along a spatial component."""
+    """Compute the poses (5, N, 3 + 4·J) of the motions at -2, -1, 0, 1 and 2 standard deviations of a component."""
     primitive = subject.primitive
     latents = np.zeros((len(DEVIATIONS), primitive.dimensions))
     latents[:, component] = np.array(DEVIATIONS) * np.sqrt(primitive.spatial.variances[component])
