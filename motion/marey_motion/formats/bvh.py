@@ -142,7 +142,10 @@ def _read_frames(
     if frames == 0 and header.declared_frames:
         lines.number = header.data_line
         declared = counted(header.declared_frames, "frame")
-        raise lines.error(f"the header declares {declared}, but the file contains no frames", code="file-truncated")
+        raise lines.error(
+            f"the header declares {declared}, but the file contains no frames; copy or export it again",
+            code="file-truncated",
+        )
     _warn_of_layout(header, frames, wrapped, warnings)
     return table.values.reshape(frames, width) if frames else np.empty((0, width))
 

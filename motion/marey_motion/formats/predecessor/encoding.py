@@ -51,7 +51,9 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
     """
     document = decode_content(data, file)
     if not isinstance(document, dict):
-        raise FormatError("the file contains no document", code="document-damaged", file=file)
+        raise FormatError(
+            "the file contains a list instead of a document with named fields", code="document-damaged", file=file
+        )
     return document
 
 
