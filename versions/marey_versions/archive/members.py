@@ -114,7 +114,7 @@ def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
         header.offset_data = position + tarfile.BLOCKSIZE
         position = header.offset_data + -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
         if position > size_bytes:
-            raise BadArchive(f"{header.name}: the archive was cut off")
+            raise BadArchive(f"{header.name}: the archive was cut off; copy or export it again")
         yield header
 
 
@@ -169,4 +169,7 @@ def stored_differences(member: ArchiveMember, data: bytes) -> list[ArrayDifferen
 def require_digest(member: ArchiveMember, digest: str) -> None:
     """Raise `BadArchive` if the digest of a member's content is not the digest in the member's name."""
     if digest != member.digest:
-        raise BadArchive(f"{member.name}: the content has the digest {digest}; it was changed or damaged")
+        raise BadArchive(
+            f"{member.name}: the content has the digest {digest}, so it was changed or damaged; copy or export the "
+            "archive again"
+        )
