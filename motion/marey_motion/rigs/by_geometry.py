@@ -31,7 +31,7 @@ MOST_PLANS = 30
 HAIR_TURN = 0.75
 # Factors of the confidence where the sides are distinguished by the rest pose, or guessed.
 SIDES_UNNAMED, SIDES_GUESSED = 0.8, 0.7
-TOLD = "were distinguished by the rest pose alone"
+KNOWN_BY_REST_POSE = "were distinguished by the rest pose alone"
 GUESSED = "are a guess: no foot shows the direction the body faces, so left was taken for +x; check before use"
 # Plans that are worth so little less are as likely, and what that takes from the confidence.
 CLOSE, DOUBTED = 0.3, 0.6
@@ -84,7 +84,8 @@ def find_body(skeleton: Skeleton) -> GeometryMatch | None:
         sides, by_name = _left_and_right(skeleton, reading, np.array((1.0, 0.0, 0.0)) if left is None else left)
         if not by_name:
             confidence *= SIDES_GUESSED if left is None else SIDES_UNNAMED
-            notes.append(f"left and right of {names[0]} to {names[2]} {GUESSED if left is None else TOLD}")
+            origin = GUESSED if left is None else KNOWN_BY_REST_POSE
+            notes.append(f"left and right of {names[0]} to {names[2]} {origin}")
         for side, limb in zip(SIDES, sides, strict=True):
             places = (*range(3), -1 if reading is arms else 3)
             named = {f"{side}_{name}": reading.joint(limb, place) for name, place in zip(names, places, strict=True)}
