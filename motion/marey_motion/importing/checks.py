@@ -416,6 +416,6 @@ def _surely_no_jump(rotations: NDArray[np.float32]) -> bool:
 
 
 def _step_cosines(rotations: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Compute cosines (F - 1, J) of half the angle between consecutive frames."""
+    """Compute the cosine (F - 1, J) of half the angle between each joint's rotations in consecutive frames."""
     cosines: NDArray[np.float32] = np.abs(np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]))
     return cosines

@@ -138,7 +138,7 @@ def _axis_of_person(
     if standing[1] >= _CLEAR_COSINE and upright_on_ground:
         votes[standing[0]] += _UPRIGHT_VOTE
     best, *others = sorted(votes, key=lambda axis: -votes[axis])
-    borne = f"; the ground through the origin bears the body along {' and '.join(ground)}" if ground else ""
+    borne = f"; along {' and '.join(ground)}, the body stands on the plane through the origin" if ground else ""
     observed = _observed_axes(standing, resting) + borne + ("" if flat is None else f"; {flat[1]}")
     if others and votes[best] - votes[others[0]] < _CLEAR_LEAD:
         raise _unclear_axis(body, observed, standing, resting)
@@ -189,7 +189,7 @@ def _axis_of_tilted_body(body: BodyMeasures, axis: UpAxis, cosine: float, flat: 
     if cosine >= _CLEAR_COSINE:
         grounded = [candidate for candidate in (axis, rest_axis) if _stands_on_origin(body, candidate)]
         if len(set(grounded)) == 1:
-            body.evidence.append(f"up axis {grounded[0]}: the ground through the origin bears the body; {observed}")
+            body.evidence.append(f"up axis {grounded[0]}: the body stands on the plane through the origin; {observed}")
             return grounded[0]
     raise _unclear_axis(body, observed, (axis, cosine), (rest_axis, rest_cosine))
 

@@ -124,8 +124,10 @@ def _keyframes(given: Mapping[str, Any], frames: int, member: str) -> Iterator[t
             try:
                 number = int(frame)
             except (TypeError, ValueError) as error:
-                at = f"{short_name(label)!r} is at {short_name(frame)!r}"
-                message = f"keyframe {at}, which is neither a frame, 'lastFrame' nor 'middle'"
+                message = (
+                    f"keyframe {short_name(label)!r} must be the number of a frame, 'lastFrame' or 'middle', not "
+                    f"{short_name(frame)!r}"
+                )
                 raise FormatError(message, file=member) from error
             yield label, min(max(number, 0), frames - 1)
 

@@ -241,7 +241,10 @@ def _layout_notes(layout: FeatureLayout) -> tuple[DatabaseNote, ...]:
     count = len(layout.matched_joints)
     if count <= MOST_MATCHED_JOINTS:
         return ()
-    message = f"{count} joints are matched; with more than {MOST_MATCHED_JOINTS} the trajectory hardly counts"
+    message = (
+        f"{count} joints are matched; with more than {MOST_MATCHED_JOINTS}, the trajectory hardly affects the search; "
+        "match fewer joints, or raise the weights of the trajectory"
+    )
     return (DatabaseNote("many-joints", message),)
 
 

@@ -160,7 +160,10 @@ class MotionPrimitive:
             raise MotionError("the widening must be at least 1", where="widening")
         least, most = self.log_slope_bounds
         if not -MOST_LOG_SLOPE <= least <= most <= MOST_LOG_SLOPE:
-            message = f"{least:g} to {most:g} is not a range within {-MOST_LOG_SLOPE:g} to {MOST_LOG_SLOPE:g}"
+            message = (
+                f"the limits {least:g} and {most:g} must be in ascending order, and from {-MOST_LOG_SLOPE:g} to "
+                f"{MOST_LOG_SLOPE:g}"
+            )
             raise MotionError(message, where="log_slope_range")
 
     @property

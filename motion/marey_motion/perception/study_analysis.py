@@ -206,7 +206,10 @@ def _fit(
     seed: int,
     refusals: list[str],
 ) -> FittedMetric | None:
-    """Fit one component for each measurement, and then their shares; None if no component could be fitted."""
+    """Fit one component for each measurement, and then their shares; None if no component could be fitted.
+
+    The reasons for components that could not be fitted are appended to `refusals`.
+    """
     perceived = table.differences[np.triu_indices(len(table.differences), 1)]
     parts, fitted = [], []
     for differences in pairs:

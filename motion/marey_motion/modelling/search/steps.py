@@ -303,7 +303,7 @@ def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> t
 
 
 def _heading(across: Floats) -> float:
-    """Compute the heading of a body from its axis from right to left."""
+    """Compute the heading of a body, in radians, from the axis (3,) of the body from right to left."""
     return float(np.arctan2(-across[2], across[0]))
 
 
