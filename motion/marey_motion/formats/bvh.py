@@ -136,7 +136,7 @@ def _read_frames(
         cut = table.ragged_line == table.last_line and table.ragged_count < width
         raise lines.error(
             f"the line has {counted(table.ragged_count, 'value')}, but the file declares {width} channels"
-            + ("; the file is cut off in its last line" if cut else ""),
+            + ("; the file is cut off in its last line, so copy or export it again" if cut else ""),
             code="file-truncated" if cut else "frame-width",
         )
     if frames == 0 and header.declared_frames:

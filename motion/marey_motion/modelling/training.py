@@ -149,7 +149,7 @@ def check_examples(aligned: AlignedSet) -> None:
         if not (np.isfinite(motion.poses).all() and np.isfinite(clip.time_function).all()):
             raise ModelError("the example contains numbers that are not finite (infinite or NaN)", where=clip.name)
         if not (np.diff(clip.time_function) > 0.0).all():
-            raise ModelError("the time function is not strictly increasing", where=clip.name)
+            raise ModelError("the time function is not strictly increasing; align the examples again", where=clip.name)
 
 
 def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:

@@ -114,7 +114,9 @@ def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOption
     """
     if not same_hierarchy(clip.skeleton, plan.source, tolerance_m=SAME_SKELETON_M):
         raise ClipError(
-            "the clip has a different skeleton from the source skeleton of the retargeting plan", where="skeleton"
+            "the clip has a different skeleton from the source skeleton of the retargeting plan; make a plan for the "
+            "skeleton of the clip",
+            where="skeleton",
         )
     bones = (
         FollowedBones(clip.poses[:, 3:], {}) if plan.changes_no_pose else follow_moved_bones(clip, plan.source_joints)

@@ -88,7 +88,7 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
             if place in places:
                 raise FormatError(f"action {action}: two nodes are called {place[1]!r}; rename one", file=file)
             if len(places) == MOST_PRIMITIVES:
-                raise FormatError(f"the graph has more than {MOST_PRIMITIVES} nodes", file=file)
+                raise FormatError(f"the graph has more than {MOST_PRIMITIVES} nodes, which is the limit", file=file)
             places.add(place)
             listed[action, model_id] = node
             names[action, model_id] = place

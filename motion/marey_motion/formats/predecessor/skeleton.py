@@ -128,7 +128,7 @@ def _nested_nodes(root: Document, file: str) -> list[tuple[str, str | None, Docu
         nodes.append((name, parent, node))
         children = node.get("children") or []
         if not isinstance(children, list):
-            raise FormatError("'children' is not a list", file=file, joint=name)
+            raise FormatError("field 'children' must be a list of nodes", file=file, joint=name)
         waiting.extend((child, name) for child in reversed(children))
     return nodes
 
@@ -142,7 +142,7 @@ def _source(nodes: list[tuple[str, str | None, Document]], mirrored: bool, file:
     for name, parent, node in nodes:
         offset = number_list(node, "offset", 3, file, name) * (MIRROR_VECTOR if mirrored else 1.0)
         if name in indices:
-            raise FormatError("two joints have this name", file=file, joint=name)
+            raise FormatError("two joints have this name; rename one of them", file=file, joint=name)
         if name not in inner:
             tips.append((indices[str(parent)], offset))
             continue

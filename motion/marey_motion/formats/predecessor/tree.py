@@ -150,11 +150,15 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
         if not isinstance(below, list):
             raise FormatError(f"{place}: the field `children` must be a list of nodes", file=file)
         if level > MOST_LEVELS:
-            raise FormatError(f"{place}: the tree has more than {MOST_LEVELS} levels below its root", file=file)
+            raise FormatError(
+                f"{place}: the tree has more than {MOST_LEVELS} levels below its root, which is the limit", file=file
+            )
         indices.append(_indices_of(node, place, count, file) if node.get("indices") is not None or not below else None)
         children.append(len(below))
         if len(indices) + len(waiting) + len(below) > MOST_NODES:
-            raise FormatError(f"the tree has more than {MOST_NODES} nodes", code="format-limit", file=file)
+            raise FormatError(
+                f"the tree has more than {MOST_NODES} nodes, which is the limit", code="format-limit", file=file
+            )
         waiting.extend((child, f"{place}.{number}", level + 1) for number, child in enumerate(below))
     complete = _completed(indices, children)
     if len(np.unique(complete[0])) != count or len(complete[0]) != count:

@@ -167,7 +167,7 @@ def _features(
     if not end_effectors:
         raise MotionError(
             "the tree is made from the positions of hands, feet and head, but the joint mapping of the skeleton "
-            "contains none of them",
+            "contains none of them; add them to the mapping",
             where="features",
         )
     frames = feature_frames(primitive)
