@@ -87,7 +87,7 @@ def equal_clips(database: MatchingDatabase) -> NDArray[np.int64]:
 
 
 def _same_rows(database: MatchingDatabase, first: DatabaseClip, second: DatabaseClip) -> bool:
-    """Check whether two clips have equal rows in all arrays of the database, and are both loops or both not."""
+    """Check whether two clips have equal features, root motion, poses and contacts, and are both loops or both not."""
     one, other = (slice(clip.start, clip.stop) for clip in (first, second))
     arrays = (
         database.features,

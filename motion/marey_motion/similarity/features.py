@@ -36,7 +36,7 @@ WIDTH = ROTATIONS_AT + 4 * len(ROTATED_JOINTS)
 CONTEXT_S = 1.0
 """Seconds of motion before and after a range of frames that are needed to compute the features of this range.
 
-The heading is averaged over these seconds, and velocities are differences of frames.
+The heading is smoothed over time, and velocities are differences of frames.
 """
 _ROUNDED_FRAMES = 1e-6
 
