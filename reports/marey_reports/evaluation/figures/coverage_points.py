@@ -102,7 +102,7 @@ def _draw_together(subjects: Sequence[Subject], chosen: Sequence[_Points], limit
 
 
 def _draw_small(subjects: Sequence[Subject], chosen: Sequence[_Points], limits: Limits) -> Figure:
-    """Draw a small panel for each clip with its own colour, and one panel for all other clips.
+    """Draw a small panel for each of the clips with most data, and one panel for all other clips.
 
     The points of a panel are drawn in colour on top of the grey points of all clips.
     """
