@@ -60,7 +60,10 @@ class _OriginSearch:
         return None if value is None else entry_of(key, value)
 
     def before(self, parent: str, commit: str, key: str) -> DatasetEntry | None:
-        """Return the entry in a parent of the commit, perhaps under another key; None if the parent lacks it."""
+        """Return the entry of `parent` that became the entry `key` of `commit`; None if there is no such entry.
+
+        The entry may have another key in the parent.
+        """
         trees = [self.commit_of(one).tree for one in (parent, commit)]
         same, present = self.entry(parent, key), self.entry(commit, key)
         if trees[0] == trees[1] or (same and present and same.parts.items() & present.parts.items()):
