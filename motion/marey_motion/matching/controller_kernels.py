@@ -224,7 +224,7 @@ def _first_row(index, playback, rules, desired, root, query):
 
 @compiled
 def _later_row(playback, row, ticks):
-    """Find the row `ticks` after `row`, or the last row of its clip that another one follows."""
+    """Find the row `ticks` after `row` or, if the clip ends earlier, the last row of the clip that has a successor."""
     for _ in range(ticks):
         if playback.successors[playback.successors[row]] < 0:
             break

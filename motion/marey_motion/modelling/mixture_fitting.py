@@ -135,7 +135,7 @@ def fit_mixture(
     Parameters
     ----------
     latents : (n, d) float64    latent vectors
-    options : MixtureOptions, optional    options
+    options : MixtureOptions, optional    numbers and kinds of distributions to try, and the criterion of the choice
     groups : ExampleGroups, optional    takes and performers; by default, each example is a take of its own
     seed : int    the same seed gives the same mixture
 
@@ -336,7 +336,7 @@ def low_density(mixture: LatentMixture, seed: int) -> float:
 
 
 def _score(candidate: MixtureCandidate, criterion: Criterion) -> float:
-    """Return the criterion of a candidate; higher is better."""
+    """Return the value of the criterion for a candidate, with the sign chosen so that higher is better."""
     if criterion == "held_out":
         return float("-inf") if candidate.held_out_log_likelihood is None else candidate.held_out_log_likelihood
     return -(candidate.bic if criterion == "bic" else candidate.aic)

@@ -78,7 +78,7 @@ def train_primitive(
     Parameters
     ----------
     aligned : AlignedSet    m examples of N frames
-    options : ModelOptions    options
+    options : ModelOptions    options of the training
     name : str    name of the action
     seed : int    seed of the mixture's starts, the folds and the samples of the report
     threads : int    threads for leave-one-out reconstructions; the result does not depend on their number
@@ -158,7 +158,7 @@ def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:
     Parameters
     ----------
     aligned : AlignedSet    the examples
-    options : ModelOptions    options
+    options : ModelOptions    options of the training
 
     Returns
     -------
@@ -198,7 +198,7 @@ def channel_weights(
     poses : (m, N, D) float64    poses of D = 3 + 4·J channels; their quaternions have consistent signs
     coefficients : (m, n, D) float64    coefficients of the poses
     keep : Keep    number of components
-    options : ModelOptions    options
+    options : ModelOptions    options of the training
 
     Returns
     -------

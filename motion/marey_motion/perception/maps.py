@@ -227,7 +227,10 @@ def _centred(clip: MeasuredClip) -> Floats:
 
 
 def _superposed(a: MeasuredClip, b: MeasuredClip, vectors: Floats) -> Floats:
-    """Rotate `vectors` (n, P, 3) about the vertical as the points of `b` must be rotated to superpose those of `a`."""
+    """Rotate `vectors` (n, P, 3) about the vertical, by the rotation that superposes the points of `b` on those of `a`.
+
+    Each frame has its own rotation.
+    """
     ones, others = (_centred(clip) @ (1.0, 1.0j) for clip in (a, b))
     turn = np.sum(ones * others.conj(), axis=1, keepdims=True)
     turn = np.where(np.abs(turn) > 0.0, turn / np.maximum(np.abs(turn), np.finfo(float).tiny), 1.0)

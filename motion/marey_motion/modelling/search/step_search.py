@@ -65,7 +65,7 @@ def search_steps(
 
     Parameters
     ----------
-    steps : sequence of Step    the steps
+    steps : sequence of Step    the steps with their constraints
     trees : sequence of SampleTree    samples of each step's primitive
     start : Placement    position and heading in the world at which the first step begins
     candidates : int    nodes of a tree that are followed from each level to the next

@@ -131,7 +131,7 @@ class SeveralSteps:
 
         Parameters
         ----------
-        steps : sequence of Step    the steps
+        steps : sequence of Step    the steps with their constraints
         start : Placement    position and heading in the world at which the first step begins
         transitions : TransitionOptions    continuity between steps
 

@@ -124,7 +124,7 @@ def build_tree(
     ----------
     primitive : MotionPrimitive    the model
     seed : int    the same seed gives the same tree
-    options : TreeOptions    options
+    options : TreeOptions    number of samples, and shape of the tree
     end_effectors : sequence of int    joint indices; used if samples are clustered by the positions of end effectors
 
     Returns
