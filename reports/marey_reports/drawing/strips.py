@@ -269,7 +269,7 @@ def _draw_label(axes: Axes, row: StripRow, middle: float) -> None:
 
 
 def _lines(label: str) -> list[str]:
-    """Break a label into lines; a label that is too long even for them loses its middle."""
+    """Break a label into lines; a label that does not fit on these lines is shortened in its middle."""
     return wrap(shortened(label, MOST_LABEL_LINES * LABEL_LETTERS), LABEL_LETTERS) or [""]
 
 
