@@ -104,7 +104,7 @@ def merge_entries(
     ours, theirs : the entries that differ between the base and each side
     resolutions : decisions about conflicts. Each decides one conflict, or one part of a conflict. If several conflicts
         have the same key, the first resolutions with this key decide the first of these conflicts, and so on
-    merge_parts : merges the parts that both sides have changed; None: such parts are in conflict
+    merge_parts : merges the parts that both sides have changed; if None, such parts are in conflict
 
     Returns
     -------
