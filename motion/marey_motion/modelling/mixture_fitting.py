@@ -40,7 +40,7 @@ class MixtureCandidate:
     Parameters
     ----------
     components : int    number of components
-    covariance : str    kind of covariance
+    covariance : str    kind of covariance: "full", "tied" or "diagonal"
     bic, aic : float    Bayesian and Akaike information criterion
     log_likelihood : float    natural logarithm of the likelihood of all examples
     held_out_log_likelihood : float or None    mean log-likelihood of examples under mixtures that were fitted without
@@ -88,7 +88,7 @@ class FittedMixture:
     Parameters
     ----------
     mixture : LatentMixture    the mixture
-    covariance : str    kind of covariance; "point" for examples that do not vary
+    covariance : str    kind of covariance: "full", "tied", "diagonal", or "point" for examples that do not vary
     widening : float    factor of the covariances for likelihoods, at least 1. It applies to `held_out` and
         `held_out_subjects`, not to the candidates. If the options do not set the factor, it is the least of `WIDENINGS`
         with which at most 5 % of the left-out examples (rounded up) are below their thresholds (see `HeldOut`). It is

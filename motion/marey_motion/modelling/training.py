@@ -112,6 +112,9 @@ def train_primitive(
 def check_examples(aligned: AlignedSet) -> None:
     """Check that a model can be trained on examples.
 
+    There must be enough examples and canonical frames. In each example, all numbers must be finite, only rotations of
+    joints may vary, and the time function must be strictly increasing.
+
     Parameters
     ----------
     aligned : AlignedSet    the examples

@@ -272,7 +272,7 @@ def leave_one_motion_out(parts: Sequence[PairDifferences], perceived: Floats, sh
 
     Returns
     -------
-    (R,) float64    for each pair, the mean of two predictions: one without each motion of the pair
+    (R,) float64    for each pair, the mean of two predictions, each from a fit without one motion of the pair
 
     Raises
     ------

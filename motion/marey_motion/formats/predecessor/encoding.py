@@ -16,7 +16,7 @@ _BZ2_MARK = b"BZh"
 
 
 def encode_document(document: dict[str, Any], encoding: Encoding) -> bytes:
-    """Encode a document.
+    """Encode a document of Marey's predecessor as JSON, BSON, or BSON compressed with bz2.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ JOINTS, AXES = "joints", "cos_map"
 
 @dataclass(frozen=True)
 class PredecessorSkeletonModel:
-    """A skeleton model.
+    """A skeleton model of Marey's predecessor: standard joints of a skeleton, and anatomical axes of its joints.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def is_skeleton_model(document: Mapping[str, Any]) -> bool:
 
 
 def skeleton_model_of_document(document: Mapping[str, Any], skeleton: Skeleton, file: str) -> PredecessorSkeletonModel:
-    """Read a skeleton model.
+    """Read a skeleton model from a decoded document of Marey's predecessor.
 
     Parameters
     ----------

@@ -83,6 +83,10 @@ def as_log_slopes(
     -------
     components : FunctionalComponents    Marey's form
     error_frames : float    largest difference between the two forms at these scores, in frames
+
+    Raises
+    ------
+    FormatError    if the time function decreases, or if its slope is too steep or too flat
     """
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
         wanted = time.time_functions(scores)

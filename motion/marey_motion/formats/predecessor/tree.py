@@ -108,7 +108,7 @@ def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, en
     Parameters
     ----------
     tree : SampleTree    the samples
-    spatial : int    number of spatial components of a latent vector; these are written as the features of a sample
+    spatial : int    number of spatial scores at the start of a latent vector; they are written as the sample's features
     branching : int    largest number of children of a node
     encoding : str    "json", "bson" or "bson.bz2"
 
