@@ -64,9 +64,9 @@ def contact_sheet(
 ) -> bytes:
     """Draw a PNG with one row per take: at each of several times, the source and the result side by side.
 
-    The result has a tinted background. The figures of a take have the same scale and the same view: from the front left
-    of the source in its first frame, and nothing of a figure leaves its cell. Each figure is drawn over its own patch
-    of the floor y = 0, with an arrow in its facing direction.
+    The result has a tinted background. The figures of a take have the same scale, and are seen from the front left of
+    the source in its first frame. No part of a figure leaves its cell. Each figure is drawn over its own patch of the
+    floor y = 0, with an arrow in its facing direction.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def contact_sheet(
     moments : number of evenly spaced times at which a take is drawn, at most `MAX_MOMENTS` and one per frame
     total : number of takes from which the drawn takes were chosen; None if all takes are drawn
     choice : order in which they were chosen, such as "the worst first"; written only if not all takes are drawn
-    sides : what the clips on white and on tinted background are
+    sides : names, for the header, of the clips on the white and on the tinted background
 
     Raises
     ------
