@@ -45,7 +45,7 @@ class StripCell:
         return np.asarray(seen + below, dtype=np.float64)
 
 
-class Look(NamedTuple):
+class BodyStyle(NamedTuple):
     """Style of the lines of a body.
 
     If `colour` is None, each side of the body has its own colour. A `rim` is a light edge that separates overlapping
@@ -58,7 +58,7 @@ class Look(NamedTuple):
     rim: bool = False
 
 
-GHOST = Look(LINE_POINTS, 0.55, REFERENCE)
+GHOST = BodyStyle(LINE_POINTS, 0.55, REFERENCE)
 
 
 def draw_path(axes: Axes, path: Floats, frame: BboxBase) -> None:
@@ -98,7 +98,9 @@ def shapes_of(body: StickFigure, drawn: Iterable[Floats]) -> BodyShapes:
     )
 
 
-def draw_body(axes: Axes, shapes: BodyShapes, stage: StripCell, points: Floats, look: Look, frame: BboxBase) -> None:
+def draw_body(
+    axes: Axes, shapes: BodyShapes, stage: StripCell, points: Floats, look: BodyStyle, frame: BboxBase
+) -> None:
     """Draw the bones of a body with points (P, 3): each side as one shape, the far side before the near one."""
     from matplotlib.patches import Circle, PathPatch
 

@@ -25,7 +25,7 @@ from marey_reports.drawing.strip_bodies import (
     LINE_POINTS,
     SIDE_COLOURS,
     BodyShapes,
-    Look,
+    BodyStyle,
     StripCell,
     draw_body,
     draw_path,
@@ -287,6 +287,7 @@ def _draw_cell(axes: Axes, stage: StripCell, shapes: BodyShapes, row: StripRow, 
     if row.ghost is not None:
         draw_body(axes, shapes, stage, row.ghost[column], GHOST, frame)
     count = len(row.bodies)
-    look = Look(LINE_POINTS, rim=True) if count == 1 else Look(0.6 * LINE_POINTS, max(0.25, 1.0 / np.sqrt(count)))
+    faint = BodyStyle(0.6 * LINE_POINTS, max(0.25, 1.0 / np.sqrt(count)))
+    look = BodyStyle(LINE_POINTS, rim=True) if count == 1 else faint
     for points in row.bodies[:, column]:
         draw_body(axes, shapes, stage, points, look, frame)
