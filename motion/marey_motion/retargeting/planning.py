@@ -297,8 +297,8 @@ def _heights(
     hip, knee, ankle = (positions[joints[f"{side}_{joint}"]] for joint in ("hip", "knee", "ankle"))
     leg = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
     trunk = _trunk(skeleton, pelvis, up)
-    told = _shows_drop(skeleton, joints, up, side)
-    drop = float((positions[pelvis] - hip) @ trunk) if told else np.nan
+    known = _shows_drop(skeleton, joints, up, side)
+    drop = float((positions[pelvis] - hip) @ trunk) if known else np.nan
     toe = joints.get(f"{side}_toe")
     foot = np.nan if toe is None else FOOT_DROP * float(np.linalg.norm(positions[toe] - ankle))
     return drop, leg, foot

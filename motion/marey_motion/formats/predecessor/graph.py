@@ -148,9 +148,9 @@ def _transitions(
     if not isinstance(given, Mapping):
         raise FormatError(f"{'/'.join(place)}: 'transitions' must be an object", file=file)
     found = []
-    for key, told in given.items():
+    for key, target in given.items():
         action, _, model = key.rpartition(":")
-        wanted = told if isinstance(told, Mapping) else {}
+        wanted = target if isinstance(target, Mapping) else {}
         action = str(wanted.get("action_name", action))
         candidates = [(action, str(one)) for one in (wanted.get("model_id"), wanted.get("model_name"), model) if one]
         other = next((known[one] for one in candidates if one in known), None)
