@@ -216,7 +216,7 @@ class _Sides:
 
     @property
     def changed_parts(self) -> Iterator[ChangedPart]:
-        """The clashing parts, if both sides have the entry."""
+        """The clashing parts that have content on both sides; none if one of the sides has no such entry."""
         for part in self.clashes:
             if self.ours is not None and self.theirs is not None and part in self.ours.parts.keys() & self.theirs.parts:
                 yield ChangedPart(part, self.base, self.ours, self.theirs)
