@@ -96,7 +96,10 @@ class ComparedSubject:
         return self.comparison.runs[self.comparison.settings[setting].runs[0]]
 
     def points(self, field: str) -> list[Point]:
-        """Return the settings whose runs all have a number that can be drawn, in the order of `order_of`."""
+        """Return a point for each setting whose runs all have a number for `field` that can be drawn.
+
+        The points are in the order of `order_of`.
+        """
         found = []
         for place in self.order_of(field):
             setting = self.comparison.settings[place]

@@ -197,7 +197,7 @@ def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell
 
 
 def _norm(ceiling: float) -> Any:
-    """Make a square-root colour scale, on which small amounts of data can be distinguished from none."""
+    """Make a square-root colour scale from 0 to `ceiling`; it distinguishes small amounts of data from none."""
     from matplotlib.colors import PowerNorm
 
     return PowerNorm(0.5, vmin=0.0, vmax=ceiling)

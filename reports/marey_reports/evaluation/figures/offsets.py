@@ -43,7 +43,7 @@ FAMILY_TITLES: dict[Family, str] = {
 
 
 class _Field(NamedTuple):
-    """Mean offset of the trials of one family on their grid; NaN where there is no trial."""
+    """Mean offset in each trial of one family, by speed (rows) and turn rate (columns); NaN where there is no trial."""
 
     turn_rates_deg_s: Floats
     speeds_m_s: Floats
