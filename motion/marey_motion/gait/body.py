@@ -35,7 +35,7 @@ class GaitMoments:
     ----------
     times_s : (n,)    seconds
     phases : (n,)    strides done since time 0
-    root : RootState    the exact path
+    root : RootState    position, velocity and heading on the path, not smoothed
     """
 
     times_s: AnyFloats

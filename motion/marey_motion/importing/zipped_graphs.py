@@ -114,7 +114,10 @@ def _read_model(model: ZippedModel, skeleton: Skeleton, member: str) -> Predeces
 
 
 def _keyframes(given: Mapping[str, Any], frames: int, member: str) -> Iterator[tuple[str, int]]:
-    """Yield label and frame of each keyframe that the archive lists for a model; frames are limited to the motion."""
+    """Yield label and frame of each keyframe that the archive lists for a model.
+
+    Frames outside the motion become its first or last frame.
+    """
     for label, frame in given.items():
         if frame in _ENDS:
             yield label, frames - 1

@@ -51,7 +51,7 @@ class Judgements:
         if self.shown.shape != (trials, SHOWN) or {self.participants.shape, self.chosen.shape} != {(trials,)}:
             raise MotionError("each trial needs a participant, four motions and a chosen pair")
         if not trials:
-            raise MotionError("there are no answered trials")
+            raise MotionError("the judgements contain no answered trial; at least one is needed")
         ordered = np.sort(self.shown, axis=1)
         wrong = (ordered[:, 0] < 0) | (ordered[:, -1] >= self.motion_count) | (np.diff(ordered) == 0).any(axis=1)
         wrong |= (self.chosen < 0) | (self.chosen >= len(_FIRST)) | (self.participants < 0)

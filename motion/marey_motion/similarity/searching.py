@@ -33,9 +33,10 @@ _MORE_STEPS = 8
 
 
 class Hit(NamedTuple):
-    """Window that resembles the example: indices of shard, run (clip) and first row in the run, and its distance.
+    """Window that resembles the example, and its distance from the example.
 
-    `mirrored` is True if the mirrored example is nearer than the example itself.
+    `shard`, `run` and `row` are the indices of the shard, of the run (the clip) in the shard, and of the window's first
+    row in the run. `mirrored` is True if the mirrored example is nearer than the example itself.
     """
 
     shard: int
