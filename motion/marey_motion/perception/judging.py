@@ -185,7 +185,7 @@ def simulate_judgements(differences: Floats, participants: int, seed: int, noise
 
 
 def difference_table(judgements: Judgements) -> DifferenceTable:
-    """Count judgements.
+    """Compute the difference of each pair of motions: 1 minus the share of its showings in which it was chosen.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def difference_table(judgements: Judgements) -> DifferenceTable:
 
     Returns
     -------
-    DifferenceTable    differences and counts of all pairs
+    DifferenceTable    differences and counts of all pairs; NaN for pairs that were never shown together
     """
     n = judgements.motion_count
     shown, chosen = (counts.sum(axis=0) for counts in _counts_by_participant(judgements))
