@@ -33,7 +33,7 @@ HAIR_TURN = 0.75
 SIDES_UNNAMED, SIDES_GUESSED = 0.8, 0.7
 KNOWN_BY_REST_POSE = "were distinguished by the rest pose alone"
 GUESSED = "are a guess: no foot shows the direction the body faces, so left was taken for +x; check before use"
-# Plans that are worth so little less are as likely, and what that takes from the confidence.
+# Plans that are score so little less are as likely, and what that takes from the confidence.
 CLOSE, DOUBTED = 0.3, 0.6
 
 
@@ -70,8 +70,8 @@ def find_body(skeleton: Skeleton) -> GeometryMatch | None:
         return None
     # A neck costs more to look for than limbs do.
     necks = [_neck(tree, plan) for plan in plans[:MOST_PLANS]]
-    worths = [plan.worth + worth for plan, (worth, _) in zip(plans, necks, strict=False)]
-    best = int(np.argmax(worths))
+    scores = [plan.score + score for plan, (score, _) in zip(plans, necks, strict=False)]
+    best = int(np.argmax(scores))
     plan, (_, neck_and_head) = plans[best], necks[best]
     legs, arms = plan.legs, plan.arms
     joints = {"pelvis": tree.common_ancestor(legs.pair.parent, arms.pair.parent)}
@@ -90,7 +90,7 @@ def find_body(skeleton: Skeleton) -> GeometryMatch | None:
             places = (*range(3), -1 if reading is arms else 3)
             named = {f"{side}_{name}": reading.joint(limb, place) for name, place in zip(names, places, strict=True)}
             joints |= {name: index for name, index in named.items() if index is not None}
-    rivals = [one for one, worth in zip(plans, worths, strict=False) if worth > worths[best] - CLOSE]
+    rivals = [one for one, score in zip(plans, scores, strict=False) if score > scores[best] - CLOSE]
     doubts = _doubts(skeleton, plan, rivals)
     return GeometryMatch(joints, confidence * (DOUBTED if doubts else 1.0), (*notes, *doubts))
 
@@ -121,8 +121,8 @@ def _neck(tree: BoneTree, plan: BodyPlan) -> tuple[float, list[int]]:
     limbs = {limb.chain[0] for limb in arms.limbs} | set(skeleton.path_to_root(legs.parent))
     chains = [_neck_chain(tree, joint) for joint in skeleton.children[arms.parent] if joint not in limbs]
     found = [(_looks_like_neck(tree, plan, chain), chain) for chain in chains]
-    worth, chain = max(found, key=lambda one: one[0], default=(NO_NECK, []))
-    return max(worth, NO_NECK), chain
+    score, chain = max(found, key=lambda one: one[0], default=(NO_NECK, []))
+    return max(score, NO_NECK), chain
 
 
 def _neck_chain(tree: BoneTree, start: int) -> list[int]:
@@ -145,12 +145,12 @@ def _looks_like_neck(tree: BoneTree, plan: BodyPlan, chain: list[int]) -> float:
     parent = plan.arms.pair.parent
     length = float(np.sum(tree.lengths[chain]))
     up = unit(positions[parent] - positions[plan.legs.pair.parent])
-    worth = commonness(length / plan.legs.length, NECK_BY_LEG) + float(
+    score = commonness(length / plan.legs.length, NECK_BY_LEG) + float(
         up @ unit(positions[chain[-1]] - positions[parent])
     )
     extents = [tree.extent(joint) for joint in tree.skeleton.children[parent] if joint != chain[0]]
     has_twin = any(abs(extent - tree.extent(chain[0])) < TWIN * extent for extent in extents)
-    return worth + (NO_NECK if has_twin else 0.0)
+    return score + (NO_NECK if has_twin else 0.0)
 
 
 def _turn(skeleton: Skeleton, a: int, b: int, c: int) -> float:
