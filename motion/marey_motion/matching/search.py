@@ -109,7 +109,7 @@ def build_index(
         radius=float(np.sqrt(np.einsum("nd,nd->n", rows, rows).max())),
         boxed=True,
     )
-    boxed = _boxes_pay(index) if method == "auto" else method == "boxes"
+    boxed = _boxes_save_work(index) if method == "auto" else method == "boxes"
     return index._replace(boxed=boxed)
 
 
@@ -175,7 +175,7 @@ def _boxes(low: NDArray[np.float32], high: NDArray[np.float32], starts: NDArray[
     return np.ascontiguousarray(np.stack([low[lanes], high[lanes]], axis=2).transpose(0, 3, 2, 1))
 
 
-def _boxes_pay(index: SearchIndex) -> bool:
+def _boxes_save_work(index: SearchIndex) -> bool:
     """Return whether searches that use boxes save enough comparisons.
 
     This is measured by searches for queries whose first and second halves come from two random rows.
