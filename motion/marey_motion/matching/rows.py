@@ -109,7 +109,9 @@ def _poses(motion: Motion, carrier: Floats, root: SimulationRoot, body: Matching
     return poses.astype(np.float32)
 
 
-def _set_joints_above_carrier(poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body: MatchingBody) -> None:
+def _set_joints_above_carrier(
+    poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body: MatchingBody
+) -> None:
     """Set the joints above the carrier to their rest pose relative to the root, without moving the carrier.
 
     `rotations` (F, J, 4) is a view of the rotations in `poses`; both are changed in place. `facing` (F, 4) are the
