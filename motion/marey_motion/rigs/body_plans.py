@@ -17,25 +17,27 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_motion.rigs.limbs import BoneTree, LimbPair
 
-# Joints nearer than this to their parent are rigging aids.
+# Shorter distances between a joint and its parent are not bones, but aids of the rig.
 SHORTEST_BONE_M = 1e-3
-# Pairs and readings of each that are looked at; a rig with more of them than this is no person's.
+# Greatest numbers of pairs of chains, and of interpretations of each pair, that are compared.
 MOST_PAIRS, MOST_READINGS = 32, 4
-# A limb bends nowhere beyond so many joints.
+# Number of joints at the start of a chain among which hip, knee and ankle are looked for.
 LONGEST_CHAIN = 14
-# What no proportion costs more than.
+# Lowest score of a single proportion.
 LEAST_SCORE = -8.0
-# Two bones are one with a joint in the middle when they are straighter than this.
+# Least quotient of the direct distance and the length of a chain at which the chain counts as one straight bone.
 STRAIGHT = 0.998
+# Scores of each joint within a long bone, and of each additional bone before the limb.
 TWIST_JOINT, STRAIGHT_JOINT, BENT_JOINT, EXTRA_JOINT = -0.2, -0.8, -2.0, -0.4
-# Twist joints divide a bone evenly, but for this share of it.
+# Joints are twist joints if the parts of the bone differ by at most this share of its length.
 EVENNESS = 0.04
-# Rigs may end at the wrist or ankle, or soon after it.
+# Lowest score of a hand or foot that is shorter than usual, because rigs may end at the wrist or ankle.
 SHORT_END = -0.7
-# Score if a wrist branches into nothing, a hand, a hand and a thumb; into more, 1.
+# Score of a wrist by its number of children: none, a hand, a hand and a thumb. More children have the score 1.
 FINGERS = {0: 0.0, 1: 0.0, 2: 0.5}
+# Factor of 1 + the cosine of the angle between legs and trunk: the score falls if the legs point up.
 AGAINST_TRUNK = -1.5
-# Few have anything longer than their legs.
+# Factor of the logarithm of how much longer the longest pair of chains is than the legs: few people have longer limbs.
 SHORTER = -1.5
 
 
@@ -58,7 +60,7 @@ LEG = Build(ratio=(1.02, 0.15), end=(0.27, 0.5), before=0.35)
 ARM = Build(ratio=(1.12, 0.25), end=(0.32, 0.4), before=0.6)
 ARM_BY_LEG = (0.62, 0.2)
 TRUNK_BY_LEG = (0.42, 0.45)
-# Pairs that differ more from legs and arms are no such.
+# Limits of the length of an arm divided by the length of a leg; other pairs are not arms and legs.
 ARM_BY_LEG_LIMITS = (0.3, 1.2)
 
 
@@ -124,7 +126,7 @@ def body_plans(tree: BoneTree) -> list[BodyPlan]:
     arms = {pair: _readings(tree, pair, ARM) for pair in pairs}
     longest = max((reading.length for readings in legs.values() for reading in readings), default=0.0)
     plans = []
-    # What two pairs are to each other is worked out once for all their readings: a rig may be thousands of joints deep.
+    # The relation of two pairs is computed once for all their interpretations: a rig may be thousands of joints deep.
     for above, below in ((a, b) for a in pairs for b in pairs if tree.are_apart(b, a)):
         trunk = tree.distance(below.parent, above.parent)
         for leg, arm in product(legs[below], arms[above]):

@@ -17,23 +17,23 @@ from marey_motion.rigs.names import parse_name
 from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import Skeleton
 
-# Branches that reach less far than this share of their largest sibling are rigging aids too.
+# Branches that reach less far than this share of the reach of their largest sibling are aids of the rig.
 SMALL_BRANCH = 0.3
-# From the arms' branch to the head's joint, by the length of a leg.
+# Distance from the branch of the arms to the head's joint, divided by the length of a leg: usual value and spread.
 NECK_BY_LEG = (0.25, 0.6)
-# What no neck costs, or one that looks like anything else.
+# Score if there is no neck, and lowest score of a neck.
 NO_NECK = -2.5
-# Branches that differ less are left and right of something.
+# Branches whose lengths differ by less than this share are the left and right of a pair.
 TWIN = 0.02
-# Plans of the body whose necks are looked at.
+# Greatest number of interpretations of the body for which a neck is looked for.
 MOST_PLANS = 30
-# Cosine of the sharpest turn within a neck.
+# Cosine of the sharpest bend within a neck.
 HAIR_TURN = 0.75
 # Factors of the confidence where the sides are distinguished by the rest pose, or guessed.
 SIDES_UNNAMED, SIDES_GUESSED = 0.8, 0.7
 KNOWN_BY_REST_POSE = "were distinguished by the rest pose alone"
 GUESSED = "are a guess: no foot shows the direction the body faces, so left was taken for +x; check before use"
-# Plans that are score so little less are as likely, and what that takes from the confidence.
+# Interpretations whose score is lower by less than `CLOSE` are as likely; `DOUBTED` is then a factor of the confidence.
 CLOSE, DOUBTED = 0.3, 0.6
 
 
