@@ -315,10 +315,10 @@ def _collide(one: _Decided, placed: dict[str, _Decided], choices: Choices) -> Me
 def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None) -> tuple[str, ...]:
     """Return the names of the parts that both sides have changed in different ways.
 
-    A part and a part that is computed from it, such as a model and its sample tree, count as one part: if one side has
-    changed the model and the other side the tree, both names are returned, because our tree would not fit their model.
-    All other changed parts that are computed from a returned part are also returned, since they must come from the same
-    side.
+    A part and a part that is computed from it, such as a model and its sample tree, count as one part. If one side has
+    changed the model and the other side the tree, both names are returned, because the tree of one side would not fit
+    the model of the other side. All other changed parts that are computed from a returned part are also returned, since
+    they must come from the same side.
     """
     if ours is None or theirs is None:
         return ("entry",)

@@ -94,9 +94,9 @@ class ArchiveMember(NamedTuple):
 def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
     """Yield the header of each member of an archive, with the position of the member's bytes.
 
-    Only headers of the kind that `ArchiveWriter` writes are accepted: headers of other kinds, such as those for long
-    names, can make a reader use as much memory as the file has bytes. Raises `BadArchive` for other headers, and where
-    the file was cut off.
+    Only headers of the kind that `ArchiveWriter` writes are accepted. Other headers, such as those for long names, can
+    make a reader use as much memory as the file has bytes. Raises `BadArchive` for other headers, and if the file was
+    cut off.
     """
     size_bytes = file.seek(0, io.SEEK_END)
     position = 0
