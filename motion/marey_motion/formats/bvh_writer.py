@@ -70,10 +70,10 @@ def with_folded_positions(clip: Clip) -> Clip:
     """Make a clip in which only the root is translated.
 
     Some exporters write the path of the body to the hips, below a root that does not move. If a translated joint has
-    more than half of all joints at or below it, the root takes over its motion: the joint and the joints below it stay
-    exactly in place, but the root and all other joints move. Of several such joints, the one nearest to the root is
-    chosen. Every other translated joint gets its median translation as a constant offset. If its translation varied,
-    it and the joints below it are displaced by the difference.
+    more than half of all joints at or below it, the root takes over the motion of this joint. The joint and the joints
+    below it stay exactly in place, but the root and all other joints move. If several joints meet the condition, the
+    one nearest to the root is chosen. Every other translated joint gets its median translation as a constant offset. If
+    its translation varied, it and the joints below it are displaced by the difference.
 
     Parameters
     ----------

@@ -312,8 +312,8 @@ def _floor_penetration(tracks: Tracks) -> CheckWarning | None:
 def _gait(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
     """Find feet that slide under a travelling body (skating), or under a body that does not travel (walking in place).
 
-    The mean speed of the feet is weighted: a foot at height h above the ground has the weight 2 − 2^(h/H), and no
-    weight above H = 2.5 cm (Zhang et al., Mode-adaptive neural networks for quadruped control, 2018, section 7.3).
+    The mean speed of the feet is weighted: a foot at height h above the ground has the weight 2 − 2^(h/H). A foot above
+    H = 2.5 cm does not count. (Zhang et al., Mode-adaptive neural networks for quadruped control, 2018, section 7.3)
     """
     if clip.frame_count < 3:
         return []

@@ -89,8 +89,8 @@ def _as_json(rest: Mapping[str, Any], file: str) -> Tree:
 def _mapping_of(model: PredecessorSkeletonModel, guessed: Tree) -> Tree:
     """Return the members of a document `mapping` that replace those guessed from the skeleton.
 
-    If the model contains only one of the two axes of a joint (twist and swing), the second axis is computed from the
-    guessed axis: its component perpendicular to the first axis.
+    The model may contain only one of the two axes of a joint (twist and swing). The other axis is then the component
+    of the guessed axis that is perpendicular to the axis in the model.
     """
     axes: dict[str, Tree] = dict(guessed["axes"])
     for joint in {**model.twists, **model.swings}:

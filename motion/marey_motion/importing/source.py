@@ -87,8 +87,8 @@ class SourceDocument:
     """A decoded file of the predecessor that holds no motion.
 
     `subject` names the content: a model, a tree over the samples of a model, a graph of models, an annotation or an
-    alignment of a motion, a skeleton model, a zipped graph (a graph with its models in an archive, not decoded yet), or
-    a record of work. `document` is the decoded content.
+    alignment of a motion, a skeleton model, a zipped graph, or a record of work. `document` is the decoded content; for
+    a zipped graph (an archive of a graph with its models), the models in it are not decoded yet.
     """
 
     subject: Subject

@@ -191,8 +191,9 @@ class MotionPrimitive:
     def sample(self, count: int, seed: int) -> Floats:
         """Draw latent vectors from the mixture.
 
-        Vectors whose motions would be too short or too long are drawn again; each is redrawn independently of the
-        others, so that a smaller count gives the first vectors of a larger count.
+        Vectors whose motions would be too short or too long are drawn again, each independently of the others. So a
+        smaller count gives the first vectors of a larger count. After `MOST_ATTEMPTS` draws, a vector is returned as it
+        is.
 
         Parameters
         ----------

@@ -162,10 +162,10 @@ def measure_quality(
 
 
 def _beyond_limits(clip: Clip, body: QualityBody, options: QualityOptions) -> tuple[Floats, Floats | None]:
-    """Compute depth below the floor (F,) and excess of joint limits (F,) in every frame of the clip.
+    """Compute, per frame, the depth below the floor (F,) in metres and the excess of joint limits (F,) in degrees.
 
-    The clip is not resampled: these measures are compared with fixed limits, so they do not depend on the frame rate,
-    and a frame that resampling leaves out might be the worst one.
+    The clip is not resampled, because a frame that resampling leaves out might be the worst one. The measures do not
+    depend on the frame rate. The excess is None without knees and elbows.
     """
     motion, skeleton = Motion.of(clip), clip.skeleton
     points = _points(clip, motion)

@@ -159,14 +159,16 @@ def _still_near(query, rows, bounds, places, windows, layout, tables, limit):
 def step_distances(query, shard, bounds, steps, runs, layout, tables, rotations_at, most, out):
     """Lower the elements of out (n, size) to the distances of the windows that start in n steps of `size` rows.
 
-    An element does not change if it is less than the distance already, if the distance is above `most`, or if the
+    An element does not change if it is already less than the distance, if the distance is above `most`, or if the
     window exceeds its run.
 
-    query holds samples (T, width), offsets (T,), groups (T,), the order in which the distances of samples are added,
-    and the order in which their bounds are computed. bounds holds the bounds of groups (G, balls) and their sums (n,)
-    for the steps. steps (n,) are ascending. runs are the first rows, steps and balls of all runs. layout holds the
-    numbers of rows per step, of steps per ball and of vectors, and a scratch array with an element for each vector and
-    rotation.
+    * query holds samples (T, width), offsets (T,), groups (T,), the order in which the distances of samples are added,
+      and the order in which their bounds are computed.
+    * bounds holds the bounds of groups (G, balls), and their sums (n,) for the steps.
+    * steps (n,) are ascending.
+    * runs holds the first rows, steps and balls of all runs.
+    * layout holds the numbers of rows per step, of steps per ball and of vectors, and a scratch array with an element
+      for each vector and rotation.
     """
     samples, offsets, _, order, _ = query
     size, count = layout[0], samples.shape[0]

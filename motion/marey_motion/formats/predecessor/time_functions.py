@@ -182,7 +182,7 @@ def _written_count(primitive: MotionPrimitive) -> int:
     """Return the number of spline coefficients of a written time function: one for each canonical frame, if possible.
 
     The predecessor's training uses eight coefficients. With so few coefficients, the two forms of the predecessor and
-    the form of Marey represent different functions, and a time function would be up to a tenth of a frame off.
+    the form of Marey represent different functions: a time function would differ by up to a tenth of a frame.
     """
     return max(DEGREE + 1, min(KNOTS_AT_MOST, primitive.frame_count))
 
@@ -190,8 +190,8 @@ def _written_count(primitive: MotionPrimitive) -> int:
 def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
     """Draw the temporal scores (m, k) of m latent vectors from the model, and compute their time functions (m, N).
 
-    The limits that keep a model's motions within its examples' range are not applied, because with them the time
-    functions would not be close to a function that is linear in the scores.
+    The limits that keep a model's motions within its examples' range are not applied, because they would make the time
+    functions less linear in the scores.
     """
     free = replace(primitive, duration_range_s=None, log_slope_range=None)
     latents = free.sample(DRAWN, SEED)

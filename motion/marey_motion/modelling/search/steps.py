@@ -279,10 +279,10 @@ def _link(step: Step, ends: Sequence[Tracked], first: int) -> _Link:
 def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> tuple[Floats, Floats]:
     """Place a step so that it begins where the previous step ended.
 
-    Row 0 of `points` (2 or more, 3) is the position of the pelvis at the end of the previous step, and row 1 the axis
-    of the body at that time, from right to left. `slopes` (2 or more, 3, W) are the derivatives of the rows with
-    respect to the latent vectors `stacked` (W,) of all steps. Returns the placement (3,) of the step, as heading, x and
-    z, and its derivatives (3, W).
+    `points` (2 or more, 3) describes the end of the previous step: row 0 is the position of the pelvis, and row 1 the
+    axis of the body from right to left. `slopes` (2 or more, 3, W) are the derivatives of the rows with respect to the
+    latent vectors `stacked` (W,) of all steps. Returns the placement (3,) of the step, as heading, x and z, and its
+    derivatives (3, W).
     """
     width = len(stacked)
     begun, begun_slopes = np.empty((2, 3)), np.empty((2, 3, width))
