@@ -204,7 +204,7 @@ def _imported_tree(data: bytes, name: str, model_file: str, primitive: MotionPri
     tree = read_predecessor_tree(data, name)
     if tree.dimensions != primitive.dimensions:
         model = f"the latent vectors of {model_file} have {primitive.dimensions}"
-        message = f"the samples of the tree have {tree.dimensions} numbers, but {model}"
+        message = f"the samples of the tree have {tree.dimensions} numbers, but {model}; use the tree of this model"
         raise FormatError(message, code="tree-of-another-model", file=name)
     try:
         options = TreeOptions(

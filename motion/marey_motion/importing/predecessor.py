@@ -152,7 +152,10 @@ def _aligned_item(
     name = str(file.planned.notes)
     found = alignment_of_document(document, name)
     if len(found.frames) != len(motion["poses"]):
-        message = f"the time function has {len(found.frames)} canonical frames, but the clip {len(motion['poses'])}"
+        message = (
+            f"the time function has {len(found.frames)} canonical frames, but the clip {len(motion['poses'])}; import "
+            "the clip with its own alignment"
+        )
         raise FormatError(message, code="time-function-invalid", file=name)
     source_frames = int(found.frames.max()) + 1
     ends = [end for _, end in found.sections if end < len(found.frames)]

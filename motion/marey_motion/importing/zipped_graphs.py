@@ -106,7 +106,7 @@ def _read_model(model: ZippedModel, skeleton: Skeleton, member: str) -> Predeces
     found = model_of_document(decode_document(model.data, member), member, skeleton=skeleton)
     own = found.primitive.skeleton
     if not same_hierarchy(own, skeleton, tolerance_m=SAME_OFFSET_M):
-        message = "the model has another skeleton than the graph; unpack the archive, and import the files in it"
+        message = "the skeletons of the model and of the graph differ; unpack the archive, and import the files in it"
         raise FormatError(message, code="skeleton-mismatch", file=member)
     frames = found.primitive.frame_count
     listed = dict(_keyframes(model.keyframes, frames, member))
