@@ -17,7 +17,7 @@ from numba import njit
 _options = partial(njit, cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
 compiled = _options()
-# Fused multiply-add is the only liberty taken with IEEE arithmetic.
+# Fused multiply-add is the only deviation from IEEE arithmetic.
 contracted = _options(fastmath={"contract"})
 # For functions with so many arguments that a call costs as much as their work.
 inlined = _options(forceinline=True)

@@ -17,9 +17,9 @@ from marey_motion.skeleton import Skeleton
 
 REFLECTION = np.diag([-1.0, 1.0, 1.0])
 HALF_TURN_ABOUT_X = np.array([0.0, 1.0, 0.0, 0.0])
-# Rest poses whose bones mirror each other to within this count as symmetric: sides measured apart differ a little.
+# Greatest angle between bones and their mirrored counterparts in a symmetric rest pose; measured sides differ a little.
 SAME_DIRECTION_RAD = 0.05
-# Share of the spread of a joint's bones that must lie beside the longest direction for them to tell its twist.
+# Least share of the spread of a joint's bones that must lie beside the longest direction to determine its twist.
 SPREAD = 1e-3
 
 

@@ -12,7 +12,7 @@ from marey_motion.looping import LoopSeam, continue_motion
 from marey_motion.motion import Motion
 
 SAME_RATE = 1e-9
-# What a frame adds to a cubic spline falls to a quarter from one frame to the next: nothing is left after so many.
+# The influence of a frame on a cubic spline falls to about a quarter with each frame, and is negligible after so many.
 LOOP_REACH = 20
 # Channels interpolated at a time, so that an hour of motion needs little more memory than its own.
 CHANNELS = 32

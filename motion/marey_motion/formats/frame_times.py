@@ -12,11 +12,11 @@ KNOWN_RATES_HZ = (
     *(24000 / 1001, 30000 / 1001, 60000 / 1001, 120000 / 1001, 240000 / 1001),
 )
 SNAP_TOLERANCE = 1e-4
-# What six decimals of a frame time leave open needs no mention.
+# Smaller deviations have no warning, because frame times with six decimals are not more exact.
 NOTABLE_DEVIATION = 2e-5
-# Three decimals of a frame time can be this far from the rate they stand for.
+# Greatest deviation from the rate of a frame time that is rounded to three decimals.
 ROUNDED_DEVIATION = 0.02
-# Nobody records a body less often; such a "time" is a rate, or milliseconds.
+# A greater "frame time" is a rate, or is in milliseconds: no recording has fewer frames.
 LONGEST_FRAME_TIME_S = 1.0
 
 

@@ -20,10 +20,10 @@ from marey_motion.gait.path import RootState
 from marey_motion.gait.style import GaitStyle, eased
 from marey_motion.skeleton import Skeleton
 
-LEG_STRETCH = 0.99  # of the straight leg: a knee that locks would move with a jerk
-YIELDING_M = 0.10  # of a leg's length, over which a foot in mid-air begins to follow the stretched leg
-SMOOTHING_S = 0.12  # over which the pelvis gives way to a leg that would be out of reach
-BLENDING_S = 0.30  # over which trunk and arms follow a change of speed or turn
+LEG_STRETCH = 0.99  # greatest share of the length of the straight leg; a knee that locks would move with a jerk
+YIELDING_M = 0.10  # range of a leg's length over which a foot in mid-air begins to follow the stretched leg
+SMOOTHING_S = 0.12  # half of the window over which the pelvis is lowered for a leg that would be out of reach
+BLENDING_S = 0.30  # half of the window over which trunk and arms follow a change of speed or turn
 SIDES = {"Left": 1, "Right": -1}
 
 

@@ -20,10 +20,10 @@ from marey_motion.gait import style as styles
 from marey_motion.gait.path import RootPath, RootState
 from marey_motion.gait.style import GaitStyle, eased
 
-LANDING_SHARE = 0.18  # of the stance, in which a foot that lands tilted comes down flat
+LANDING_SHARE = 0.18  # share of the stance in which a foot that lands tilted comes down flat
 PUSH_OFF_START = 0.50  # share of the stance after which the foot rolls off
 EARLY_PEAK = 729.0 / 16.0  # makes s²(1 - s)⁴ reach 1, at a third of the swing, where the heel is highest
-ROUNDING_M = 0.05  # greatest height over which a swinging foot changes what it keeps clear of the floor
+ROUNDING_M = 0.05  # greatest height over which the lowest part of a swinging foot changes from heel to ball or toes
 STILL_M = 1e-9  # lift below which a foot has not left the floor
 SHORT_STEP_M = 0.12  # shorter steps are lifted less; no step, no lift
 

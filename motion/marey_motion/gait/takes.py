@@ -21,7 +21,7 @@ from marey_motion.gait.style import GaitStyle
 from marey_motion.skeleton import Skeleton
 
 MAX_FRAMES = 1_000_000
-BEHIND_ANKLE = 0.64  # of the ankle's height: how far the heel is behind the ankle
+BEHIND_ANKLE = 0.64  # distance of the heel behind the ankle, as a share of the ankle's height
 
 
 class GeneratedTake(NamedTuple):

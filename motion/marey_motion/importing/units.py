@@ -31,13 +31,14 @@ from marey_schemas.formats import UNITS_M
 from marey_schemas.options.imports import Handedness, ImportOptions, UpAxis
 
 CONVENTIONAL_UNITS = ("m", "cm", "mm")
-# Adults, from the joint that carries both legs down the bones to the ankle. No length fits two units in these bounds.
+# Lengths of the legs of adults, along the bones from the joint that carries both legs to the ankle. The range is so
+# small that no length fits two units.
 LEG_LENGTH_M = (0.72, 1.2)
-# Bodies of any kind, such as children and animals.
+# Lengths of the legs of bodies of any kind, such as children and animals.
 ANY_LEG_LENGTH_M = (0.1, 1.5)
 
 _MIRRORED_COSINE = -0.2
-# Height of the hips of a body that stands, by the length of a leg.
+# Least height of the hips of a body that stands, as a share of the length of a leg.
 _STANDING_SHARE = 0.7
 
 
@@ -165,7 +166,7 @@ def _doubtful_unit(unit_m: float, legs_m: float, origin: str) -> CheckWarning:
 def _unit_of_leg(body: BodyMeasures, hip_height: float, up_axis: UpAxis, stated: float | None) -> float:
     assert body.leg is not None
     (low, high), known, reason = LEG_LENGTH_M, tuple(UNITS_M), "legs"
-    # The names of a known rig count before what the body does: people crawl and turn cartwheels, too.
+    # The names of a known rig have precedence over the motion: people crawl and turn cartwheels, too.
     if not body.landmarks.by_names and walks_on_hands(body, up_axis):
         (low, high), known, reason = ANY_LEG_LENGTH_M, CONVENTIONAL_UNITS, "hands stay on the ground, and legs"
     elif not body.landmarks.by_names:

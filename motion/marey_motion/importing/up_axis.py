@@ -24,15 +24,16 @@ from marey_motion.importing.source import SourceMotion
 from marey_schemas.options.imports import ImportOptions, UpAxis
 
 _CLEAR_COSINE = 0.8
-# Legs and trunk that point the same way: no pose of a body, but bones all put on one line.
+# Below this cosine between legs and trunk, the pose is not one of a body: all bones are on one line.
 _FOLDED_COSINE = -0.9
 _FOLDED = "rest pose that is none of a body, with legs and trunk pointing the same way"
 _FLAT_GROUND = 0.1
 _CLEARLY_FLATTER = 3.0
 # Sum of the cosines of motion and rest pose, along the same axis, that is as clear as one upright body.
 _AGREEING_COSINES = 1.4
-# What speaks for an axis if the rig is known by its names; a cosine of the motion counts as itself. The rest pose of a
-# known rig counts most, because the body may lie, crawl or roll. Flat ground counts less: a roll is flat sideways, too.
+# Weights of the evidence for an axis if the rig is known by its names; a cosine of the motion is its own weight. The
+# rest pose of a known rig counts most, because the body may lie, crawl or roll. Flat ground counts less, because the
+# lowest point of a body that rolls also stays at one height along a horizontal axis.
 _REST_VOTE, _FLAT_VOTE, _UPRIGHT_VOTE, _ALL_FOURS_VOTE, _GROUND_VOTE = 1.5, 0.6, 0.8, 0.9, 0.4
 # The body is on the ground along this axis, but not along the axis of its rest pose.
 _ONLY_GROUND_VOTE = 1.0

@@ -16,7 +16,7 @@ import numpy as np
 from marey_motion.kernels import compiled
 from marey_motion.matching.search_kernels import cost_of, nearest, nearest_weighted
 
-# How the wished trajectory is taken from the reference.
+# Ways to follow the desired path.
 BY_TIME = 0
 BY_PATH = 1
 OPEN_LOOP = 2
@@ -30,7 +30,7 @@ FORCED = 3
 # If the desired motion changes by more than this from one tick to the next, a search is made at once.
 JUMP_M_S = 0.5
 JUMP_RAD = np.pi / 6
-# The nearest point of the path is looked for so far from the last one, or a lap could be skipped.
+# The nearest point of the path is searched for only within this time of the last one, so that no lap is skipped.
 PATH_WINDOW_S = 0.5
 
 

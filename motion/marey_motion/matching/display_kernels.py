@@ -11,7 +11,7 @@ import numpy as np
 
 from marey_motion.kernels import compiled, product
 
-# Offsets below this, in metres or radians and the same per second, are below what float32 poses can show.
+# Smaller offsets (in metres or radians) and velocities (per second) cannot be represented in float32 poses.
 FORGOTTEN = 1e-9
 # Half of an angle, squared, below which the first terms of the series are exact to the last bit.
 SMALL = 1e-4

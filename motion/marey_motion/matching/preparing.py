@@ -23,7 +23,7 @@ from marey_motion.skeleton import SAME_OFFSET_M, Skeleton, same_hierarchy
 from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.wording import counted
 
-# The seam of a loop is measured in steps between its frames.
+# If the seam of a loop is shorter than this share of a step between frames, the last frame repeats the first.
 REPEATED_STEPS = 0.2
 OPEN_STEPS = 3.0
 STILL_RAD = 1e-4

@@ -20,8 +20,8 @@ LARGEST = 1e18
 
 _SIXTEEN = 16
 _PROBES = 32
-# Where more than this share of the blocks has to be looked at, going through all of them in order is quicker. Measured
-# on captured motion with ever more noise: both take the same time at some place between 0.25 and 0.45.
+# If searches visit more than this share of the blocks, a scan of all blocks in order is faster. In measurements on
+# captured motion with increasing noise, both took the same time at a share between 0.25 and 0.45.
 _SCAN_ABOVE = 0.35
 
 

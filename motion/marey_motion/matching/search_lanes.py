@@ -22,7 +22,7 @@ _ZEROS = ir.Constant(_SIXTEEN, [0.0] * LANES)
 _UNDEFINED = ir.Constant(_SIXTEEN, ir.Undefined)
 _FIRST_LANE = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
 
-# Even and odd dimensions are summed apart: two additions can then be under way at once.
+# Even and odd dimensions are summed separately, so that the processor can do two additions at the same time.
 DIMENSIONS_PER_STEP = 2
 
 Values = list[ir.Value]

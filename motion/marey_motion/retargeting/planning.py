@@ -17,11 +17,11 @@ from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, JointAxes, Join
 from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import SAME_SKELETON_M, Skeleton, same_hierarchy
 
-FEWEST_ESSENTIAL = 8  # of the essential joints: a pelvis, and more than the legs or the arms alone
-SAME_RAD = 1e-6  # by which axes may differ that went through a document
+FEWEST_ESSENTIAL = 8  # least number of essential joints: a pelvis, and more than the legs or the arms alone
+SAME_RAD = 1e-6  # greatest angle between equal axes of which one was stored in a document
 SAME_DIRECTION = 0.94  # cosine of about 20 degrees: bones of one rig on two people differ by less
-STANDING = 0.7  # cosine between legs and trunk from which a rest pose is taken for one that stands
-FOOT_DROP = 0.45  # of the ankle-to-toe length: the height of the ankle above the toe of a foot that stands
+STANDING = 0.7  # least cosine between legs and trunk in a rest pose that stands
+FOOT_DROP = 0.45  # height of the ankle above the toe of a standing foot, as a share of the distance from ankle to toe
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ class Build:
     its logarithm; `before` is an upper limit.
     """
 
-    ratio: tuple[float, float]  # upper by lower long bone
+    ratio: tuple[float, float]  # upper divided by lower long bone
     end: tuple[float, float]  # what follows, to the tip of toes or fingers, by both long bones
     before: float  # most that precedes the long bones, by their length
 

@@ -44,7 +44,7 @@ _STATES = {"start_states": "start", "end_states": "end", "idle_states": "idle", 
 _MOST_MEMBERS = 4 * MOST_PRIMITIVES
 # Methods whose members `zipfile` unpacks only up to the declared size.
 _BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-# All that a damaged or hostile archive raises; RuntimeError stands for encryption and for unknown compression, too.
+# Errors that a damaged or hostile archive can raise; encryption and unknown compression raise RuntimeError.
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile, zlib.error, struct.error, EOFError, IndexError, OSError, OverflowError, RuntimeError,
     ValueError,
