@@ -31,7 +31,7 @@ def change(store: ChunkStore, root: str, changes: Changes) -> str:
 
 
 class _Change:
-    """Change of one tree."""
+    """Change of the tree with the root digest `root`: rewrites the chunks with changed keys, level by level."""
 
     def __init__(self, writer: ChunkWriter, root: str) -> None:
         self._writer = writer
