@@ -212,7 +212,7 @@ def _at_rate(clip: Clip, rate_hz: float) -> Motion:
 
 
 def _points(clip: Clip, motion: Motion) -> Floats:
-    """Compute the positions (F, J + E, 3) of joints and end sites."""
+    """Compute the positions (F, J + E, 3) of joints and end sites in the world, in metres."""
     found = kinematics.forward_kinematics(
         clip.skeleton,
         motion.poses,
