@@ -58,7 +58,11 @@ def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: Figu
     families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
     if not families:
         wanted = ", ".join(FAMILY_TITLES)
-        raise MotionError(f"the figure needs trials on a grid of speeds and turn rates: {wanted}", code="unknown-trial")
+        raise MotionError(
+            f"the figure shows trials of the families {wanted}, but the evaluation has none of them; evaluate with at "
+            "least one of these families",
+            code="unknown-trial",
+        )
     fields = [[_field(subject, family) for subject in subjects] for family in families]
     levels = nice_levels(max(_largest(field) for row in fields for field in row))
     if len(subjects) == 1:

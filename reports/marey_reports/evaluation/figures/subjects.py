@@ -109,7 +109,8 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
         raise MotionError(f"the evaluation has no trial {name!r}", code="unknown-trial")
     if len(subject.result.records) != len(names):
         raise MotionError(
-            "this figure needs the records of all trials, but the evaluation does not contain them",
+            "this figure needs the records of all trials, but they were not read with the evaluation; read its part "
+            "`records`, too",
             code="records-missing",
             where=name,
         )
