@@ -37,7 +37,7 @@ class FoundOrigin(NamedTuple):
 
 @dataclass
 class _OriginSearch:
-    """Search through the history, from later commits to earlier ones."""
+    """Search for the commits that gave an entry its parts, path and tags, from later commits to earlier ones."""
 
     reader: ChunkReader
     commit_of: Callable[[str], HistoricCommit]
