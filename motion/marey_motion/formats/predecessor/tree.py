@@ -50,7 +50,7 @@ def read_predecessor_tree(data: bytes, file: str) -> SampleTree:
 
     Returns
     -------
-    SampleTree    the samples
+    SampleTree    the samples, grouped in the tree
 
     Raises
     ------
