@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from marey_motion.formats.predecessor.credentials import has_text, is_secret_list, is_secret_name, contains_credential
+from marey_motion.formats.predecessor.credentials import contains_credential, has_text, is_secret_list, is_secret_name
 from marey_motion.formats.texts import cut_text, plain_text
 from marey_schemas.documents.predecessor_records import HIDDEN, LONGEST_TEXT, MOST_SHOWN, FieldValue, RecordForm
 

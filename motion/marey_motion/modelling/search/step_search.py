@@ -18,10 +18,10 @@ from marey_motion.modelling.search.optimise import DEFAULT_REFINING, Refined, re
 from marey_motion.modelling.search.samples import FoundSamples, search_closely
 from marey_motion.modelling.search.steps import (
     DEFAULT_TRANSITIONS,
-    StepStart,
     Measured,
     SeveralSteps,
     Step,
+    StepStart,
 )
 from marey_motion.modelling.search.tree import SampleTree
 from marey_schemas.options.searching import CANDIDATES, PASSES, RefineOptions, TransitionOptions
