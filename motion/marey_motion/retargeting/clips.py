@@ -50,13 +50,10 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
     bones. If the target is the source skeleton itself, the clip keeps its translations. The path of the pelvis is the
     source's path times the plan's scale. A root above the pelvis moves with the pelvis without turning.
 
-    There are three corrections:
-
-    * Pelvis, spine and neck are turned, where necessary, so that the line of the hips and the spine have the directions
-      that they have in the source.
-    * If a rest pose does not show how far the hips are below the pelvis, the middle of the hips follows the scaled path
-      of the source, instead of the pelvis.
-    * If the soles would not stand on the floor of the source, the whole clip is moved up or down.
+    There are three corrections. Pelvis, spine and neck are turned, where necessary, so that the line of the hips and
+    the spine have the directions that they have in the source. If a rest pose does not show how far the hips are below
+    the pelvis, the middle of the hips follows the scaled path of the source, instead of the pelvis. If the soles would
+    not stand on the floor of the source, the whole clip is moved up or down.
 
     Parameters
     ----------
