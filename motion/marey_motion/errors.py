@@ -119,7 +119,7 @@ class RotationError(MotionError):
 
 
 class MappingError(MotionError):
-    """The joint mapping lacks standard names that the operation needs.
+    """The joint mapping, or the axes of the mapped joints, cannot be used for the requested operation.
 
     Examples
     --------
@@ -142,13 +142,13 @@ class AnnotationError(MotionError):
 
 
 class EditError(MotionError):
-    """The command cannot be applied to this motion."""
+    """The editing command cannot be applied to this motion."""
 
     default_code = "edit-invalid"
 
 
 class ModelError(MotionError):
-    """No model can be trained on the examples, or the numbers are not a valid model."""
+    """No model can be trained on the given examples, or the numbers of a stored model are not valid."""
 
     default_code = "model-invalid"
 
@@ -232,7 +232,7 @@ class AmbiguousUnits(FormatError):
 
 
 class ContradictedOption(FormatError):
-    """A unit, an upward axis or a frame rate was given that the motion in the file contradicts.
+    """The motion in the file contradicts the unit, the upward axis or the frame rate that the caller gave.
 
     Examples
     --------

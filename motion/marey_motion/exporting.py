@@ -85,7 +85,7 @@ def write_motion_file(
     time: Literal["canonical", "source"] = "canonical",
     skeleton: Skeleton | None = None,
 ) -> ExportedFile:
-    """Write the motion of a clip, or of an aligned clip, as a file. Server and worker both use this function.
+    """Write the motion of a clip, or of an aligned clip, as a file.
 
     Parameters
     ----------

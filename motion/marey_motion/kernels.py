@@ -17,7 +17,7 @@ from numba import njit
 _options = partial(njit, cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
 compiled = _options()
-# Fused multiply-add is the only liberty taken with IEEE arithmetic.
+# Fused multiply-add is the only deviation from IEEE arithmetic.
 contracted = _options(fastmath={"contract"})
 # For functions with so many arguments that a call costs as much as their work.
 inlined = _options(forceinline=True)
@@ -28,7 +28,8 @@ contracted_inlined = _options(forceinline=True, fastmath={"contract"})
 def product(a, b):
     """Return the rotation that applies `b`, then `a`.
 
-    The function is inlined before types are inferred, so that the caller's rules of arithmetic apply to the function.
+    The function is inlined before types are inferred, so that the caller's options for floating-point arithmetic, such
+    as fused multiply-add, also apply to this function.
     """
     return (
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],

@@ -21,7 +21,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.options.contacts import TOE_SPEED_M_S
 
 CONTACT_WINDOW_S = 0.1
-# A sideways axis shorter than this on the ground belongs to a body lying on its side and says nothing of its heading.
+# If the sideways axis is shorter than this on the ground, the body lies on its side and has no defined heading.
 SHORTEST_LATERAL_M = 1e-3
 _KEPT_CHAINS = 256
 

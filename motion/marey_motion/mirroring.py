@@ -17,9 +17,9 @@ from marey_motion.skeleton import Skeleton
 
 REFLECTION = np.diag([-1.0, 1.0, 1.0])
 HALF_TURN_ABOUT_X = np.array([0.0, 1.0, 0.0, 0.0])
-# Rest poses whose bones mirror each other to within this count as symmetric: sides measured apart differ a little.
+# Greatest angle between bones and their mirrored counterparts in a symmetric rest pose; measured sides differ a little.
 SAME_DIRECTION_RAD = 0.05
-# Share of the spread of a joint's bones that must lie beside the longest direction for them to tell its twist.
+# Least share of the spread of a joint's bones that must lie beside the longest direction to determine its twist.
 SPREAD = 1e-3
 
 
@@ -75,7 +75,7 @@ def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
 
 
 def mirror_motion(skeleton: Skeleton, partners: AnyInts, motion: Motion) -> Motion:
-    """Reflect a motion in x, like `mirror_clip`, but in double precision.
+    """Reflect a motion in x, which exchanges the motion of left and right limbs, in double precision.
 
     Parameters
     ----------
@@ -127,7 +127,8 @@ def _mirror_of(skeleton: Skeleton, pairing: tuple[int, ...]) -> _Mirror:
 def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.bool_], joint: int) -> Floats:
     """Return the improper matrix (3, 3) that maps the local axes of a joint's source to those of the joint.
 
-    The source is the joint from which the joint gets its motion. `sources` and `carried` are described in `_Mirror`.
+    The source is the joint from which the joint gets its motion. `sources` (J,) are the sources of all joints;
+    `carried` (J,) is True for joints without a counterpart, which keep their local motion.
     """
     source = sources[joint]
     rest = quaternions.as_matrix(skeleton.rest_global_rotations[[joint, source]])

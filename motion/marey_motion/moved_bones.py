@@ -19,9 +19,9 @@ from marey_motion.clip import Clip
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.rigs.axes import bone_end
 
-# Bones that turn less are left as their joints' rotations have them.
+# Bones with smaller rotations are not corrected.
 LEAST_TURN_DEG = 0.1
-# Joints nearer to each other point nowhere.
+# The bone between joints at a smaller distance has no direction.
 SHORTEST_BONE_M = 1e-4
 
 

@@ -12,7 +12,7 @@ from marey_motion.looping import LoopSeam, continue_motion
 from marey_motion.motion import Motion
 
 SAME_RATE = 1e-9
-# What a frame adds to a cubic spline falls to a quarter from one frame to the next: nothing is left after so many.
+# The influence of a frame on a cubic spline falls to about a quarter with each frame, and is negligible after so many.
 LOOP_REACH = 20
 # Channels interpolated at a time, so that an hour of motion needs little more memory than its own.
 CHANNELS = 32
@@ -48,13 +48,17 @@ def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = N
 
 
 def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopSeam | None = None) -> Motion:
-    """Sample a motion at another frame rate, as `resample_clip` does, but in double precision.
+    """Sample a motion at another frame rate, in double precision.
+
+    The first sample is the first frame, and no sample lies beyond the last frame. Positions and rotations follow cubic
+    splines. If all samples fall on frames, these frames are copied unchanged.
 
     Parameters
     ----------
     motion : Motion    F frames
     from_hz, to_hz : float    frame rates of the motion and of the result
-    seam : LoopSeam, optional    as for `resample_clip`
+    seam : LoopSeam, optional    the transition from the end of a loop to its start; None if the motion is not a loop.
+        The duration of a loop is rounded to a whole number of sample intervals.
 
     Returns
     -------

@@ -120,7 +120,8 @@ def root_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: 
     motion : Motion    result of `body_first`, or an edit of it
     skeleton : Skeleton    its joints
     carrier : int    joint that carries the body
-    root_stays : bool    as for `body_first`
+    root_stays : bool    True if the root is a static reference, whose rotation does not depend on the body; the same
+        value as for `body_first`
 
     Returns
     -------

@@ -243,7 +243,7 @@ def _perceive(clip: Clip) -> None:
 
 
 def _find_similar(clip: Clip) -> None:
-    """Compile the kernels of searches by example: search for a window of a clip, in a file as searches map it."""
+    """Compile the kernels of searches by example: search a shard file for a window of a clip."""
     from marey_motion.matching.body import MatchingBody
     from marey_motion.motion import Motion
     from marey_motion.perception.metric import published_metric

@@ -32,7 +32,7 @@ def nearest_common(commit_of: Callable[[str], HistoricCommit], ours: str, theirs
 
     A common ancestor is nearest if no other common ancestor descends from it. A commit counts as its own ancestor. The
     search reads commits in the order of decreasing generation. It stops when all commits that are left to read are
-    ancestors of common ancestors. So its time does not depend on the length of the history before the common ancestors.
+    ancestors of common ancestors. So the time of the search does not depend on the length of the history before them.
 
     Parameters
     ----------

@@ -6,13 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 
 
 class BadCommitSearch:
-    """Search for the first bad commit. The suspects are the commits that can be this commit; tests exclude some.
+    """Search for the first bad commit, by tests of commits.
 
-    The search assumes that the commits after a bad commit are bad, and that the ancestors of a good commit are good. A
-    test leaves one number of suspects if the tested commit is bad, and another number if it is good. The search tests
-    the commit for which the larger of the two numbers is smallest. In a history without merges, this takes at most
-    log2(n) tests for n commits, rounded up. With merges, which have two parents, a test leaves about two thirds of the
-    commits in the worst case.
+    The suspects are the commits that can be the first bad commit. Every test excludes some of them. The search assumes
+    that the commits after a bad commit are bad, and that the ancestors of a good commit are good. A test leaves one
+    number of suspects if the tested commit is bad, and another number if it is good. The search tests the commit for
+    which the larger of the two numbers is smallest. In a history without merges, this takes at most log2(n) tests for n
+    commits, rounded up. With merges, which have two parents, a test leaves about two thirds of the commits in the worst
+    case.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Resolutions of a merge: which of them decides which conflict, or which part of a conflict."""
+"""Assignment of the resolutions of a merge to the conflicts, or parts of conflicts, that they decide."""
 
 from __future__ import annotations
 

@@ -36,8 +36,9 @@ class MergeConflict(NamedTuple):
     clash: AnnotationClash | None = None
     """The reason why an annotation could not be merged segment by segment."""
     no_way_back: str | None = None
-    """Path to which an entry would have to return, but at which another entry is. Set only if a resolution has decided
-    the conflict; the conflict remains, because the entry would be lost.
+    """Path to which one of two entries would return after a resolution, but at which there is another entry; else None.
+
+    In this case, the conflict remains in spite of the resolution, because the first entry would be lost.
     """
 
     @property
@@ -103,7 +104,7 @@ def merge_entries(
     ours, theirs : the entries that differ between the base and each side
     resolutions : decisions about conflicts. Each decides one conflict, or one part of a conflict. If several conflicts
         have the same key, the first resolutions with this key decide the first of these conflicts, and so on
-    merge_parts : merges the parts that both sides have changed; None: such parts are in conflict
+    merge_parts : merges the parts that both sides have changed; if None, such parts are in conflict
 
     Returns
     -------
@@ -166,7 +167,7 @@ class _Decided(NamedTuple):
         return self.merged
 
     def place_beside(self, key: str) -> str | None:
-        """Return the path to which this entry returns if another entry gets `key`, or None if there is no such path.
+        """Return the earlier path of this entry, for the case that another entry gets `key`; None without such a path.
 
         This is the path of the entry on our side. If our side does not have the entry, or has it at `key`, it is the
         path in the base.
@@ -215,7 +216,7 @@ class _Sides:
 
     @property
     def changed_parts(self) -> Iterator[ChangedPart]:
-        """The clashing parts, if both sides have the entry."""
+        """The clashing parts that have content on both sides; none if one of the sides has no such entry."""
         for part in self.clashes:
             if self.ours is not None and self.theirs is not None and part in self.ours.parts.keys() & self.theirs.parts:
                 yield ChangedPart(part, self.base, self.ours, self.theirs)
@@ -257,23 +258,23 @@ def _decide(sides: _Sides, choices: Choices) -> _Decided | MergeConflict:
 
 
 def _apply(decided: Sequence[_Decided], mine: Iterable[ComparedEntry], choices: Choices, merged: MergedEntries) -> None:
-    """Add changes of our tree to `merged`; if another entry already has the new key of an entry, add a conflict.
+    """Add the changes of our tree to `merged`, and a conflict for each key that two entries should get.
 
-    If two entries should get the same key, and this cannot be resolved, a conflict is added. `mine` contains the
-    entries that our side has changed.
+    A resolution in `choices` can decide which of the two entries gets the key; then no conflict is added. `mine`
+    contains the entries that our side has changed.
     """
-    held = {one.after.key: _Decided(one.before, one.after, one.before, one.after) for one in mine if one.after}
+    placed = {one.after.key: _Decided(one.before, one.after, one.before, one.after) for one in mine if one.after}
     for one in decided:
         if one.ours is not None:
-            held.pop(one.ours.key, None)
+            placed.pop(one.ours.key, None)
             merged.changes[one.ours.key] = None
-    held.update((one.result.key, one) for one in decided if one.merged is not None and not one.moves)
+    placed.update((one.result.key, one) for one in decided if one.merged is not None and not one.moves)
     # Entries that go back to the base come first, so that a conflict never lists an entry of theirs as ours.
     moving = sorted((one for one in decided if one.moves), key=_gets_place_of_theirs)
-    colliding = [one for one in moving if held.setdefault(one.result.key, one) is not one]
+    colliding = [one for one in moving if placed.setdefault(one.result.key, one) is not one]
     # Collisions come last, so that no entry goes back to a place that another entry gets.
-    merged.conflicts += (conflict for one in colliding if (conflict := _collide(one, held, choices)) is not None)
-    for key, one in held.items():
+    merged.conflicts += (conflict for one in colliding if (conflict := _collide(one, placed, choices)) is not None)
+    for key, one in placed.items():
         if one.merged == one.ours:
             merged.changes.pop(key, None)
             continue
@@ -286,15 +287,15 @@ def _gets_place_of_theirs(one: _Decided) -> bool:
     return one.theirs is not None and one.merged is not None and one.theirs.key == one.merged.key
 
 
-def _collide(one: _Decided, held: dict[str, _Decided], choices: Choices) -> MergeConflict | None:
+def _collide(one: _Decided, placed: dict[str, _Decided], choices: Choices) -> MergeConflict | None:
     """Decide which of two entries gets a key; the other entry returns to its earlier path.
 
-    `held` contains entries by key; one of them has the key that `one` should get. If a side has added the entry that
+    `placed` contains entries by key; one of them has the key that `one` should get. If a side has added the entry that
     does not get the key, this entry has no earlier path and is dropped. The result is a conflict if there is no
     resolution, or if the earlier path is taken.
     """
     key = one.result.key
-    other = held[key]
+    other = placed[key]
     conflict = MergeConflict(None, other.merged, one.merged, ("path",))
     choice = choices.take(key, {"path": ("path",)}, tuple(Side))
     if not isinstance(choice, Side):
@@ -304,19 +305,20 @@ def _collide(one: _Decided, held: dict[str, _Decided], choices: Choices) -> Merg
     winner, loser = (one, other) if choice is Side.THEIRS else (other, one)
     if (back := loser.place_beside(key)) is not None:
         moved = loser.at(back)
-        if moved.result.key in held:
+        if moved.result.key in placed:
             return conflict._replace(no_way_back=back)
-        held[moved.result.key] = moved
-    held[key] = winner
+        placed[moved.result.key] = moved
+    placed[key] = winner
     return None
 
 
 def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None) -> tuple[str, ...]:
-    """Return the parts that both sides have changed in different ways.
+    """Return the names of the parts that both sides have changed in different ways.
 
-    If a part is computed from another part, the two count as one. If one side has changed the first part and the other
-    side the second part, both parts are returned. For example, our sample tree does not fit the model of their side.
-    Then everything else that was computed from the model is returned, too, because it must come from the same side.
+    A part and a part that is computed from it, such as a model and its sample tree, count as one part. If one side has
+    changed the model and the other side the tree, both names are returned, because the tree of one side would not fit
+    the model of the other side. All other changed parts that are computed from a returned part are also returned, since
+    they must come from the same side.
     """
     if ours is None or theirs is None:
         return ("entry",)

@@ -37,7 +37,7 @@ class FoundOrigin(NamedTuple):
 
 @dataclass
 class _OriginSearch:
-    """Search through the history, from later commits to earlier ones."""
+    """Search for the commits that gave an entry its parts, path and tags, from later commits to earlier ones."""
 
     reader: ChunkReader
     commit_of: Callable[[str], HistoricCommit]
@@ -60,7 +60,10 @@ class _OriginSearch:
         return None if value is None else entry_of(key, value)
 
     def before(self, parent: str, commit: str, key: str) -> DatasetEntry | None:
-        """Return the entry in a parent of the commit, perhaps under another key; None if the parent lacks it."""
+        """Return the entry of `parent` that became the entry `key` of `commit`; None if there is no such entry.
+
+        The entry may have another key in the parent.
+        """
         trees = [self.commit_of(one).tree for one in (parent, commit)]
         same, present = self.entry(parent, key), self.entry(commit, key)
         if trees[0] == trees[1] or (same and present and same.parts.items() & present.parts.items()):
@@ -82,8 +85,8 @@ def find_origins(
 ) -> dict[str, FoundOrigin]:
     """Return the origin of each part of an entry, of its path and of its tags, by name.
 
-    A merge is the origin of a part only if the part differs from the same part in both parents. An entry that was moved
-    is recognised by its content, as in `compare_entries`.
+    A merge is the origin of a part only if the part differs from the same part in both parents. A moved entry is
+    recognised by the equal content of at least one of its parts.
 
     Parameters
     ----------

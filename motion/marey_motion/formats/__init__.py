@@ -100,8 +100,8 @@ def read_source(
     companion : bytes or None    content of the companion file, such as the ASF of an AMC
     companion_name : str    name of the companion file
     options : ImportOptions    facts about the file, such as its unit; they have precedence over the content
-    skeleton : Skeleton, optional    skeleton of motions in a format whose files do not contain one; it has precedence
-        over the companion
+    skeleton : Skeleton, optional    skeleton to use instead of the companion, if the file has a format that does not
+        contain a skeleton
 
     Returns
     -------
@@ -135,7 +135,7 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
     ----------
     clip : Clip    the motion
     file_format : str    one of `marey_schemas.formats.MOTION_FORMATS`
-    options    options of the format's writer
+    options    keyword arguments of the format's function `write_<name>`
 
     Returns
     -------

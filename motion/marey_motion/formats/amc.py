@@ -87,7 +87,7 @@ def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | Non
         position, number = lines.position, lines.number
         line = next(iter(lines), None)
         if line is None:
-            raise lines.error("the file contains no frames", code="file-truncated")
+            raise lines.error("the file contains no frames; copy or export it again", code="file-truncated")
         words = line.lower().split()
         if words[0] == b":degrees" or words[0] == b":radians":
             degrees = words[0] == b":degrees"

@@ -41,10 +41,10 @@ _SPACED = bytes.maketrans(b",()", b"   ")
 class Bone:
     """A bone in the units and conventions of the file.
 
-    `vector` is the direction times the length, in the file's unit and world axes. `axis` are three angles, and the
-    order of the axes about which they turn; `frame` is the quaternion of these turns. `channels` are the degrees of
-    freedom in order ("rx", "tz"). `line` is the number of the bone's line in the file. `written_name` is the bone's
-    name as the bytes in the file; AMC files contain the same bytes.
+    `vector` is the direction times the length, in the file's unit and world axes. `axis` contains three angles, and
+    the order of the coordinate axes about which they rotate; `frame` is the quaternion of these rotations. `channels`
+    are the degrees of freedom in order ("rx", "tz"). `line` is the number of the bone's line in the file.
+    `written_name` is the bone's name as the bytes in the file; AMC files contain the same bytes.
     """
 
     name: str

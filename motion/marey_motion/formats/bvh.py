@@ -136,13 +136,16 @@ def _read_frames(
         cut = table.ragged_line == table.last_line and table.ragged_count < width
         raise lines.error(
             f"the line has {counted(table.ragged_count, 'value')}, but the file declares {width} channels"
-            + ("; the file is cut off in its last line" if cut else ""),
+            + ("; the file is cut off in its last line, so copy or export it again" if cut else ""),
             code="file-truncated" if cut else "frame-width",
         )
     if frames == 0 and header.declared_frames:
         lines.number = header.data_line
         declared = counted(header.declared_frames, "frame")
-        raise lines.error(f"the header declares {declared}, but the file contains no frames", code="file-truncated")
+        raise lines.error(
+            f"the header declares {declared}, but the file contains no frames; copy or export it again",
+            code="file-truncated",
+        )
     _warn_of_layout(header, frames, wrapped, warnings)
     return table.values.reshape(frames, width) if frames else np.empty((0, width))
 
@@ -211,10 +214,11 @@ def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.fl
 
 
 def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float64]) -> None:
-    """Add the offsets to the values of position channels below the root that contain displacements from the offsets.
+    """Convert displacements in the position channels below the root to positions, by adding the offsets in place.
 
-    Some exporters write displacements. They are detected by their size: for most joints, the values stay within a tenth
-    of the bone's length from zero. If such values were positions, every bone would have nearly no length.
+    Some exporters write the displacement of a joint from its OFFSET instead of its position. The values of a file are
+    displacements if, for most joints, they stay within a tenth of the bone's length from zero. As positions, such
+    values would give bones nearly no length. Other values are left unchanged.
     """
     offsets = source.offsets[list(source.translated_joints)]
     lengths = np.linalg.norm(offsets, axis=1)

@@ -48,7 +48,7 @@ class BvhHeader:
 
 
 @dataclass(frozen=True)
-class _KeptHierarchy:
+class _CachedHierarchy:
     """Parsed HIERARCHY in the cache. Files with equal text share one hierarchy, so its lists must not be changed.
 
     `position` is the offset of the first byte after the text of the hierarchy; `number` is the number of its last line.
@@ -59,7 +59,7 @@ class _KeptHierarchy:
     number: int
 
 
-_KNOWN: LruCache[bytes, _KeptHierarchy] = LruCache(max_entries=64)
+_KNOWN: LruCache[bytes, _CachedHierarchy] = LruCache(max_entries=64)
 """Cache of the hierarchies read last, by the digest of their text."""
 
 
@@ -97,7 +97,7 @@ def _read_hierarchy(lines: TextLines) -> BvhHeader:
         raise lines.error(f"a BVH file begins with HIERARCHY; {shown}", code="not-bvh")
     header = _HierarchyReader(lines).read()
     if key is not None and motion is not None and lines.position == motion.end():
-        _KNOWN.put(key, _KeptHierarchy(replace(header), lines.position, lines.number))
+        _KNOWN.put(key, _CachedHierarchy(replace(header), lines.position, lines.number))
     return header
 
 

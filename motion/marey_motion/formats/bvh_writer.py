@@ -70,10 +70,10 @@ def with_folded_positions(clip: Clip) -> Clip:
     """Make a clip in which only the root is translated.
 
     Some exporters write the path of the body to the hips, below a root that does not move. If a translated joint has
-    more than half of all joints at or below it, the root takes over its motion: the joint and the joints below it stay
-    exactly in place, but the root and all other joints move. Of several such joints, the one nearest to the root is
-    chosen. Every other translated joint gets its median translation as a constant offset. If its translation varied,
-    it and the joints below it are displaced by the difference.
+    more than half of all joints at or below it, the root takes over the motion of this joint. The joint and the joints
+    below it stay exactly in place, but the root and all other joints move. If several joints meet the condition, the
+    one nearest to the root is chosen. Every other translated joint gets its median translation as a constant offset. If
+    its translation varied, it and the joints below it are displaced by the difference.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def _hierarchy(clip: Clip, order: list[int], axes: NDArray[np.int64], scale: flo
 
 
 def _written_name(name: str) -> str:
-    """Write underscores for the characters that BVH does not allow in a joint name."""
+    """Return a joint name with underscores in place of the characters that BVH does not allow."""
     return "".join("_" if character in "{}\n\r" else character for character in name)
 
 
@@ -209,7 +209,7 @@ def format_table(values: NDArray[np.float64]) -> bytes:
 
 @compiled
 def _format(values, text):
-    """Write `values` into `text`; return the number of bytes written."""
+    """Fill `text` (bytes,) with `values` (F, C) as F lines of decimal numbers; return the number of bytes written."""
     digits = np.empty(24, np.uint8)
     at = 0
     for frame in range(values.shape[0]):

@@ -165,9 +165,10 @@ def _converted_clip(source: SourceMotion, skeleton: Skeleton, axes: NDArray[np.f
 
 
 def _moved(vectors: NDArray[np.float64], axes: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    """Convert vectors (..., 3) to metres, by the factor `scale`, and to Marey's axes; exact if unit and axes stay.
+    """Convert vectors (..., 3) to metres, by the factor `scale`, and to Marey's axes.
 
-    The rows of `axes` (3, 3) are Marey's axes in the axes of the file.
+    The rows of `axes` (3, 3) are Marey's axes in the axes of the file. If neither the unit nor the axes change, the
+    result equals the input exactly.
     """
     turned = vectors if _same_axes(axes) else vectors @ axes.T
     return turned if scale == 1.0 else turned * scale

@@ -12,21 +12,23 @@ KNOWN_RATES_HZ = (
     *(24000 / 1001, 30000 / 1001, 60000 / 1001, 120000 / 1001, 240000 / 1001),
 )
 SNAP_TOLERANCE = 1e-4
-# What six decimals of a frame time leave open needs no mention.
+# Smaller deviations have no warning, because frame times with six decimals are not more exact.
 NOTABLE_DEVIATION = 2e-5
-# Three decimals of a frame time can be this far from the rate they stand for.
+# Greatest deviation from the rate of a frame time that is rounded to three decimals.
 ROUNDED_DEVIATION = 0.02
-# Nobody records a body less often; such a "time" is a rate, or milliseconds.
+# A greater "frame time" is a rate, or is in milliseconds: no recording has fewer frames.
 LONGEST_FRAME_TIME_S = 1.0
 
 
 def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWarning]) -> float:
     """Compute the rate of a file from its frame time.
 
-    Files round frame times: .0083333 means 120 Hz. So the reciprocal of the frame time is compared with the nearest
-    common rate. If their relative difference is at most 1e-4, the common rate is used; a difference above 2e-5 gives a
-    warning. If the difference is greater, the reciprocal is used; up to 2 %, as for .0333 and 30 Hz, a warning names
-    the common rate, which may be the intended one.
+    Files round frame times: .0083333 means 120 Hz. Therefore, the reciprocal of the frame time is compared with the
+    nearest common rate, such as 30 or 120 Hz:
+
+    * If the relative difference is at most 1e-4, the common rate is used, with a warning above 2e-5.
+    * If the relative difference is greater, the reciprocal is used. Below 2 %, as for .0333 and 30 Hz, a warning names
+      the common rate, because the file may mean this rate.
 
     Parameters
     ----------
@@ -71,7 +73,7 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
 
 
 def frame_time_to_write(frame_rate_hz: float) -> float:
-    """Compute the frame time to write in a file, and refuse one that `frame_rate_of` does not accept.
+    """Compute the frame time to write in a file, and refuse a rate that readers do not accept.
 
     Parameters
     ----------
@@ -88,7 +90,7 @@ def frame_time_to_write(frame_rate_hz: float) -> float:
     lowest_hz = 1.0 / LONGEST_FRAME_TIME_S
     if not lowest_hz <= frame_rate_hz <= MAX_FRAME_RATE_HZ:
         raise FormatError(
-            f"a clip of {frame_rate_hz:.6g} Hz cannot be written in this format, which is read only with frame rates "
+            f"a clip of {frame_rate_hz:.6g} Hz cannot be written in this format, whose frame rates must be "
             f"from {lowest_hz:g} to {MAX_FRAME_RATE_HZ:.0f} Hz; resample the clip, or write it as npz",
             code="frame-rate",
         )

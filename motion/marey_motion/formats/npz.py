@@ -52,7 +52,7 @@ _OPTIONAL_MEMBERS = ("translated_joints", "translations")
 _STORED_BYTES = 4  # of a number of a clip
 # Methods whose members `zipfile` unpacks only up to the declared size.
 _BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-# All that a damaged or hostile archive raises; RuntimeError stands for encryption and for unknown compression, too.
+# Errors that a damaged or hostile archive can raise; encryption and unknown compression raise RuntimeError.
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,

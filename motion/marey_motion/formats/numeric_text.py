@@ -67,7 +67,7 @@ def parse_number(text, start):
 
     Returns
     -------
-    kind : int    `EXACT`, `LONG` or `MALFORMED`
+    kind : int    `EXACT`; `LONG` for a number that only `float` parses exactly; `MALFORMED` for any other text
     value : float    valid only when `kind` is `EXACT`
     stop : int    position after the token
     """

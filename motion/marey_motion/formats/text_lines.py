@@ -27,7 +27,7 @@ class TextLines:
     def __init__(self, data: bytes, file: str) -> None:
         if data.startswith(_WIDE_MARKS) or _EVERY_OTHER_ZERO in (data[0:3:2], data[1:4:2]):
             raise FormatError("the file is text in UTF-16; save it as UTF-8", code="text-encoding", file=file, line=1)
-        # Editors of old ended a file with Ctrl-Z, and disks filled it up with zeros.
+        # Old editors ended a file with Ctrl-Z, and old file systems filled it up with zeros.
         self.data = data.rstrip(b"\0\x1a")
         self.file = file
         self.number = 0

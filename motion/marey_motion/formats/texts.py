@@ -26,7 +26,7 @@ def plain_text(text: str) -> str:
 
 
 def cut_text(text: str, longest: int) -> str:
-    """Return a text as `plain_text` does, but at most its beginning.
+    """Shorten a text to a number of characters, and replace halves of surrogate pairs with question marks.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def cut_text(text: str, longest: int) -> str:
 
     Returns
     -------
-    str    the text; an ellipsis ends a text that was cut off
+    str    the text; if it was cut off, its last character is an ellipsis
 
     Examples
     --------
@@ -46,15 +46,15 @@ def cut_text(text: str, longest: int) -> str:
 
 
 def short_name(name: object) -> str:
-    """Return a name from a file as messages show it, with at most `LONGEST_NAME` characters.
+    """Shorten a name from a file to `LONGEST_NAME` characters, for messages.
 
     Parameters
     ----------
-    name : object    the name, or another value that a file has in place of one
+    name : object    the name; any other value that the file has in its place is converted to text
 
     Returns
     -------
-    str    its beginning
+    str    the name; if it was cut off, its last character is an ellipsis
 
     Examples
     --------

@@ -6,7 +6,7 @@ from marey_motion.errors import FormatLimit
 from marey_schemas.formats import MOST_UNPACKED_BYTES
 
 _ROTATION_NUMBERS, _ROTATION_BYTES = 4, 16
-# Of real motion, most joints have channels: a file has about three numbers for the four of a rotation.
+# In real files, most joints have channels: about three numbers in the file give the four numbers of a rotation.
 _MOST_PER_NUMBER = 8
 
 

@@ -20,10 +20,10 @@ from marey_motion.gait.path import RootState
 from marey_motion.gait.style import GaitStyle, eased
 from marey_motion.skeleton import Skeleton
 
-LEG_STRETCH = 0.99  # of the straight leg: a knee that locks would move with a jerk
-YIELDING_M = 0.10  # of a leg's length, over which a foot in mid-air begins to follow the stretched leg
-SETTLING_S = 0.12  # over which the pelvis gives way to a leg that would be out of reach
-BLENDING_S = 0.30  # over which trunk and arms follow a change of speed or turn
+LEG_STRETCH = 0.99  # greatest share of the length of the straight leg; a knee that locks would move with a jerk
+YIELDING_M = 0.10  # range of a leg's length over which a foot in mid-air begins to follow the stretched leg
+SMOOTHING_S = 0.12  # half of the window over which the pelvis is lowered for a leg that would be out of reach
+BLENDING_S = 0.30  # half of the window over which trunk and arms follow a change of speed or turn
 SIDES = {"Left": 1, "Right": -1}
 
 
@@ -35,7 +35,7 @@ class GaitMoments:
     ----------
     times_s : (n,)    seconds
     phases : (n,)    strides done since time 0
-    root : RootState    the exact path
+    root : RootState    position, velocity and heading on the path, not smoothed
     """
 
     times_s: AnyFloats
@@ -47,13 +47,13 @@ class GaitMoments:
         """Number of points in time per second."""
         return (len(self.times_s) - 1) / float(self.times_s[-1] - self.times_s[0])
 
-    def settled(self, values: AnyFloats, window_s: float = BLENDING_S) -> AnyFloats:
+    def smoothed(self, values: AnyFloats, window_s: float = BLENDING_S) -> AnyFloats:
         """Smooth values over time with a Hann window.
 
         Parameters
         ----------
         values : (n,)    any unit
-        window_s : float    seconds before and after
+        window_s : float    half of the window: seconds before and after each point in time
 
         Returns
         -------
@@ -65,7 +65,7 @@ class GaitMoments:
         weights = np.hanning(2 * reach + 3)[1:-1]
         return np.asarray(convolve1d(values, weights / weights.sum(), mode="nearest"))
 
-    def settled_below(self, limits: AnyFloats, window_s: float = SETTLING_S) -> AnyFloats:
+    def smoothed_below(self, limits: AnyFloats, window_s: float = SMOOTHING_S) -> AnyFloats:
         """Compute a smooth curve that is nowhere above given limits.
 
         Each limit is first replaced by the least limit in a window around it. The result is then smoothed with a Hann
@@ -75,7 +75,7 @@ class GaitMoments:
         Parameters
         ----------
         limits : (n,)    any unit
-        window_s : float    seconds before and after
+        window_s : float    half of both windows: seconds before and after each point in time
 
         Returns
         -------
@@ -84,7 +84,7 @@ class GaitMoments:
         from scipy.ndimage import minimum_filter1d
 
         lowest = minimum_filter1d(limits, 2 * _reach(window_s, self.frame_rate_hz) + 1, mode="nearest")
-        return self.settled(lowest, window_s)
+        return self.smoothed(lowest, window_s)
 
 
 def _reach(window_s: float, frame_rate_hz: float) -> int:
@@ -156,7 +156,7 @@ def _shank_m(skeleton: Skeleton) -> float:
 
 def _pelvis(style: GaitStyle, moments: GaitMoments) -> AnyFloats:
     """Rotate the pelvis to the heading, with a tilt that drops the side of the swinging leg."""
-    speeds = moments.settled(moments.root.speeds)
+    speeds = moments.smoothed(moments.root.speeds)
     tilts = style.bounce * 0.06 * eased(speeds / 1.4) * np.cos(2.0 * np.pi * moments.phases)
     return quaternions.from_euler("yz", np.stack((moments.root.headings, tilts), axis=-1))
 
@@ -182,7 +182,7 @@ def _pelvis_heights(
     `pelvis` (n, 4) are rotations of the pelvis. For each side, `ankles` has positions (n, 3), and `loaded` has flags
     (n,) that are True while the foot is on the ground.
     """
-    speeds = moments.settled(moments.root.speeds)
+    speeds = moments.smoothed(moments.root.speeds)
     leg = _thigh_m(skeleton) + _shank_m(skeleton)
     moving = eased(speeds / 1.2)
     crouch = 0.006 + moving * styles.blended(0.010, 0.045, speeds)
@@ -201,7 +201,7 @@ def _pelvis_heights(
                 where="speed_m_s",
             )
         heights = np.minimum(heights, ankle[:, 1] + np.sqrt(squared) - hip[:, 1])
-    return moments.settled_below(heights)
+    return moments.smoothed_below(heights)
 
 
 def _bend_leg(
@@ -237,10 +237,14 @@ def _bend_leg(
 
 
 def _pose_trunk(style: GaitStyle, moments: GaitMoments, rotations: dict[str, AnyFloats]) -> None:
-    """Pose the trunk: it leans into speed and turns, the shoulders swing against the legs, the head looks ahead."""
+    """Pose trunk, neck and head, and add their rotations in the world to `rotations`.
+
+    The trunk leans forward or backward with the speed in this direction, and to the inner side of turns. The shoulders
+    turn against the legs, and the head faces ahead.
+    """
     root = moments.root
-    forward = moments.settled(root.speeds * np.cos(root.travel_angles))
-    bank = style.lean * moments.settled(styles.bank_rad(root.speeds, root.turn_rates))
+    forward = moments.smoothed(root.speeds * np.cos(root.travel_angles))
+    bank = style.lean * moments.smoothed(styles.bank_rad(root.speeds, root.turn_rates))
     lean = (
         style.lean
         * np.sign(forward)
@@ -257,8 +261,8 @@ def _pose_trunk(style: GaitStyle, moments: GaitMoments, rotations: dict[str, Any
 
 
 def _pose_arm(style: GaitStyle, moments: GaitMoments, side: str, sign: int, rotations: dict[str, AnyFloats]) -> None:
-    """Pose an arm that swings against the leg; the elbow bends with speed."""
-    speeds = moments.settled(moments.root.speeds)
+    """Pose an arm that swings opposite to the leg of its side; at higher speeds, the elbow is bent more."""
+    speeds = moments.smoothed(moments.root.speeds)
     swing = style.arm_swing * sign * np.sin(2.0 * np.pi * moments.phases)
     angle = swing * styles.blended(0.38 * eased(speeds / 1.4), 0.55, speeds) - styles.blended(0.04, 0.10, speeds)
     drift = style.wander * _drift(style, moments, 1 + (sign > 0))
@@ -275,7 +279,7 @@ def _pose_arm(style: GaitStyle, moments: GaitMoments, side: str, sign: int, rota
 
 
 def _shoulder_twist(style: GaitStyle, moments: GaitMoments) -> AnyFloats:
-    speeds = moments.settled(moments.root.speeds)
+    speeds = moments.smoothed(moments.root.speeds)
     size = styles.blended(0.10 * eased(speeds / 1.4), 0.14, speeds)
     return np.asarray(-style.sway * size * np.sin(2.0 * np.pi * moments.phases))
 

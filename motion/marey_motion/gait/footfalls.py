@@ -20,10 +20,10 @@ from marey_motion.gait import style as styles
 from marey_motion.gait.path import RootPath, RootState
 from marey_motion.gait.style import GaitStyle, eased
 
-LANDING_SHARE = 0.18  # of the stance, in which a foot that lands tilted comes down flat
+LANDING_SHARE = 0.18  # share of the stance in which a foot that lands tilted comes down flat
 PUSH_OFF_START = 0.50  # share of the stance after which the foot rolls off
 EARLY_PEAK = 729.0 / 16.0  # makes s²(1 - s)⁴ reach 1, at a third of the swing, where the heel is highest
-ROUNDING_M = 0.05  # greatest height over which a swinging foot changes what it keeps clear of the floor
+ROUNDING_M = 0.05  # greatest height over which the lowest part of a swinging foot changes from heel to ball or toes
 STILL_M = 1e-9  # lift below which a foot has not left the floor
 SHORT_STEP_M = 0.12  # shorter steps are lifted less; no step, no lift
 
@@ -139,7 +139,10 @@ class _Foot(NamedTuple):
     ----------
     ground : (n,) complex    ground position of the ball of the foot, z + i·x in metres
     heights : (n,)    height of the ball above its height in the rest pose, metres
-    pitches, toe_pitches, yaws, freedom : (n,)    as in `FootMotion`
+    pitches, toe_pitches, yaws : (n,)    angles of the foot, of its toes, and of its heading, in radians; toes up is
+        positive
+    freedom : (n,)    0 in stance, rising to 1 in the middle of the swing: how gradually a foot that is out of reach is
+        moved towards the hip
     """
 
     ground: Complexes
@@ -248,7 +251,7 @@ class Footfalls:
 
     @cached_property
     def _leaving_pitch_rates(self) -> AnyFloats:
-        """Pitch rate at the end of the push-off of each stance, radians per second."""
+        """Pitch rate of the foot in radians per second, when it leaves the floor after each stance."""
         return np.asarray(self._leaving_pitches / ((1.0 - PUSH_OFF_START) * (self.leaves_s - self.strikes_s)))
 
     def _standing(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:

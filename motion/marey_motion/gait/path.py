@@ -192,7 +192,7 @@ class RootPath:
 
     @cached_property
     def _columns(self) -> AnyFloats:
-        """Table (4, pieces): speed, acceleration, turn rate and travel angle."""
+        """Table (4, pieces): speed, acceleration, turn rate and travel angle, in metres, seconds and radians."""
         rows = [(p.speed_m_s, p.acceleration_m_s2, p.turn_rate_rad_s, p.travel_angle_rad) for p in self.pieces]
         return np.array(rows).T
 

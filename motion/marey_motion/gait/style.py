@@ -82,11 +82,11 @@ def eased(x: AnyFloats | float) -> AnyFloats:
 
     Parameters
     ----------
-    x : (...)    any number
+    x : (...)    numbers, without unit
 
     Returns
     -------
-    (...)    0 to 1
+    (...)    values from 0 to 1
     """
     x = np.clip(x, 0.0, 1.0)
     result: AnyFloats = np.asarray(x * x * (3.0 - 2.0 * x))

@@ -21,7 +21,7 @@ from marey_motion.gait.style import GaitStyle
 from marey_motion.skeleton import Skeleton
 
 MAX_FRAMES = 1_000_000
-BEHIND_ANKLE = 0.64  # of the ankle's height: how far the heel is behind the ankle
+BEHIND_ANKLE = 0.64  # distance of the heel behind the ankle, as a share of the ankle's height
 
 
 class GeneratedTake(NamedTuple):
@@ -98,7 +98,7 @@ def generate_along(
 
     Raises
     ------
-    MotionError    for the same reasons as `generate_gait`
+    MotionError    if a parameter is invalid (the message names it), or if a step would be longer than the leg
     """
     skeleton, style = studio_skeleton(stature_m), style or GaitStyle()
     frames = _frame_count(path, frame_rate_hz)
@@ -126,7 +126,7 @@ def foot_motions(
     path : RootPath    the path of the root
     times_s : (n,)    increasing seconds
     stature_m : float    height of the walker, metres
-    style : GaitStyle, optional    as for `generate_along`
+    style : GaitStyle, optional    style of the walker; neutral if None
 
     Returns
     -------

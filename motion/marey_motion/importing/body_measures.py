@@ -51,7 +51,7 @@ def measure_body(source: SourceMotion, anatomy: Anatomy, file: str) -> BodyMeasu
 
     Returns
     -------
-    BodyMeasures    measures without evidence
+    BodyMeasures    the measures; `evidence` and `warnings` are still empty
     """
     skeleton, landmarks = anatomy.skeleton, anatomy.landmarks
     rest = skeleton.rest_global_positions

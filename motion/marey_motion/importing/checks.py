@@ -17,13 +17,13 @@ from marey_motion.importing.landmarks import Landmarks
 from marey_motion.importing.tracks import Tracks, track
 from marey_schemas.wording import counted
 
-# Every code a warning may carry, and what it means to the reader of an import report.
+# The codes of warnings, with their meaning for readers of an import report.
 CODES = {
-    # What the file says, and what was made of it.
+    # Content of the file, and how it was read.
     "frame-count-mismatch": "The file has more or fewer frames than its header declares; all were imported.",
     "frames-wrapped": "Frames are divided into several lines; the lines were joined by counting values.",
     "keyframes-at-end": "Keyframes at the end of the motion were moved from after the last frame to the last frame.",
-    "tree-pickled": "A tree in a zipped graph is a pickle, which is a program and never read; build the tree again.",
+    "tree-pickled": "A tree in a zipped graph is a pickle. Pickles are programs and never read; build the tree again.",
     "transitions-ignored": "Transitions of a zipped graph lead from or to nodes that do not exist; they were left out.",
     "credentials-in-file": "The file contains credentials; they are hidden, but remain in the file.",
     "no-frames": "The file contains no motion; only its skeleton was imported.",
@@ -36,28 +36,29 @@ CODES = {
     "duplicate-joint-names": "Several joints have the same name; the name of the parent was added to make them unique.",
     "position-channels": "Joints below the root move relative to their parents; their translations were kept.",
     "bones-moved-by-translations": "Bones follow the positions of the source's joints instead of their rotations.",
-    "pelvis-from-hip-line": "The retargeted pelvis follows the line between the source's hips, which its pelvis joint "
-    "contradicts.",
-    "dropped-joints-followed": "Retargeted bones of spine or neck stand for joints that only one of the skeletons has.",
+    "pelvis-from-hip-line": "The retargeted pelvis follows the line between the source's hips, because the rotation of "
+    "the source's pelvis contradicts this line.",
+    "dropped-joints-followed": "Retargeted bones of spine or neck were turned, because only one of the skeletons has "
+    "some joints of spine or neck.",
     "below-floor": "Hands or feet of the retargeted clip are below the floor on which the source stands.",
-    "feet-kept": "Feet of the retargeted clip were moved, so that they stay in place while those of the source do.",
+    "feet-kept": "Feet of the retargeted clip were moved, so that they stay in place while the source's feet do so.",
     "knees-fast": "Knees of the retargeted clip bend faster than those of the source, because feet are kept in place.",
-    "edit-warning": "A command of an edit reported something that its result may not be expected to have.",
-    "hands-kept": "Hands of the retargeted clip were moved to the scaled positions of those of the source.",
+    "edit-warning": "A command of an edit reported an unexpected property of its result; the message describes it.",
+    "hands-kept": "Hands of the retargeted clip were moved to the scaled positions of the source's hands.",
     "soles-moved-to-floor": "The retargeted clip was moved up or down, because its soles were off the floor.",
     "offsets-from-positions": "The file contains no bone lengths; they were computed from the position channels.",
     "position-channels-relative": "The position channels contain displacements from the offsets instead of positions.",
     "non-unit-quaternions": "Some quaternions did not have length 1; they were normalised.",
     "sign-flips-unrolled": "Rotations jumped between a quaternion and its negative; the signs were made continuous.",
-    # What was inferred.
+    # Inferred properties.
     "unit-inferred": "The unit of length is unusual; it was inferred from the size of the body.",
-    "unit-doubtful": "The unit of length that the file states, or that was given, gives legs of another length than an "
-    "adult's.",
+    "unit-doubtful": "With the unit of length that the file states, or that was given, the legs are not as long as "
+    "those of an adult.",
     "up-axis-assumed": "The file does not show which axis points up; y was assumed.",
-    "up-axis-doubtful": "The body points along another axis than the upward axis that was given.",
+    "up-axis-doubtful": "From feet to head, the body does not point along the upward axis that was given.",
     "up-axis-converted": "The upward axis of the file is not y; the motion was rotated.",
     "left-handed": "Left and right joints seem to be exchanged: the axes of the file may be left-handed.",
-    # What the motion shows.
+    # Defects of the motion.
     "rest-pose-frame": "A rest pose at the beginning or end of the motion falsifies averages; it can be trimmed.",
     "floor-offset": "The floor under the feet is above or below height zero.",
     "floor-penetration": "Feet go below the height of the ground in the rest of the motion.",
@@ -76,9 +77,9 @@ SKATE_SPEED_M_S = 0.6
 IN_PLACE_FOOT_SPEED_M_S = 0.4
 TELEPORT_SPEED_M_S = 15.0
 REST_JUMP_M_S = 8.0
-"""Speed of the fastest point of the body above which a step between rest pose and motion is a jump."""
+"""Speed in metres per second: if a point of the body is faster between rest pose and motion, the body jumps there."""
 JUMP_RAD = np.radians(60.0)
-# Cosine of half an angle a little smaller, beyond any rounding of the one that is compared.
+# Cosine of half of an angle that is smaller than JUMP_RAD by more than any rounding error.
 _SURELY_NO_JUMP = np.cos(JUMP_RAD / 2) + 1e-3
 _FRAMES_AT_A_LOOK = 64
 
@@ -312,8 +313,8 @@ def _floor_penetration(tracks: Tracks) -> CheckWarning | None:
 def _gait(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
     """Find feet that slide under a travelling body (skating), or under a body that does not travel (walking in place).
 
-    The mean speed of the feet is weighted: a foot at height h above the ground has the weight 2 − 2^(h/H), and no
-    weight above H = 2.5 cm (Zhang et al., Mode-adaptive neural networks for quadruped control, 2018, section 7.3).
+    The mean speed of the feet is weighted: a foot at height h above the ground has the weight 2 − 2^(h/H). A foot above
+    H = 2.5 cm does not count. (Zhang et al., Mode-adaptive neural networks for quadruped control, 2018, section 7.3)
     """
     if clip.frame_count < 3:
         return []
@@ -416,6 +417,6 @@ def _surely_no_jump(rotations: NDArray[np.float32]) -> bool:
 
 
 def _step_cosines(rotations: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Compute cosines (F - 1, J) of half the angle between consecutive frames."""
+    """Compute the cosine (F - 1, J) of half the angle between each joint's rotations in consecutive frames."""
     cosines: NDArray[np.float32] = np.abs(np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]))
     return cosines

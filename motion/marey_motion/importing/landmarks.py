@@ -11,7 +11,7 @@ from marey_motion.rigs import JointMapping, map_joints
 from marey_motion.rigs.mapping import LEAST_CONFIDENCE
 from marey_motion.skeleton import Skeleton
 
-# Skeletons whose anatomy and measures caches keep.
+# Number of skeletons whose anatomy and measures are cached.
 KEPT_SKELETONS = 256
 
 

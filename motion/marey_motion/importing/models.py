@@ -49,7 +49,7 @@ _NEEDED: dict[str, str] = {
     "skeleton model": "a skeleton model must be imported together with its skeleton, and be called like it: for "
     "example, body_skeleton_model.json needs body_skeleton.json or body.skeleton",
 }
-"""Error for a file that can only be read together with another file, by the subject of the file."""
+"""Error message, by kind of content, for a file that was imported without the motion or skeleton that it belongs to."""
 
 
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
@@ -185,7 +185,10 @@ def model_parts(
 
 
 def _time(time: PredecessorTime, model: Tree) -> Tree:
-    """Record a time function of the predecessor, from which the time function in the document `model` was converted."""
+    """Convert a time function of the predecessor to plain values, with the digest of the document `model`.
+
+    The time function of this document was converted from the time function of the predecessor.
+    """
     return {
         "form": time.form,
         "knots": time.basis.knots,
@@ -201,7 +204,7 @@ def _imported_tree(data: bytes, name: str, model_file: str, primitive: MotionPri
     tree = read_predecessor_tree(data, name)
     if tree.dimensions != primitive.dimensions:
         model = f"the latent vectors of {model_file} have {primitive.dimensions}"
-        message = f"the samples of the tree have {tree.dimensions} numbers, but {model}"
+        message = f"the samples of the tree have {tree.dimensions} numbers, but {model}; use the tree of this model"
         raise FormatError(message, code="tree-of-another-model", file=name)
     try:
         options = TreeOptions(

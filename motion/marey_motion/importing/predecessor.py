@@ -41,7 +41,7 @@ IMPORTED_LAYER = "imported"
 
 
 def described_skeleton(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
-    """Make the item of a skeleton that has a file of its own, with its mapping.
+    """Make the item of a skeleton that was imported from a skeleton file, including the joint mapping.
 
     Parameters
     ----------
@@ -87,10 +87,10 @@ def _as_json(rest: Mapping[str, Any], file: str) -> Tree:
 
 
 def _mapping_of(model: PredecessorSkeletonModel, guessed: Tree) -> Tree:
-    """Return the members of a document `mapping` that a skeleton model replaces.
+    """Return the members of a document `mapping` that replace those guessed from the skeleton.
 
-    If the model contains only one of the two axes of a joint (twist and swing), the second axis is computed from the
-    guessed axis: its component perpendicular to the first axis.
+    The model may contain only one of the two axes of a joint (twist and swing). The other axis is then the component
+    of the guessed axis that is perpendicular to the axis in the model.
     """
     axes: dict[str, Tree] = dict(guessed["axes"])
     for joint in {**model.twists, **model.swings}:
@@ -152,7 +152,10 @@ def _aligned_item(
     name = str(file.planned.notes)
     found = alignment_of_document(document, name)
     if len(found.frames) != len(motion["poses"]):
-        message = f"the time function has {len(found.frames)} canonical frames, but the clip {len(motion['poses'])}"
+        message = (
+            f"the time function has {len(found.frames)} canonical frames, but the clip {len(motion['poses'])}; import "
+            "the clip with its own alignment"
+        )
         raise FormatError(message, code="time-function-invalid", file=name)
     source_frames = int(found.frames.max()) + 1
     ends = [end for _, end in found.sections if end < len(found.frames)]
@@ -185,7 +188,8 @@ def motion_content(file: FileToImport, imported: ImportedMotion, motion: Tree) -
 
     Returns
     -------
-    str or None    the digest; None if the format is another one, or if frames, floor, unit, axes or rate were changed
+    str or None    the digest; None if the file has another format, if the import dropped frames or moved the floor, or
+        if the options set the unit, an axis or the frame rate
     """
     options, source = file.options, imported.source
     unchanged = source.format == FORMAT and source.trimmed_frames == (0, 0) and source.floor_shift_m == 0.0

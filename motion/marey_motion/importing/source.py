@@ -29,10 +29,10 @@ class SourceMotion:
     joint_names, display_names, parents, offsets, rest_rotations    as in `Skeleton`, in the file's unit and axes
     end_sites : tuple of (int, (3,) float64)    joint and offset of each
     root_positions : (F, 3) float64, optional    in the file's unit; None if the file holds no motion
-    rotations : (F, J, 4) float32, optional    unit, sign-continuous in time
+    rotations : (F, J, 4) float32, optional    local unit quaternions (w, x, y, z), continuous in sign over time
     translations : (F, k, 3) float64, optional    local positions of joints below the root that replace their offsets,
         in the file's unit
-    translated_joints : tuple of int    those k joints
+    translated_joints : tuple of int    indices of the k joints with translations
     frame_rate_hz, declared_frame_time_s : float, optional    rate to use, and the frame time as written
     unit_scale_m : float, optional    metres per unit of the file; None if format and file do not state it
     up_axis : str, optional    axis that points up; None if format and file do not state it
@@ -84,10 +84,11 @@ class SourceMotion:
 
 @dataclass(frozen=True)
 class SourceDocument:
-    """A decoded file that holds no motion: a model, a tree over the samples of a model, or a graph of models.
+    """A decoded file of the predecessor that holds no motion.
 
-    Other subjects are an annotation or an alignment of a motion, a skeleton model, a zipped graph (a graph with its
-    models in an archive, not decoded yet), and a record of work, with its form and content.
+    `subject` names the content: a model, a tree over the samples of a model, a graph of models, an annotation or an
+    alignment of a motion, a skeleton model, a zipped graph, or a record of work. `document` is the decoded content; for
+    a zipped graph (an archive of a graph with its models), the models in it are not decoded yet.
     """
 
     subject: Subject

@@ -66,13 +66,13 @@ class Tracks:
 
     @cached_property
     def lowest(self) -> NDArray[np.float32]:
-        """Heights (F,) of the lowest point of both feet."""
+        """Height (F,) of the lowest point of the two feet in each frame, in metres."""
         lowest: NDArray[np.float32] = self.soles[..., 1].min(axis=1)
         return lowest
 
     @cached_property
     def floor_height(self) -> float:
-        """The height of the floor in metres: the 5 % quantile of the heights of the lowest point of both feet."""
+        """Height of the floor in metres: in 5 % of the frames, the lowest point of both feet is lower."""
         return float(low_quantile(self.lowest))
 
 

@@ -31,13 +31,14 @@ from marey_schemas.formats import UNITS_M
 from marey_schemas.options.imports import Handedness, ImportOptions, UpAxis
 
 CONVENTIONAL_UNITS = ("m", "cm", "mm")
-# Adults, from the joint that carries both legs down the bones to the ankle. No length fits two units in these bounds.
+# Lengths of the legs of adults, along the bones from the joint that carries both legs to the ankle. The range is so
+# small that no length fits two units.
 LEG_LENGTH_M = (0.72, 1.2)
-# Bodies of any kind, such as children and animals.
+# Lengths of the legs of bodies of any kind, such as children and animals.
 ANY_LEG_LENGTH_M = (0.1, 1.5)
 
 _MIRRORED_COSINE = -0.2
-# Height of the hips of a body that stands, by the length of a leg.
+# Least height of the hips of a body that stands, as a share of the length of a leg.
 _STANDING_SHARE = 0.7
 
 
@@ -96,8 +97,8 @@ def infer_conversion(
 
     Raises
     ------
-    AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
-    ContradictedOption    when the body clearly contradicts a given unit or axis
+    AmbiguousUnits    if the body does not determine the unit or axis; the error names the option to set, and candidates
+    ContradictedOption    if the body clearly contradicts a given unit or axis
     """
     body = measure_body(source, anatomy, file)
     up_axis = choose_up_axis(source, body, options, sibling_axis)
@@ -127,8 +128,9 @@ def _choose_unit(source: SourceMotion, body: BodyMeasures, options: ImportOption
             return stated
     if body.leg is None:
         raise AmbiguousUnits(
-            "the unit of length is not clear, because no two legs were found whose length could be measured; "
-            "set the unit with --unit (unit), such as cm, or with --unit-scale-m (unit_scale_m), in metres",
+            "the unit of length is not clear: the file does not state it, and the skeleton has no two legs whose "
+            "length could be measured; set the unit with --unit (unit), such as cm, or with --unit-scale-m "
+            "(unit_scale_m), in metres",
             file=body.file,
         )
     return _unit_of_leg(body, hip_height, up_axis, stated)
@@ -164,7 +166,7 @@ def _doubtful_unit(unit_m: float, legs_m: float, origin: str) -> CheckWarning:
 def _unit_of_leg(body: BodyMeasures, hip_height: float, up_axis: UpAxis, stated: float | None) -> float:
     assert body.leg is not None
     (low, high), known, reason = LEG_LENGTH_M, tuple(UNITS_M), "legs"
-    # The names of a known rig count before what the body does: people crawl and turn cartwheels, too.
+    # The names of a known rig have precedence over the motion: people crawl and turn cartwheels, too.
     if not body.landmarks.by_names and walks_on_hands(body, up_axis):
         (low, high), known, reason = ANY_LEG_LENGTH_M, CONVENTIONAL_UNITS, "hands stay on the ground, and legs"
     elif not body.landmarks.by_names:

@@ -24,15 +24,16 @@ from marey_motion.importing.source import SourceMotion
 from marey_schemas.options.imports import ImportOptions, UpAxis
 
 _CLEAR_COSINE = 0.8
-# Legs and trunk that point the same way: no pose of a body, but bones all put on one line.
+# Below this cosine between legs and trunk, the pose is not one of a body: all bones are on one line.
 _FOLDED_COSINE = -0.9
 _FOLDED = "rest pose that is none of a body, with legs and trunk pointing the same way"
 _FLAT_GROUND = 0.1
 _CLEARLY_FLATTER = 3.0
 # Sum of the cosines of motion and rest pose, along the same axis, that is as clear as one upright body.
 _AGREEING_COSINES = 1.4
-# What speaks for an axis if the rig is known by its names; a cosine of the motion counts as itself. The rest pose of a
-# known rig counts most, because the body may lie, crawl or roll. Flat ground counts less: a roll is flat sideways, too.
+# Weights of the evidence for an axis if the rig is known by its names; a cosine of the motion is its own weight. The
+# rest pose of a known rig counts most, because the body may lie, crawl or roll. Flat ground counts less, because the
+# lowest point of a body that rolls also stays at one height along a horizontal axis.
 _REST_VOTE, _FLAT_VOTE, _UPRIGHT_VOTE, _ALL_FOURS_VOTE, _GROUND_VOTE = 1.5, 0.6, 0.8, 0.9, 0.4
 # The body is on the ground along this axis, but not along the axis of its rest pose.
 _ONLY_GROUND_VOTE = 1.0
@@ -58,8 +59,8 @@ def choose_up_axis(
 
     Raises
     ------
-    AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
-    ContradictedOption    when the body clearly stands along another axis than the given one
+    AmbiguousUnits    if the body does not determine the axis; the error names the option to set, and candidates
+    ContradictedOption    if the body clearly stands along another axis than the given one
     """
     if options.up_axis is not None:
         _compare_with_body(options.up_axis, body, trusted=options.trust_options)
@@ -96,13 +97,13 @@ def _infer_up_axis(body: BodyMeasures, sibling_axis: UpAxis | None) -> UpAxis:
         body.axis_is_clear = True
         return "y"
     if sibling_axis is not None:
-        told = _told(standing, resting)
-        body.evidence.append(f"up axis {sibling_axis}: other files with this skeleton have it; {told}")
+        observed = _observed_axes(standing, resting)
+        body.evidence.append(f"up axis {sibling_axis}: other files with this skeleton have it; {observed}")
         return sibling_axis
     if is_person:
         axis = _axis_of_person(body, standing, resting, flat, on_fours=on_fours)
     else:
-        axis = _settle_up_axis(body, *standing, flat)
+        axis = _axis_of_tilted_body(body, *standing, flat)
     body.axis_is_clear = axis == standing[0] and standing[1] >= _CLEAR_COSINE
     return axis
 
@@ -118,8 +119,8 @@ def _axis_of_person(
     """Choose the upward axis of a known rig by weighing rest pose, motion and ground together.
 
     `standing` and `resting` are the axes nearest to the direction from feet to head in the motion and in the rest pose,
-    with cosines. `flat` is the result of `_flat_axis`; `on_fours` is true if hands and feet are below the hips along
-    its axis.
+    with cosines. `flat` is the axis along which the lowest point of the body hardly moves, with the evidence in words,
+    or None. `on_fours` is true if hands and feet are below the hips along this axis.
     """
     votes: dict[UpAxis, float] = defaultdict(float)
     votes[resting[0]] += _REST_VOTE
@@ -138,11 +139,11 @@ def _axis_of_person(
     if standing[1] >= _CLEAR_COSINE and upright_on_ground:
         votes[standing[0]] += _UPRIGHT_VOTE
     best, *others = sorted(votes, key=lambda axis: -votes[axis])
-    borne = f"; the ground through the origin bears the body along {' and '.join(ground)}" if ground else ""
-    told = _told(standing, resting) + borne + ("" if flat is None else f"; {flat[1]}")
+    borne = f"; along {' and '.join(ground)}, the body stands on the plane through the origin" if ground else ""
+    observed = _observed_axes(standing, resting) + borne + ("" if flat is None else f"; {flat[1]}")
     if others and votes[best] - votes[others[0]] < _CLEAR_LEAD:
-        raise _unclear_axis(body, told, standing, resting)
-    body.evidence.append(f"up axis {best}: the joints have the names of a known rig; {told}")
+        raise _unclear_axis(body, observed, standing, resting)
+    body.evidence.append(f"up axis {best}: the joints have the names of a known rig; {observed}")
     return best
 
 
@@ -170,32 +171,31 @@ def _compare_with_body(given: UpAxis, body: BodyMeasures, *, trusted: bool) -> N
     body.warnings.append(CheckWarning("up-axis-doubtful", reason, values={"up_axis": axis, "cosine": cosine}))
 
 
-def _settle_up_axis(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
-    """Choose the upward axis if the body is not upright along y.
-
-    The body may lie or climb, or another axis may point up.
+def _axis_of_tilted_body(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
+    """Choose the upward axis of a body that is not upright along y: it lies or climbs, or another axis points up.
 
     `axis` is the axis nearest to the direction from feet to head, and `cosine` is the cosine of the angle between this
-    axis and the direction. `flat` is the result of `_flat_axis`.
+    axis and the direction. `flat` is the axis along which the lowest point of the body hardly moves, with the evidence
+    in words; None if there is no such axis.
     """
     rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
-    told = _told((axis, cosine), (rest_axis, rest_cosine))
+    observed = _observed_axes((axis, cosine), (rest_axis, rest_cosine))
     agreed = rest_axis == axis and cosine + rest_cosine >= _AGREEING_COSINES
     if agreed and (flat is None or flat[0] == axis or min(cosine, rest_cosine) >= _CLEAR_COSINE):
-        body.evidence.append(f"up axis {axis}: {told}")
+        body.evidence.append(f"up axis {axis}: {observed}")
         return axis
     if flat is not None:
-        body.evidence.append(f"up axis {flat[0]}: {flat[1]}; {told}")
+        body.evidence.append(f"up axis {flat[0]}: {flat[1]}; {observed}")
         return flat[0]
     if cosine >= _CLEAR_COSINE:
         grounded = [candidate for candidate in (axis, rest_axis) if _stands_on_origin(body, candidate)]
         if len(set(grounded)) == 1:
-            body.evidence.append(f"up axis {grounded[0]}: the ground through the origin bears the body; {told}")
+            body.evidence.append(f"up axis {grounded[0]}: the body stands on the plane through the origin; {observed}")
             return grounded[0]
-    raise _unclear_axis(body, told, (axis, cosine), (rest_axis, rest_cosine))
+    raise _unclear_axis(body, observed, (axis, cosine), (rest_axis, rest_cosine))
 
 
-def _told(standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]) -> str:
+def _observed_axes(standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]) -> str:
     """Describe the upward axes that the motion and the rest pose show, for a message."""
     motion = f"mean direction from feet to head is {standing[0]} with cosine {standing[1]:.2f}"
     if standing[1] == 0.0:
@@ -205,11 +205,11 @@ def _told(standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]) -> str:
 
 
 def _unclear_axis(
-    body: BodyMeasures, told: str, standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]
+    body: BodyMeasures, observed: str, standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]
 ) -> AmbiguousUnits:
     return AmbiguousUnits(
-        f"the file does not show clearly which axis points up ({told}); name the axis with --up-axis (up_axis), one "
-        f"of {_likely_axes(standing, resting)}",
+        f"the file does not show clearly which axis points up ({observed}); name the axis with --up-axis (up_axis), "
+        f"one of {_likely_axes(standing, resting)}",
         code="up-axis-ambiguous",
         file=body.file,
     )

@@ -106,7 +106,7 @@ def _read_model(model: ZippedModel, skeleton: Skeleton, member: str) -> Predeces
     found = model_of_document(decode_document(model.data, member), member, skeleton=skeleton)
     own = found.primitive.skeleton
     if not same_hierarchy(own, skeleton, tolerance_m=SAME_OFFSET_M):
-        message = "the model has another skeleton than the graph; unpack the archive, and import the files in it"
+        message = "the skeletons of the model and of the graph differ; unpack the archive, and import the files in it"
         raise FormatError(message, code="skeleton-mismatch", file=member)
     frames = found.primitive.frame_count
     listed = dict(_keyframes(model.keyframes, frames, member))
@@ -114,7 +114,10 @@ def _read_model(model: ZippedModel, skeleton: Skeleton, member: str) -> Predeces
 
 
 def _keyframes(given: Mapping[str, Any], frames: int, member: str) -> Iterator[tuple[str, int]]:
-    """Yield label and frame of each keyframe that the archive lists for a model; frames are limited to the motion."""
+    """Yield label and frame of each keyframe that the archive lists for a model.
+
+    Frames outside the motion become its first or last frame.
+    """
     for label, frame in given.items():
         if frame in _ENDS:
             yield label, frames - 1
@@ -124,8 +127,10 @@ def _keyframes(given: Mapping[str, Any], frames: int, member: str) -> Iterator[t
             try:
                 number = int(frame)
             except (TypeError, ValueError) as error:
-                at = f"{short_name(label)!r} is at {short_name(frame)!r}"
-                message = f"keyframe {at}, which is neither a frame, 'lastFrame' nor 'middle'"
+                message = (
+                    f"keyframe {short_name(label)!r} must be the number of a frame, 'lastFrame' or 'middle', not "
+                    f"{short_name(frame)!r}"
+                )
                 raise FormatError(message, file=member) from error
             yield label, min(max(number, 0), frames - 1)
 

@@ -25,7 +25,7 @@ class JointChain(NamedTuple):
     ----------
     joints : (K,) int64    indices of all these joints in the whole skeleton, increasing
     skeleton : Skeleton    a skeleton of only these K joints
-    ends : (P,) int64    the joints from which the chain was made, in their order, as indices in `joints`
+    ends : (P,) int64    the requested joints without their ancestors, in the requested order, as indices into `joints`
     """
 
     joints: NDArray[np.int64]

@@ -45,8 +45,8 @@ def build_database(
     clips : sequence of SourceClip    clips of the body's skeleton
     body : MatchingBody    the joints to match
     options : DatabaseOptions    rate, horizons and weights
-    normaliser : Normaliser, optional    a normaliser fitted earlier ("pinned"), with its own weights; if None, one is
-        fitted to these clips
+    normaliser : Normaliser, optional    a normaliser that was fitted earlier; its weights replace those of `options`.
+        If None, a normaliser is fitted to these clips
     progress : callable, optional    called as progress(clips done, total, name of the last clip)
 
     Returns
@@ -56,7 +56,7 @@ def build_database(
     Raises
     ------
     MotionError    if a clip has another skeleton, no facing direction or too few frames (the error names the clip);
-        also if uids repeat, if options are invalid, or if the normaliser has other dimensions
+        if two clips have the same uid; if options are invalid; or if the normaliser has other feature dimensions
     """
     layout = feature_layout(options, body)
     if normaliser is not None:
@@ -241,7 +241,10 @@ def _layout_notes(layout: FeatureLayout) -> tuple[DatabaseNote, ...]:
     count = len(layout.matched_joints)
     if count <= MOST_MATCHED_JOINTS:
         return ()
-    message = f"{count} joints are matched; with more than {MOST_MATCHED_JOINTS} the trajectory hardly counts"
+    message = (
+        f"{count} joints are matched; with more than {MOST_MATCHED_JOINTS}, the trajectory hardly affects the search; "
+        "match fewer joints, or raise the weights of the trajectory"
+    )
     return (DatabaseNote("many-joints", message),)
 
 

@@ -67,8 +67,8 @@ class ControllerConstants(NamedTuple):
 
     Parameters
     ----------
-    follow : constant of `controller_kernels`, which says whether the path is followed by time, by position or in open
-        loop
+    follow : number that selects how the path is followed: by time, by position or in open loop (constants in
+        `controller_kernels`)
     by_distance : whether poses are compared by the distances between their joints instead of by their features
     period : number of ticks from one search to the next
     window : number of rows on each side of the displayed row that a search may not choose
@@ -77,7 +77,7 @@ class ControllerConstants(NamedTuple):
     blends_root : whether the velocity of the root is blended at a switch
     decay : (2, 2) matrix that advances an offset of the root's velocity, and the offset's change per second, by one
         tick
-    holds : whether the root is pulled to the desired path
+    holds : whether the root is pulled towards the desired path
     pull, clamp_m : share of the distance from the path that each tick removes, and largest distance that may remain
     tick_s : duration of a tick
     """
@@ -101,9 +101,11 @@ class DatabaseArrays(NamedTuple):
 
     Parameters
     ----------
-    successors, steps, starts : as in `RootMotion` and `MatchingDatabase`
-    points : (N, P, 3) positions of the pose joints of each row, in metres
-    offset, scale : (D,) as in the normaliser
+    successors : (N,) row that follows each row; -1 for the last row of a clip that does not wrap
+    steps : (N, 3) step of the root to the next row: metres to the left and forward, and radians to the left
+    starts : (C + 1,) first row of each clip, and N
+    points : (N, P, 3) positions of the pose joints of each row, in metres, in the frame of the row's root
+    offset, scale : (D,) normalised features are (features - offset) / scale
     horizons_s, horizons_ticks : (H,) times ahead at which the trajectory is compared, in seconds and in ticks
     """
 

@@ -4,7 +4,7 @@ Ground positions are (x, z) in metres; headings are in radians and increase in a
 name have the same meaning in all functions:
 
 * `index` is a `search.SearchIndex`.
-* `wish` is the desired path, a `controller.TrajectoryArrays`; `when` is a time on this path, in ticks.
+* `desired` is the desired path, a `controller.TrajectoryArrays`; `when` is a time on this path, in ticks.
 * `rules` is a `controller.ControllerConstants`, and `playback` a `controller.DatabaseArrays`.
 * `record` is a tuple of the arrays of a `TrialRecord`, which are filled.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from marey_motion.kernels import compiled
 from marey_motion.matching.search_kernels import cost_of, nearest, nearest_weighted
 
-# How the wished trajectory is taken from the reference.
+# Ways to follow the desired path.
 BY_TIME = 0
 BY_PATH = 1
 OPEN_LOOP = 2
@@ -27,10 +27,10 @@ REPLACING = 1
 REPLACED = 2
 FORCED = 3
 
-# A wish that changes by more than this from one tick to the next is not waited with until the next search.
+# If the desired motion changes by more than this from one tick to the next, a search is made at once.
 JUMP_M_S = 0.5
 JUMP_RAD = np.pi / 6
-# The nearest point of the path is looked for so far from the last one, or a lap could be skipped.
+# The nearest point of the path is searched for only within this time of the last one, so that no lap is skipped.
 PATH_WINDOW_S = 0.5
 
 
@@ -53,39 +53,39 @@ def _outward(heading, left, forward):
 
 
 @compiled
-def _wished(wish, when):
+def _desired_root(desired, when):
     """Compute x, z and heading of the desired path at `when` ticks.
 
     After its end, the path continues with its last speed and turn rate.
     """
-    last = wish.headings.shape[0] - 1
+    last = desired.headings.shape[0] - 1
     if when >= last:
-        left, forward, turn = _arc(wish.speeds[last], wish.turn_rates[last], (when - last) * wish.tick_s)
-        x, z = _outward(wish.headings[last], left, forward)
-        return wish.positions[last, 0] + x, wish.positions[last, 1] + z, wish.headings[last] + turn
+        left, forward, turn = _arc(desired.speeds[last], desired.turn_rates[last], (when - last) * desired.tick_s)
+        x, z = _outward(desired.headings[last], left, forward)
+        return desired.positions[last, 0] + x, desired.positions[last, 1] + z, desired.headings[last] + turn
     tick = int(when)
     rest = when - tick
-    x, z, heading = wish.positions[tick, 0], wish.positions[tick, 1], wish.headings[tick]
-    x += rest * (wish.positions[tick + 1, 0] - x)
-    z += rest * (wish.positions[tick + 1, 1] - z)
-    return x, z, heading + rest * (wish.headings[tick + 1] - heading)
+    x, z, heading = desired.positions[tick, 0], desired.positions[tick, 1], desired.headings[tick]
+    x += rest * (desired.positions[tick + 1, 0] - x)
+    z += rest * (desired.positions[tick + 1, 1] - z)
+    return x, z, heading + rest * (desired.headings[tick + 1] - heading)
 
 
 @compiled
-def _progress(wish, when, x, z):
+def _progress(desired, when, x, z):
     """Find the time, in ticks, at which the desired path is nearest to (x, z).
 
     Only times near `when`, the result at the previous tick, are searched.
     """
-    window = int(PATH_WINDOW_S / wish.tick_s)
+    window = int(PATH_WINDOW_S / desired.tick_s)
     best, best_square = 0, np.inf
     for tick in range(max(0, int(when) - window), int(when) + window + 1):
-        path_x, path_z, _ = _wished(wish, float(tick))
+        path_x, path_z, _ = _desired_root(desired, float(tick))
         square = (path_x - x) ** 2 + (path_z - z) ** 2
         if square < best_square:
             best, best_square = tick, square
-    here_x, here_z, _ = _wished(wish, float(best))
-    next_x, next_z, _ = _wished(wish, best + 1.0)
+    here_x, here_z, _ = _desired_root(desired, float(best))
+    next_x, next_z, _ = _desired_root(desired, best + 1.0)
     step_x, step_z = next_x - here_x, next_z - here_z
     square = step_x * step_x + step_z * step_z
     if square == 0.0:
@@ -95,17 +95,17 @@ def _progress(wish, when, x, z):
 
 
 @compiled
-def _moment(rules, wish, when, tick, x, z):
+def _moment(rules, desired, when, tick, x, z):
     """Compute the time on the desired path, in ticks, that corresponds to `tick`.
 
     If the path is followed by position, the result is the time at which the path is nearest to (x, z); only times near
     `when`, the result at the previous tick, are searched. Otherwise, the result is `tick` itself.
     """
-    return _progress(wish, when, x, z) if rules.follow == BY_PATH else float(tick)
+    return _progress(desired, when, x, z) if rules.follow == BY_PATH else float(tick)
 
 
 @compiled
-def moments_along(rules, wish, positions, out):
+def moments_along(rules, desired, positions, out):
     """Fill `out` (T,) with the time on the desired path, in ticks, that corresponds to each tick of a trial.
 
     `positions` (T, 2) are the positions of the root at the ticks.
@@ -113,12 +113,12 @@ def moments_along(rules, wish, positions, out):
     when = 0.0
     for tick in range(positions.shape[0]):
         if tick > 0:
-            when = _moment(rules, wish, when, tick, positions[tick, 0], positions[tick, 1])
+            when = _moment(rules, desired, when, tick, positions[tick, 0], positions[tick, 1])
         out[tick] = when
 
 
 @compiled
-def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):
+def fill_query(index, playback, rules, desired, row, when, x, z, heading, query):
     """Fill `query` (D,) with normalised features: the pose of the database's row `row`, then the desired trajectory.
 
     The trajectory starts at tick `when`, and is seen from the root at `x`, `z` in metres with `heading` in radians. In
@@ -127,13 +127,13 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):
     horizons = playback.horizons_s.shape[0]
     first = query.shape[0] - 4 * horizons
     query[:first] = index.rows[row, :first]
-    now = min(int(when), wish.speeds.shape[0] - 1)
+    now = min(int(when), desired.speeds.shape[0] - 1)
     sine, cosine = np.sin(heading), np.cos(heading)
     for h in range(horizons):
         if rules.follow == OPEN_LOOP:
-            left, forward, turn = _arc(wish.speeds[now], wish.turn_rates[now], playback.horizons_s[h])
+            left, forward, turn = _arc(desired.speeds[now], desired.turn_rates[now], playback.horizons_s[h])
         else:
-            path_x, path_z, path_heading = _wished(wish, when + playback.horizons_ticks[h])
+            path_x, path_z, path_heading = _desired_root(desired, when + playback.horizons_ticks[h])
             left = (path_x - x) * cosine - (path_z - z) * sine
             forward = (path_x - x) * sine + (path_z - z) * cosine
             turn = path_heading - heading
@@ -211,12 +211,12 @@ def choose(index, playback, rules, row, query):
 
 
 @compiled
-def _first_row(index, playback, rules, wish, root, query):
+def _first_row(index, playback, rules, desired, root, query):
     """Find the row with which a trial starts, and the cost of this row; only trajectories are compared, not poses.
 
     `root` is x, z and heading; `query` (D,) is overwritten.
     """
-    fill_query(index, playback, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
+    fill_query(index, playback, rules, desired, 0, 0.0, root[0], root[1], root[2], query)
     weights = np.ones(query.shape[0])
     weights[: query.shape[0] - 4 * playback.horizons_s.shape[0]] = 0.0
     return nearest_weighted(index, query, weights, 0, 0)
@@ -224,7 +224,7 @@ def _first_row(index, playback, rules, wish, root, query):
 
 @compiled
 def _later_row(playback, row, ticks):
-    """Find the row `ticks` after `row`, or the last row of its clip that another one follows."""
+    """Find the row `ticks` after `row` or, if the clip ends earlier, the last row of the clip that has a successor."""
     for _ in range(ticks):
         if playback.successors[playback.successors[row]] < 0:
             break
@@ -233,13 +233,13 @@ def _later_row(playback, row, ticks):
 
 
 @compiled
-def _jumped(wish, before, when):
+def _jumped(desired, before, when):
     """Return whether the desired velocity or direction jumped between the times `before` and `when`, in ticks."""
-    last = wish.speeds.shape[0] - 1
+    last = desired.speeds.shape[0] - 1
     a, b = min(int(before), last), min(int(when), last)
-    x = wish.speeds[b] * np.sin(wish.headings[b]) - wish.speeds[a] * np.sin(wish.headings[a])
-    z = wish.speeds[b] * np.cos(wish.headings[b]) - wish.speeds[a] * np.cos(wish.headings[a])
-    return x * x + z * z > JUMP_M_S * JUMP_M_S or abs(wish.headings[b] - wish.headings[a]) > JUMP_RAD
+    x = desired.speeds[b] * np.sin(desired.headings[b]) - desired.speeds[a] * np.sin(desired.headings[a])
+    z = desired.speeds[b] * np.cos(desired.headings[b]) - desired.speeds[a] * np.cos(desired.headings[a])
+    return x * x + z * z > JUMP_M_S * JUMP_M_S or abs(desired.headings[b] - desired.headings[a]) > JUMP_RAD
 
 
 @compiled
@@ -262,12 +262,12 @@ def _advance(playback, rules, row, offsets, root):
 
 
 @compiled
-def _hold(rules, wish, when, root):
-    """Pull `root` (x, z, heading) towards a place on the desired path, and limit its distance from this place.
+def _pull_to_path(rules, desired, when, root):
+    """Pull `root` (x, z, heading) towards the place and heading of the desired path at the time `when`, in ticks.
 
-    The path reaches this place after `when` ticks. The limit is `rules.clamp_m`, in metres.
+    Afterwards, the distance of the root from this place is limited to `rules.clamp_m`, in metres.
     """
-    x, z, heading = _wished(wish, when)
+    x, z, heading = _desired_root(desired, when)
     turn = heading - root[2]
     root[0] += rules.pull * (x - root[0])
     root[1] += rules.pull * (z - root[1])
@@ -279,15 +279,15 @@ def _hold(rules, wish, when, root):
 
 
 @compiled
-def run(index, playback, wish, rules, skipped, record):
+def run(index, playback, desired, rules, skipped, record):
     """Simulate one trial, and fill the arrays of `record` with its ticks.
 
     The trial starts `skipped` ticks after the row that the first search finds, or just before the end of its clip.
     """
     query = np.empty(index.rows.shape[1])
     offsets = np.zeros((2, 3))
-    root = np.array([wish.positions[0, 0], wish.positions[0, 1], wish.headings[0]])
-    row, first_cost = _first_row(index, playback, rules, wish, root, query)
+    root = np.array([desired.positions[0, 0], desired.positions[0, 1], desired.headings[0]])
+    row, first_cost = _first_row(index, playback, rules, desired, root, query)
     row = _later_row(playback, row, skipped)
     status = FORCED
     before = when = 0.0
@@ -299,13 +299,13 @@ def run(index, playback, wish, rules, skipped, record):
 
         ended = playback.successors[row] < 0
         due = ended or tick % rules.period == 0
-        if not due and tick - forced_at >= rules.period and _jumped(wish, before, when):
+        if not due and tick - forced_at >= rules.period and _jumped(desired, before, when):
             due, forced_at = True, tick
         chosen = row
         if tick == 0:
             record.match_cost[0] = first_cost
         elif due:
-            fill_query(index, playback, rules, wish, row, when, root[0], root[1], root[2], query)
+            fill_query(index, playback, rules, desired, row, when, root[0], root[1], root[2], query)
             chosen, record.match_cost[tick], record.continuing_cost[tick] = choose(index, playback, rules, row, query)
         following = playback.successors[chosen]
         status = FORCED if ended or following != chosen + 1 else KEPT
@@ -319,8 +319,8 @@ def run(index, playback, wish, rules, skipped, record):
                     offsets[0, c] += (playback.steps[row, c] - playback.steps[chosen, c]) / rules.tick_s
         _advance(playback, rules, chosen, offsets, root)
         row, before = following, when
-        when = _moment(rules, wish, when, tick + 1, root[0], root[1])
+        when = _moment(rules, desired, when, tick + 1, root[0], root[1])
         if rules.holds:
-            _hold(rules, wish, when, root)
-            # What is wished next is seen from where the character was put.
-            when = _moment(rules, wish, before, tick + 1, root[0], root[1])
+            _pull_to_path(rules, desired, when, root)
+            # The next desired positions are relative to the place to which the character was moved.
+            when = _moment(rules, desired, before, tick + 1, root[0], root[1])

@@ -1,8 +1,8 @@
 """Copies among the clips of a database, and the search index that leaves them out.
 
 A search may not choose frames next to the displayed one. If it found the same frames in a copy of the clip, it would
-choose them there. So a clip that is twice in a set would change the motion, although it adds nothing to the set.
-Therefore only the first one of several clips with equal rows is searched, in the order of their uids.
+choose them there. So a second copy of a clip would change the motion, although it adds nothing to the set. Therefore,
+of several clips with equal rows, only the clip with the lowest uid is searched.
 """
 
 from __future__ import annotations
@@ -36,16 +36,19 @@ def index_of(database: MatchingDatabase) -> SearchIndex:
 
 
 def searchable(database: MatchingDatabase, removed: Flags | None = None) -> Flags:
-    """Mark the rows that a search may choose: of clips with equal rows, only those of the first remaining one.
+    """Mark the rows that a search may choose.
+
+    Of several clips with equal rows, only the one with the lowest uid is searched, among the clips that still have rows
+    in the set.
 
     Parameters
     ----------
     database : MatchingDatabase    N rows of C clips
-    removed : (N,) bool, optional    rows that are not in the set any more
+    removed : (N,) bool, optional    True for rows that were removed from the set; none by default
 
     Returns
     -------
-    (N,) bool    rows to choose
+    (N,) bool    True for rows that a search may choose
     """
     allowed = database.selectable if removed is None else database.selectable & ~removed
     starts, groups = database.starts, equal_clips(database)
@@ -84,7 +87,7 @@ def equal_clips(database: MatchingDatabase) -> NDArray[np.int64]:
 
 
 def _same_rows(database: MatchingDatabase, first: DatabaseClip, second: DatabaseClip) -> bool:
-    """Check whether two clips are played in the same way."""
+    """Check whether two clips have equal features, root motion, poses and contacts, and are both loops or both not."""
     one, other = (slice(clip.start, clip.stop) for clip in (first, second))
     arrays = (
         database.features,

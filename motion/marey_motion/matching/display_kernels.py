@@ -11,7 +11,7 @@ import numpy as np
 
 from marey_motion.kernels import compiled, product
 
-# Offsets below this, in metres or radians and the same per second, are below what float32 poses can show.
+# Smaller offsets (in metres or radians) and velocities (per second) cannot be represented in float32 poses.
 FORGOTTEN = 1e-9
 # Half of an angle, squared, below which the first terms of the series are exact to the last bit.
 SMALL = 1e-4
@@ -93,7 +93,7 @@ def _show(pose, place, joints, moved, offsets, shown, shown_places):
 
 @compiled
 def _show_row(pose, place, joints, moved, shown, shown_places):
-    """Fill `shown` and `shown_places` with joints and translations of a row, as `_show` does, but add no offsets."""
+    """Fill `shown` (3 + 4·K) with K joints of a row's pose, and `shown_places` (M, 3) with M of its translations."""
     shown[:3] = pose[:3]
     for m in range(moved.shape[0]):
         shown_places[m] = place[moved[m]]

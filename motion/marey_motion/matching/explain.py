@@ -121,13 +121,13 @@ def explain_choice(
             raise MotionError(
                 f"the database has no row {row}; it has {database.row_count} rows, counted from 0", where="others"
             )
-    wish, rules, playback = (
+    desired, rules, playback = (
         trajectory_arrays(guide),
         controller_constants(options, guide.rate_hz),
         database_arrays(database),
     )
     shown = int(record.rows[tick])
-    query = _query_at(index, playback, wish, rules, record, tick)
+    query = _query_at(index, playback, desired, rules, record, tick)
     costs = _Costs(database, index, rules, query, shown, starting=tick == 0)
     chosen, cost, reason = _chosen(index, playback, rules, query, record, tick)
     ended = playback.successors[shown] < 0
@@ -148,7 +148,7 @@ def explain_choice(
 def _query_at(
     index: SearchIndex,
     playback: DatabaseArrays,
-    wish: TrajectoryArrays,
+    desired: TrajectoryArrays,
     rules: ControllerConstants,
     record: TrialRecord,
     tick: int,
@@ -156,10 +156,11 @@ def _query_at(
     from marey_motion.matching import controller_kernels as kernels
 
     moments = np.empty(tick + 1)
-    kernels.moments_along(rules, wish, record.positions[: tick + 1], moments)
+    kernels.moments_along(rules, desired, record.positions[: tick + 1], moments)
     query = np.empty(index.rows.shape[1])
     x, z = record.positions[tick]
-    kernels.fill_query(index, playback, rules, wish, record.rows[tick], moments[-1], x, z, record.headings[tick], query)
+    row, heading = record.rows[tick], record.headings[tick]
+    kernels.fill_query(index, playback, rules, desired, row, moments[-1], x, z, heading, query)
     return query
 
 

@@ -31,8 +31,8 @@ class FeatureGroup(NamedTuple):
 class FeatureLayout:
     """The D dimensions of a feature vector: first the pose, then the trajectory.
 
-    Positions and velocities have components left, up, forward in the frame of the root (x, y, z of a body that heads
-    along +z); points and directions of the trajectory have left and forward (x, z).
+    Positions and velocities have the components left, up and forward in the frame of the root: x, y and z of a body
+    that heads along +z. Points and directions of the trajectory have the components left and forward (x, z).
     """
 
     groups: tuple[FeatureGroup, ...]
@@ -183,7 +183,7 @@ def extract_features(
 
     Returns
     -------
-    (F, D) float64    metres and metres per second in the frame of each frame's root
+    (F, D) float64    metres and metres per second, relative to the root in the same frame of the motion
     """
     features = np.empty((len(positions), layout.dimension_count))
     for group in layout.groups:

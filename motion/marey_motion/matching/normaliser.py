@@ -72,7 +72,7 @@ class Normaliser:
 
         Raises
         ------
-        MotionError    if the dimensions differ
+        MotionError    if the number or the names of the dimensions differ
         """
         if len(self.offset) != layout.dimension_count:
             raise MotionError(
@@ -158,7 +158,8 @@ def fit_normaliser(features: Floats, layout: FeatureLayout, fitted_on: str) -> N
     """Fit an offset for each dimension and a scale for each group of dimensions.
 
     The offset is the mean. The scale is the mean of the standard deviations of the group's dimensions, divided by the
-    weight of the group. Groups that hardly vary get the scale `LEAST_SCALE`, and are listed in `floored`.
+    weight of the group. Groups that hardly vary get the scale `LEAST_SCALE`, and are listed in `floored`. Groups with
+    the weight 0 get the scale `UNMATCHED_SCALE`.
 
     Parameters
     ----------

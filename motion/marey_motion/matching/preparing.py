@@ -23,7 +23,7 @@ from marey_motion.skeleton import SAME_OFFSET_M, Skeleton, same_hierarchy
 from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.wording import counted
 
-# The seam of a loop is measured in steps between its frames.
+# If the seam of a loop is shorter than this share of a step between frames, the last frame repeats the first.
 REPEATED_STEPS = 0.2
 OPEN_STEPS = 3.0
 STILL_RAD = 1e-4
@@ -120,7 +120,7 @@ def _wanted_frames(
     Returns the cut clip, the index of its first frame in the source, and whether the body walks in place.
     """
     clip, first = source.clip, 0
-    if not _moves(clip, body.skeleton):
+    if not _fits_skeleton(clip, body.skeleton):
         raise MotionError(
             "the clip has a different skeleton from the database; retarget the clip first", code="skeleton-mismatch"
         )
@@ -136,10 +136,11 @@ def _wanted_frames(
     return clip, first, bool(in_place)
 
 
-def _moves(clip: Clip, skeleton: Skeleton) -> bool:
-    """Return whether the poses of a clip fit `skeleton`, because the clip's own skeleton has the same joints.
+def _fits_skeleton(clip: Clip, skeleton: Skeleton) -> bool:
+    """Return whether the poses of a clip are also poses of `skeleton`.
 
-    End sites may differ, and so may the offsets of the root and of joints whose translations the clip contains.
+    The skeletons must be equal, except in end sites and in the offsets of the root and of joints whose translations
+    the clip contains.
     """
     own = clip.skeleton
     if own is skeleton:

@@ -34,7 +34,8 @@ class TrialRecord:
     positions : (T, 2) float64    root on the ground, metres
     headings : (T,) float64    radians, continuous
     status : (T,) int8    `Status`
-    match_cost : (T,) float64    normalised squared cost of the row that was chosen; NaN at ticks without a search
+    match_cost : (T,) float64    cost of the chosen row; if poses are compared by features, the squared distance between
+        normalised features. NaN at ticks without a search
     continuing_cost : (T,) float64    cost of continuing the displayed clip, comparable to `match_cost`; NaN at ticks
         without a search and at the end of the clip
     pose_cost : (T,) float64    distance in metres, summed over the pose joints, from the displayed pose to the pose of

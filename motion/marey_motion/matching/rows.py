@@ -28,7 +28,7 @@ CLAMPED_S = 1 / 3
 
 
 class ClipRows(NamedTuple):
-    """The rows of one clip; shapes and meanings as in `MatchingDatabase`."""
+    """The rows that one clip adds to a `MatchingDatabase`, in arrays with the same names, shapes and units."""
 
     features: Floats
     selectable: NDArray[np.bool_]
@@ -105,11 +105,13 @@ def _poses(motion: Motion, carrier: Floats, root: SimulationRoot, body: Matching
     if body.carrier == 0:
         rotations[:, 0] = quaternions.multiply(facing, motion.rotations[:, 0])
     else:
-        _hang(poses, rotations, facing, motion, body)
+        _set_joints_above_carrier(poses, rotations, facing, motion, body)
     return poses.astype(np.float32)
 
 
-def _hang(poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body: MatchingBody) -> None:
+def _set_joints_above_carrier(
+    poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body: MatchingBody
+) -> None:
     """Set the joints above the carrier to their rest pose relative to the root, without moving the carrier.
 
     `rotations` (F, J, 4) is a view of the rotations in `poses`; both are changed in place. `facing` (F, 4) are the

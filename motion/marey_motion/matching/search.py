@@ -20,8 +20,8 @@ LARGEST = 1e18
 
 _SIXTEEN = 16
 _PROBES = 32
-# Where more than this share of the blocks has to be looked at, going through all of them in order is quicker. Measured
-# on captured motion with ever more noise: both take the same time at some place between 0.25 and 0.45.
+# If searches visit more than this share of the blocks, a scan of all blocks in order is faster. In measurements on
+# captured motion with increasing noise, both took the same time at a share between 0.25 and 0.45.
 _SCAN_ABOVE = 0.35
 
 
@@ -109,7 +109,7 @@ def build_index(
         radius=float(np.sqrt(np.einsum("nd,nd->n", rows, rows).max())),
         boxed=True,
     )
-    boxed = _boxes_pay(index) if method == "auto" else method == "boxes"
+    boxed = _boxes_save_work(index) if method == "auto" else method == "boxes"
     return index._replace(boxed=boxed)
 
 
@@ -175,7 +175,7 @@ def _boxes(low: NDArray[np.float32], high: NDArray[np.float32], starts: NDArray[
     return np.ascontiguousarray(np.stack([low[lanes], high[lanes]], axis=2).transpose(0, 3, 2, 1))
 
 
-def _boxes_pay(index: SearchIndex) -> bool:
+def _boxes_save_work(index: SearchIndex) -> bool:
     """Return whether searches that use boxes save enough comparisons.
 
     This is measured by searches for queries whose first and second halves come from two random rows.
@@ -219,7 +219,7 @@ def find_nearest(
 
     Raises
     ------
-    MotionError    if the queries or weights have invalid values or a different number of dimensions from the index
+    MotionError    if the queries or weights have invalid values or another number of dimensions than the index
     """
     from marey_motion.matching import search_kernels as kernels
 
@@ -247,17 +247,18 @@ def find_best(
     index : SearchIndex    N rows of D dimensions
     query : (D,) float64    normalised like the rows
     count : int    number of rows to find; fewer are returned if fewer are selectable
-    weights : (D,) float64, optional    as for `find_nearest`
+    weights : (D,) float64, optional    factors by which the squared differences are multiplied, one per dimension and
+        not negative; 1 if None
     skip : (int, int)    rows [start, stop) that may not be chosen
 
     Returns
     -------
-    rows : (count,) int64    the rows
-    costs : (count,) float64    the same costs as in `find_nearest`, bit for bit
+    rows : (count,) int64    numbers of the rows
+    costs : (count,) float64    squared distances, equal to those of `find_nearest` to the last bit
 
     Raises
     ------
-    MotionError    as for `find_nearest`
+    MotionError    if the query or the weights have invalid values or another number of dimensions than the index
     """
     from marey_motion.matching import search_kernels as kernels
 

@@ -162,7 +162,11 @@ def _choose_row(index, query, block, lanes, row, cost, limit):
 
 @inlined
 def _search_group(index, query, group, row, cost, limit):
-    """Compare the best row so far with the rows of a group of boxes; parameters and results as in `_choose_row`."""
+    """Compare the best row so far with the rows of a group of boxes.
+
+    `row`, `cost` and `limit` are the best row so far, its exact cost, and a bound: rows with a greater float32 cost are
+    skipped. Returns the new row, cost and limit.
+    """
     boxes = _screened_boxes(index.boxes, query, group, query.bounds, limit)
     first = index.group_blocks[group]
     boxes &= (1 << (index.group_blocks[group + 1] - first)) - 1
@@ -182,7 +186,8 @@ def _search_boxes(index, query, row, cost, limit):
     """Search the nearest group of boxes first, for a tight limit, then the remaining groups in their order.
 
     Searching all groups in the order of their distance would visit a few per cent fewer groups, but take longer.
-    Parameters and results are as in `_choose_row`.
+    `row`, `cost` and `limit` are the best row so far, its exact cost, and a bound: rows with a greater float32 cost are
+    skipped. Returns the new row, cost and limit.
     """
     groups = index.boxes.shape[0]
     bounds = np.empty((index.group_boxes.shape[0], LANES), np.float32)
@@ -203,7 +208,11 @@ def _search_boxes(index, query, row, cost, limit):
 
 @compiled
 def _search_blocks(index, query, start, stop, row, cost, limit):
-    """Compare the best row so far with the rows of blocks [start, stop); parameters and results as in `_choose_row`."""
+    """Compare the best row so far with the rows of blocks [start, stop).
+
+    `row`, `cost` and `limit` are the best row so far, its exact cost, and a bound: rows with a greater float32 cost are
+    skipped. Returns the new row, cost and limit.
+    """
     for block in range(start, stop):
         lanes = _screened_rows(index, query, block, limit)
         if lanes:
@@ -231,15 +240,19 @@ def nearest(index, query, warm_row, skip_start, skip_stop):
 
     Returns the row and its cost, or (-1, inf) if there is none.
 
-    Of several nearest rows, the lowest is returned. `warm_row` is a row likely to be near, or -1: it changes the time
-    taken, not the answer.
+    Of several nearest rows, the row with the lowest number is returned. `warm_row` is a row that is likely to be near,
+    or -1; it changes only the time of the search, not its result.
     """
     return _nearest(index, query, np.ones(query.shape[0]), warm_row, skip_start, skip_stop)
 
 
 @compiled
 def nearest_weighted(index, query, weights, skip_start, skip_stop):
-    """Find the nearest row, as `nearest` does, with squared differences multiplied by non-negative weights (D,)."""
+    """Find the selectable row of least weighted cost outside [skip_start, skip_stop).
+
+    The squared differences are multiplied by the non-negative `weights` (D,). Returns the row and its cost, or (-1,
+    inf) if there is none.
+    """
     return _nearest(index, query, weights, -1, skip_start, skip_stop)
 
 
@@ -256,14 +269,20 @@ def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):
 
 @compiled
 def all_costs(index, query, weights, costs):
-    """Fill `costs` (N,) with the cost of every row, selectable or not; `weights` (D,) are as for `nearest_weighted`."""
+    """Fill `costs` (N,) with the cost of every row, selectable or not.
+
+    The squared differences are multiplied by `weights` (D,).
+    """
     for row in range(costs.shape[0]):
         costs[row] = _cost(index.rows[row], query, weights)
 
 
 @compiled
 def boxes_within(index, query, cost):
-    """Count the blocks whose box is at most `cost` away from the query; any search must visit at least these blocks."""
+    """Count the blocks whose box has a squared distance of at most `cost` from the query.
+
+    Any search for a row of this cost must visit at least these blocks.
+    """
     prepared = _prepared(index, query, np.ones(query.shape[0]), 0, 0)
     limit = _limit(prepared, cost)
     count = 0

@@ -22,7 +22,7 @@ _ZEROS = ir.Constant(_SIXTEEN, [0.0] * LANES)
 _UNDEFINED = ir.Constant(_SIXTEEN, ir.Undefined)
 _FIRST_LANE = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
 
-# Even and odd dimensions are summed apart: two additions can then be under way at once.
+# Even and odd dimensions are summed separately, so that the processor can do two additions at the same time.
 DIMENSIONS_PER_STEP = 2
 
 Values = list[ir.Value]
@@ -97,11 +97,14 @@ def _summed(gap: Gap, operands: int) -> Any:
 row_costs = _summed(_from_row, 1)
 """row_costs(blocks (B, D, 16), query (D,), weights (D,), sums (16,), number, limit): squared distances of 16 rows.
 
-All are float32 and D is even. Fills `sums` for block `number`; the integer returned has bit l set where
-sums[l] <= limit."""
+All arrays are float32, and D is even. Fills `sums` with the distances of the rows of block `number`. Bit l of the
+returned integer is set if sums[l] <= limit.
+"""
 
 box_costs = _summed(_from_box, 2)
-"""box_costs(boxes (G, D, 2, 16), …): squared distances from the query to the nearest points of 16 boxes.
+"""box_costs(boxes (G, D, 2, 16), query (D,), weights (D,), sums (16,), number, limit): squared distances of 16 boxes.
 
-A box is given by its low and high sides. All else is as in `row_costs`.
+All arrays are float32, and D is even. A box is given by its low and high sides, and its distance is that of its point
+nearest to the query. Fills `sums` with the distances of the boxes of group `number`. Bit l of the returned integer is
+set if sums[l] <= limit.
 """

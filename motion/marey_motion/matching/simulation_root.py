@@ -65,7 +65,7 @@ def simulation_root(positions: Floats, body: MatchingBody, rate_hz: float) -> Si
 
 
 def raw_root(positions: Floats, body: MatchingBody) -> SimulationRoot:
-    """Compute the root of `simulation_root` without smoothing.
+    """Compute the ground projection of the torso, with the mean heading of hips and shoulders, without smoothing.
 
     Parameters
     ----------

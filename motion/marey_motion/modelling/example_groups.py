@@ -14,7 +14,7 @@ from marey_motion.arrays import Ints
 LEAST_SUBJECTS = 3
 LEAST_FOLDS = 2
 LEAST_TRAINED = 4
-"""Least number of examples that must remain when a group is left out."""
+"""Least number of examples that must remain for training when a group is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class ExampleGroups:
         Returns
         -------
         (m,) int64 or None    number of the part of each example; None if there are fewer than three performers, or if
-            too few examples would remain
+            too few examples would remain for training
         """
         return None if self.subjects is None else _usable(self.subjects)
 
@@ -110,5 +110,5 @@ def _numbered(names: Sequence[str]) -> Ints:
 
 
 def _usable(parts: Ints) -> Ints | None:
-    """Return the parts (m,), or None if too few examples remain without the largest part."""
+    """Return the parts (m,), or None if too few examples remain for training when the largest part is left out."""
     return parts if len(parts) - np.bincount(parts).max() >= LEAST_TRAINED else None

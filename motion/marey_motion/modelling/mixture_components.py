@@ -90,7 +90,7 @@ def parameter_count(count: int, dimensions: int, covariance: CovarianceKind) -> 
     ----------
     count : int    number of normal distributions
     dimensions : int    number of dimensions d
-    covariance : str    kind of covariance
+    covariance : str    kind of covariance: "full", "tied" or "diagonal"
 
     Returns
     -------

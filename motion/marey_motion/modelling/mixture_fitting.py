@@ -1,4 +1,4 @@
-"""Choice of the mixture of normal distributions over latent vectors: number of distributions and kind of covariance."""
+"""Choice of a mixture of normal distributions for latent vectors: number of distributions and kind of covariance."""
 
 from __future__ import annotations
 
@@ -23,10 +23,14 @@ LEAST_EXAMPLES_PER_COMPONENT = 5
 PATIENCE = 2
 """Number of successive component counts without improvement after which no larger count is tried."""
 LOW_SHARE = 0.05
-"""Share of the samples of a mixture that are less likely than its threshold for improbable examples."""
+"""Share of a mixture's samples whose density is below the threshold for improbable examples."""
 THRESHOLD_SAMPLES = 2000
 WIDENINGS = tuple(float(2.0 ** (step / 8)) for step in range(17))
-"""Factors of the covariances, from 1 to 4; the least factor that calibrates the likelihoods is chosen."""
+"""Factors of the covariances, from 1 to 4.
+
+The least factor is chosen with which at most about 5 % of the left-out examples are below the threshold for improbable
+examples.
+"""
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class MixtureCandidate:
     Parameters
     ----------
     components : int    number of components
-    covariance : str    kind of covariance
+    covariance : str    kind of covariance: "full", "tied" or "diagonal"
     bic, aic : float    Bayesian and Akaike information criterion
     log_likelihood : float    natural logarithm of the likelihood of all examples
     held_out_log_likelihood : float or None    mean log-likelihood of examples under mixtures that were fitted without
@@ -84,11 +88,11 @@ class FittedMixture:
     Parameters
     ----------
     mixture : LatentMixture    the mixture
-    covariance : str    kind of covariance; "point" for examples that do not vary
-    widening : float    factor of the covariances for likelihoods, at least 1. Unless the options set it, it is the
-        least of `WIDENINGS` with which at most 5 % of the left-out examples (rounded up) are below the threshold that
-        5 % of the samples of the widened mixture do not reach; the greatest if none is sufficient, 1 if `held_out` is
-        None. It applies to `held_out` and `held_out_subjects`, not to the candidates
+    covariance : str    kind of covariance: "full", "tied", "diagonal", or "point" for examples that do not vary
+    widening : float    factor of the covariances for likelihoods, at least 1. It applies to `held_out` and
+        `held_out_subjects`, not to the candidates. If the options do not set the factor, it is the least of `WIDENINGS`
+        with which at most 5 % of the left-out examples (rounded up) are below their thresholds (see `HeldOut`). It is
+        the greatest of `WIDENINGS` if no factor is sufficient, and 1 if `held_out` is None
     candidates : tuple of MixtureCandidate    by kind of covariance and number of components; empty for examples that do
         not vary
     held_out, held_out_subjects : HeldOut, optional    likelihoods of examples whose take, or whose performer, was left
@@ -131,7 +135,7 @@ def fit_mixture(
     Parameters
     ----------
     latents : (n, d) float64    latent vectors
-    options : MixtureOptions, optional    options
+    options : MixtureOptions, optional    numbers and kinds of distributions to try, and the criterion of the choice
     groups : ExampleGroups, optional    takes and performers; by default, each example is a take of its own
     seed : int    the same seed gives the same mixture
 
@@ -164,7 +168,7 @@ def fit_mixture(
 
 
 class _Tried(NamedTuple):
-    """A fitted candidate."""
+    """A candidate with its mixture, and the log-likelihoods of left-out examples; None without cross-validation."""
 
     candidate: MixtureCandidate
     mixture: LatentMixture
@@ -181,7 +185,10 @@ class _Unseen:
     seed: int
 
     def judged(self, widening: float = 1.0) -> HeldOut:
-        """Compute the likelihood of each example, and the threshold, under the widened mixture without its fold."""
+        """Compute the likelihood and the threshold of each example under the mixture fitted without the example's fold.
+
+        The covariances of each mixture are first multiplied by `widening`.
+        """
         found = HeldOut(np.empty(len(self.folds)), np.empty(len(self.folds)))
         for fold, fitted in enumerate(self.mixtures):
             mixture = fitted.widened(widening)
@@ -329,7 +336,7 @@ def low_density(mixture: LatentMixture, seed: int) -> float:
 
 
 def _score(candidate: MixtureCandidate, criterion: Criterion) -> float:
-    """Return the criterion of a candidate; higher is better."""
+    """Return the value of the criterion for a candidate, with the sign chosen so that higher is better."""
     if criterion == "held_out":
         return float("-inf") if candidate.held_out_log_likelihood is None else candidate.held_out_log_likelihood
     return -(candidate.bic if criterion == "bic" else candidate.aic)

@@ -142,7 +142,7 @@ class MotionPrimitive:
         if self.spatial.mean.shape[1] != 3 + 4 * self.skeleton.joint_count:
             raise MotionError(
                 f"the spatial components have {self.spatial.mean.shape[1]} channels, but a skeleton of "
-                f"{self.skeleton.joint_count} joints needs 3, and 4 for each joint"
+                f"{self.skeleton.joint_count} joints needs {3 + 4 * self.skeleton.joint_count}: 3 and 4 for each joint"
             )
         if self.temporal.basis.frame_count != self.frame_count - 1:
             raise MotionError(
@@ -160,7 +160,10 @@ class MotionPrimitive:
             raise MotionError("the widening must be at least 1", where="widening")
         least, most = self.log_slope_bounds
         if not -MOST_LOG_SLOPE <= least <= most <= MOST_LOG_SLOPE:
-            message = f"{least:g} to {most:g} is not a range within {-MOST_LOG_SLOPE:g} to {MOST_LOG_SLOPE:g}"
+            message = (
+                f"the limits {least:g} and {most:g} must be in ascending order, and from {-MOST_LOG_SLOPE:g} to "
+                f"{MOST_LOG_SLOPE:g}"
+            )
             raise MotionError(message, where="log_slope_range")
 
     @property
@@ -175,7 +178,7 @@ class MotionPrimitive:
 
     @property
     def log_slope_bounds(self) -> tuple[float, float]:
-        """Limits of the temporal function: `log_slope_range`, by default -`MOST_LOG_SLOPE` to `MOST_LOG_SLOPE`."""
+        """Limits of the temporal function: `log_slope_range` or, if it is None, ±`MOST_LOG_SLOPE`."""
         return self.log_slope_range or (-MOST_LOG_SLOPE, MOST_LOG_SLOPE)
 
     @cached_property
@@ -188,8 +191,9 @@ class MotionPrimitive:
     def sample(self, count: int, seed: int) -> Floats:
         """Draw latent vectors from the mixture.
 
-        Vectors whose motions would be too short or too long are drawn again; each is redrawn independently of the
-        others, so that a smaller count gives the first vectors of a larger count.
+        Vectors whose motions would be too short or too long are drawn again, each independently of the others. So a
+        smaller count gives the first vectors of a larger count. After `MOST_ATTEMPTS` draws, a vector is returned as it
+        is.
 
         Parameters
         ----------

@@ -59,7 +59,7 @@ def reconstruction_errors(
     ----------
     skeleton : Skeleton    J joints
     principal : PrincipalExamples    components of the examples
-    poses : (m, N, D) float64    poses; their quaternions have consistent signs
+    poses : (m, N, 3 + 4·J) float64    poses of the examples; their quaternions have consistent signs
     most_components : int    largest number of components
     groups : ExampleGroups, optional    takes and performers; by default, each example is a take of its own
     threads : int    threads to use
@@ -133,7 +133,10 @@ def comparison_frames(basis: SplineBasis) -> NDArray[np.int64]:
 
 
 def _left_out(scores: Floats, members: Ints, count: int) -> Floats:
-    """Compute the scores (g, count, r) of g left-out examples, rebuilt by 0, 1, ... components of the others."""
+    """Compute the scores (g, count, r) of g left-out examples that are rebuilt from components of the other examples.
+
+    The examples are rebuilt from 0, 1, ... and count - 1 components. `members` are the indices of the left-out ones.
+    """
     own = scores[members]
     others = len(scores) - len(members)
     moved = own.sum(axis=0) / others
@@ -147,7 +150,7 @@ def _left_out(scores: Floats, members: Ints, count: int) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Poses at T frames as a linear function of r scores: mean (T, D), directions (r, T, D)."""
+    """Poses at T frames as a linear function of r scores: mean (T, 3 + 4·J), directions (r, T, 3 + 4·J)."""
 
     skeleton: Skeleton
     mean: Floats
@@ -156,7 +159,7 @@ class _Comparison:
     def distances(self, scores: Floats, poses: Floats) -> Floats:
         """Compute the mean distance of joints, in metres, between each of c motions and one given motion; (c,).
 
-        The c motions are given by their `scores` (c, r), and the one motion by its `poses` (T, D).
+        The c motions are given by their `scores` (c, r), and the one motion by its `poses` (T, 3 + 4·J).
         """
         from marey_motion import kinematics
         from marey_motion.modelling import reconstruction_kernels

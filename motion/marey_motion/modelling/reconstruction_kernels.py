@@ -41,9 +41,10 @@ def _place_joints(pose, local, parents, offsets, world, positions):
 
 @compiled
 def mean_distances(poses, parents, offsets, targets, out):
-    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), for B motions of T poses (B, T, D).
+    """Fill `out` (B,) with the mean distance, in metres, of the joints of B motions from `targets` (T, J, 3).
 
-    The quaternions of the poses need not have unit length. `parents` (J,) and `offsets` (J, 3) are the skeleton's.
+    `poses` (B, T, 3 + 4·J) are the motions; their quaternions need not have unit length. `parents` (J,) and `offsets`
+    (J, 3) describe the skeleton.
     """
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))
@@ -63,10 +64,11 @@ def mean_distances(poses, parents, offsets, targets, out):
 
 @compiled
 def squared_error_gradient(poses, parents, offsets, targets, gradient):
-    """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) in the poses.
+    """Return the sum of squared distances of joints from `targets` (F, J, 3), and fill `gradient` (F, 3 + 4·J).
 
-    Quaternions need not have unit length: the sum is computed for the rotations that they represent. From the leaves to
-    the root, the gradients of all joints below a joint are added up to a force and a torque on this joint.
+    The gradient is the derivative of the sum with respect to `poses` (F, 3 + 4·J). Quaternions need not have unit
+    length: the sum is computed for the rotations that they represent. From the leaves to the root, the gradients of all
+    joints below a joint are added up to a force and a torque on this joint.
     """
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))

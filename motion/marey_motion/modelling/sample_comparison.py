@@ -50,7 +50,7 @@ def compare_samples(
     Parameters
     ----------
     primitive : MotionPrimitive    the model
-    poses : (m, N, D) float64    poses of the examples; their quaternions have consistent signs
+    poses : (m, N, 3 + 4·J) float64    poses of the examples; their quaternions have consistent signs
     durations_s : (m,) float64    durations of the examples
     takes : (m,) int64    number of the take of each example
     sampled : (n, L) float64    latent vectors of the samples, n at least 1
@@ -99,7 +99,10 @@ def _greatest_gap(one: Floats, other: Floats) -> float:
 
 
 def _beyond_range(examples: Floats, samples: Floats) -> float:
-    """Compute the share of rotations of samples (n, T, D) that are outside the ranges of the examples (m, T, D)."""
+    """Compute the share of joint rotations in samples that are outside the ranges of the examples.
+
+    The samples are poses (n, T, 3 + 4·J), the examples poses (m, T, 3 + 4·J).
+    """
     turned = [motions[..., 3:].reshape(*motions.shape[:2], -1, 4) for motions in (examples, samples)]
     given, drawn = (one / np.linalg.norm(one, axis=-1, keepdims=True) for one in turned)
     mean = given.mean(axis=(0, 1))

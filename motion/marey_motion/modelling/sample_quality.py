@@ -102,7 +102,7 @@ def joint_positions(skeleton: Skeleton, poses: Floats, joints: tuple[int, ...]) 
     Parameters
     ----------
     skeleton : Skeleton    J joints
-    poses : (m, N, D) float64    root translations in metres and local rotations
+    poses : (m, N, 3 + 4·J) float64    root translations in metres and local rotations (w, x, y, z)
     joints : tuple of int    indices of k joints
 
     Returns

@@ -43,7 +43,8 @@ def optimised_weights(
     ----------
     skeleton : Skeleton    J joints
     basis : SplineBasis    splines with n coefficients
-    coefficients : (m, n, D) float64    coefficients of examples whose quaternions have consistent signs
+    coefficients : (m, n, D) float64    coefficients of m examples in D = 3 + 4·J channels; the quaternions of the
+        examples have consistent signs
     starts : sequence of (D,) float64    candidates for the starting weights; the best candidate is improved
     keep : Keep    number of components
     inner_product : str    "coefficients" or "l2"

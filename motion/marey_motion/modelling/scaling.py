@@ -25,11 +25,11 @@ def root_max_weights(poses: Floats) -> Floats:
 
     Parameters
     ----------
-    poses : (m, N, D) float64    root translations in metres and local rotations
+    poses : (m, N, 3 + 4·J) float64    root translations in metres and local rotations
 
     Returns
     -------
-    (D,) float64    weights, 1 for rotations
+    (3 + 4·J,) float64    weights, 1 for rotations
     """
     extents = np.abs(poses[..., :3]).max(axis=(0, 1))
     weights = np.ones(poses.shape[2])
@@ -47,12 +47,12 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
     Parameters
     ----------
     skeleton : Skeleton    J joints
-    poses : (F, D) float64    typical poses, such as those of the mean motion; quaternions are normalised first, because
-        mean quaternions are shorter than 1
+    poses : (F, 3 + 4·J) float64    typical poses, such as those of the mean motion; their quaternions need not have
+        unit length
 
     Returns
     -------
-    (D,) float64    metres per unit of each channel
+    (3 + 4·J,) float64    metres per unit of each channel
     """
     rotations = quaternions.normalise(poses[:, 3:].reshape(len(poses), -1, 4)).reshape(len(poses), -1)
     joints = kinematics.forward_kinematics(skeleton, np.concatenate((poses[:, :3], rotations), axis=1))

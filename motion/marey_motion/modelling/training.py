@@ -20,7 +20,7 @@ from marey_motion.modelling.scaling import jacobian_weights, root_max_weights
 from marey_motion.modelling.splines import SplineBasis, coefficient_count
 from marey_motion.modelling.time_model import equalising_weight, fit_log_slopes
 from marey_motion.modelling.training_report import TrainingReport, report_on
-from marey_motion.modelling.training_warnings import Warned, warnings_of
+from marey_motion.modelling.training_warnings import ModelWarning, warnings_of
 from marey_schemas.options.modelling import ModelOptions
 
 Progress = Callable[[int, int | None, str], None]
@@ -43,7 +43,7 @@ class TrainedPrimitive:
 
     primitive: MotionPrimitive
     report: TrainingReport
-    warnings: tuple[Warned, ...]
+    warnings: tuple[ModelWarning, ...]
     options: ModelOptions
     weights: Floats
 
@@ -78,7 +78,7 @@ def train_primitive(
     Parameters
     ----------
     aligned : AlignedSet    m examples of N frames
-    options : ModelOptions    options
+    options : ModelOptions    options of the training
     name : str    name of the action
     seed : int    seed of the mixture's starts, the folds and the samples of the report
     threads : int    threads for leave-one-out reconstructions; the result does not depend on their number
@@ -111,6 +111,9 @@ def train_primitive(
 
 def check_examples(aligned: AlignedSet) -> None:
     """Check that a model can be trained on examples.
+
+    There must be enough examples and canonical frames. In each example, all numbers must be finite, only rotations of
+    joints may vary, and the time function must be strictly increasing.
 
     Parameters
     ----------
@@ -149,7 +152,7 @@ def check_examples(aligned: AlignedSet) -> None:
         if not (np.isfinite(motion.poses).all() and np.isfinite(clip.time_function).all()):
             raise ModelError("the example contains numbers that are not finite (infinite or NaN)", where=clip.name)
         if not (np.diff(clip.time_function) > 0.0).all():
-            raise ModelError("the time function is not strictly increasing", where=clip.name)
+            raise ModelError("the time function is not strictly increasing; align the examples again", where=clip.name)
 
 
 def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:
@@ -158,7 +161,7 @@ def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:
     Parameters
     ----------
     aligned : AlignedSet    the examples
-    options : ModelOptions    options
+    options : ModelOptions    options of the training
 
     Returns
     -------
@@ -195,10 +198,10 @@ def channel_weights(
     ----------
     aligned : AlignedSet    the examples
     basis : SplineBasis    splines with n coefficients
-    poses : (m, N, D) float64    poses; their quaternions have consistent signs
+    poses : (m, N, D) float64    poses of D = 3 + 4·J channels; their quaternions have consistent signs
     coefficients : (m, n, D) float64    coefficients of the poses
     keep : Keep    number of components
-    options : ModelOptions    options
+    options : ModelOptions    options of the training
 
     Returns
     -------
@@ -239,17 +242,20 @@ def _assemble(
 
 
 def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
-    """Compute the allowed range of durations of samples: a fifth beyond the range of the examples at both ends."""
+    """Compute the shortest and the longest duration of samples in seconds.
+
+    The range is that of the examples, extended by a fifth at both ends.
+    """
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     return float(durations.min()) * (1.0 - DURATION_MARGIN), float(durations.max()) * (1.0 + DURATION_MARGIN)
 
 
 def _log_slope_range(aligned: AlignedSet, temporal: PrincipalExamples) -> tuple[float, float]:
-    """Compute the range to which the logarithms of time steps are clipped in motions of the model.
+    """Compute the least and the greatest logarithm of a time step in motions of the model.
 
-    The range covers the time steps of the examples and of the examples rebuilt from the kept components, and is
-    extended by `LOG_SLOPE_MARGIN` at both ends. Clipping therefore changes no rebuilt example. The range never exceeds
-    ±`MOST_LOG_SLOPE`.
+    A time step is the number of real frames from one canonical frame to the next. The range contains the time steps of
+    the examples, and of the examples rebuilt from the kept components. It is extended by `LOG_SLOPE_MARGIN` at both
+    ends, but never beyond ±`MOST_LOG_SLOPE`.
     """
     functions = temporal.functions
     rebuilt = functions.basis.at_frames @ functions.coefficients(_kept_scores(temporal))[..., 0].T

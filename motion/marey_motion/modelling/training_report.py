@@ -75,7 +75,7 @@ class TrainingReport:
     ----------
     spatial_energy, temporal_energy : cumulative share of the variance, over all components of the examples
     takes, subjects : number of takes and of performers; 0 performers if they are unknown or fewer than three
-    mixture_covariance : kind of covariance, see `FittedMixture`
+    mixture_covariance : kind of covariance: "full", "tied", "diagonal", or "point" for examples that do not vary
     candidates : mixtures compared, with their criteria
     log_likelihood : mean log-likelihood of the examples
     held_out_log_likelihood : mean of the examples' `held_out_log_likelihood`; None if it was not computed
@@ -129,7 +129,7 @@ def report_on(
     ----------
     primitive : MotionPrimitive    the model
     aligned : AlignedSet    m examples
-    poses : (m, N, D) float64    poses of the examples; their quaternions have consistent signs
+    poses : (m, N, 3 + 4·J) float64    poses of the examples; their quaternions have consistent signs
     spatial, temporal : PrincipalExamples    all components of the examples, also those that the model does not keep
     latents : (m, L) float64    latent vectors of the examples
     fitted : FittedMixture    mixture and candidates

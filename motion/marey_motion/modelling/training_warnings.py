@@ -21,14 +21,14 @@ LEAST_ERROR_CM = 0.5
 
 
 @dataclass(frozen=True)
-class Warned:
+class ModelWarning:
     """Warning about a model: a stable code and a description."""
 
     code: str
     message: str
 
 
-def warnings_of(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> tuple[Warned, ...]:
+def warnings_of(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> tuple[ModelWarning, ...]:
     """List the warnings about a model: about its examples, then its mixture, then its samples.
 
     Parameters
@@ -39,20 +39,20 @@ def warnings_of(primitive: MotionPrimitive, report: TrainingReport, options: Mod
 
     Returns
     -------
-    tuple of Warned    a code and a message for each warning
+    tuple of ModelWarning    a code and a message for each warning
     """
     return (*_of_examples(primitive, report, options), *_of_mixture(report), *_of_samples(report))
 
 
-def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> list[Warned]:
+def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> list[ModelWarning]:
     count, found = len(report.examples), []
     if primitive.dimensions == 0:
         found.append(
-            Warned("no-variation", f"all {count} examples are the same motion, so the model can only repeat it")
+            ModelWarning("no-variation", f"all {count} examples are the same motion, so the model can only repeat it")
         )
     elif count < FEW_EXAMPLES_PER_DIMENSION * primitive.dimensions:
         found.append(
-            Warned(
+            ModelWarning(
                 "too-few-examples",
                 f"there are only {count} examples for {primitive.dimensions} dimensions, so their likelihoods are "
                 f"hardly meaningful; add examples, or keep less than {options.spatial_share:.0%} of the variance",
@@ -64,7 +64,7 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
         training, left_out = (curve[primitive.spatial.count] for curve in (errors.training_cm, errors.left_out_cm))
         if left_out > max(OVERFITTED_RATIO * training, LEAST_ERROR_CM):
             found.append(
-                Warned(
+                ModelWarning(
                     "does-not-generalise",
                     f"the mean reconstruction error is {left_out:.1f} cm for an example left out of the training, but "
                     f"{training:.1f} cm for training examples, which do not show all variations of the action; add "
@@ -76,7 +76,7 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
         names = ", ".join(one.name for one in outliers[:NAMES_SHOWN])
         more = f" and {len(outliers) - NAMES_SHOWN} more" if len(outliers) > NAMES_SHOWN else ""
         found.append(
-            Warned(
+            ModelWarning(
                 "outliers",
                 f"these examples are unlike the others: {names}{more}; check whether they show the same action",
             )
@@ -84,14 +84,16 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
     return found
 
 
-def _of_time_components(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> list[Warned]:
+def _of_time_components(
+    primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions
+) -> list[ModelWarning]:
     """Warn if the limit of the number of temporal components is too low for the requested share of the variance."""
     kept = primitive.temporal.count
     held = float(report.temporal_energy[kept - 1]) if 0 < kept <= len(report.temporal_energy) else 0.0
     if kept < options.most_temporal_components or kept >= len(report.temporal_energy) or held >= options.temporal_share:
         return []
     return [
-        Warned(
+        ModelWarning(
             "time-components-missing",
             f"{kept} temporal components explain {held:.0%} of the variance of the timing, but "
             f"{options.temporal_share:.0%} were asked for; raise most_temporal_components, or accept that samples vary "
@@ -105,12 +107,12 @@ def _likelihood(example: ExampleReport) -> float:
     return example.log_likelihood if held_out is None else held_out
 
 
-def _of_mixture(report: TrainingReport) -> list[Warned]:
+def _of_mixture(report: TrainingReport) -> list[ModelWarning]:
     found = []
     share = report.held_out_low_share
     if share is not None and share > MANY_UNLIKELY and len(report.examples) * share > 1.0:
         found.append(
-            Warned(
+            ModelWarning(
                 "likelihood-too-sure",
                 f"{share:.0%} of the examples are less likely, under a model that was trained without their takes, "
                 "than 95% of what this model expects; unseen motions differ more than the examples show, so add takes",
@@ -119,7 +121,7 @@ def _of_mixture(report: TrainingReport) -> list[Warned]:
     slow = [candidate.components for candidate in report.candidates if not candidate.converged]
     if slow:
         found.append(
-            Warned(
+            ModelWarning(
                 "not-converged",
                 f"the fit of a mixture of {', '.join(map(str, slow))} normal distributions did not converge",
             )
@@ -127,14 +129,14 @@ def _of_mixture(report: TrainingReport) -> list[Warned]:
     return found
 
 
-def _of_samples(report: TrainingReport) -> list[Warned]:
+def _of_samples(report: TrainingReport) -> list[ModelWarning]:
     found = []
     if report.sample_feet is not None and report.training_feet is not None:
         found += _of_feet(report.sample_feet, report.training_feet)
     durations = report.sample_durations
     if durations is not None and durations.outside_share > MANY_OUTSIDE:
         found.append(
-            Warned(
+            ModelWarning(
                 "odd-durations",
                 f"{durations.outside_share:.0%} of the samples are more than 5% longer or shorter than all examples",
             )
@@ -142,11 +144,11 @@ def _of_samples(report: TrainingReport) -> list[Warned]:
     return found
 
 
-def _of_feet(feet: FootQuality, trained: FootQuality) -> list[Warned]:
+def _of_feet(feet: FootQuality, trained: FootQuality) -> list[ModelWarning]:
     found = []
     if feet.below_floor_mean_cm > DEEP_BELOW_FLOOR_CM:
         found.append(
-            Warned(
+            ModelWarning(
                 "feet-below-floor",
                 f"in {feet.below_floor_share:.0%} of their frames, samples have a foot below the floor, "
                 f"{feet.below_floor_mean_cm:.1f} cm on average (examples: {trained.below_floor_share:.0%}, "
@@ -155,7 +157,7 @@ def _of_feet(feet: FootQuality, trained: FootQuality) -> list[Warned]:
         )
     if feet.slide_m_s > max(SLIDING_RATIO * trained.slide_m_s, SLIDING_M_S):
         found.append(
-            Warned(
+            ModelWarning(
                 "feet-slide",
                 f"where the examples plant their feet, those of samples slide at {feet.slide_m_s:.2f} m/s on average "
                 f"(examples: {trained.slide_m_s:.2f} m/s); plant the feet of samples (edit command `plant_feet`)",

@@ -26,7 +26,7 @@ from marey_motion.resampling import resample_motion
 MOST_COMPARED_FRAMES = 3600
 """Greatest number of frames of a clip, at the rate of the metric."""
 MOST_TABLE_CELLS = 2_000_000_000
-"""Greatest number of cells of all motion maps of a table of distances."""
+"""Greatest number of cells in all motion maps together that are computed for one table of distances."""
 
 Progress = Callable[[float, float | None, str], None]
 
@@ -58,7 +58,8 @@ class ClipDistances:
     Parameters
     ----------
     totals : (N, N) float64    perceptual distances, symmetric, 0 on the diagonal
-    by_component : (C, N, N) float64    distances by each component of the metric alone, not multiplied by its share
+    by_component : (C, N, N) float64    distances by each of the C components of the metric alone, before the
+        multiplication by the component's share in the total
     """
 
     totals: Floats
@@ -72,7 +73,7 @@ class ClipDistances:
         ----------
         count : int    number of clips N
         pairs : (R, 2) int64    all pairs of the clips, each once
-        found : (R, 1 + C) float64    distances of the pairs, as `compare_pairs` returns them
+        found : (R, 1 + C) float64    total distance of each pair, then its distance by each of the C components
 
         Returns
         -------
@@ -180,7 +181,7 @@ def compare_clips(
 
     Raises
     ------
-    MotionError    as for `compare_pairs`
+    MotionError    if clips cannot be compared, or the motion maps of all pairs have more than `MOST_TABLE_CELLS` cells
     """
     pairs = np.stack(np.triu_indices(len(clips), 1), axis=1)
     by_number = dict(enumerate(clips))
@@ -209,7 +210,8 @@ def compare_pairs(
 
     Returns
     -------
-    (R, 1 + C) float64    distance of each pair, and its distances by each component alone, not multiplied by its share
+    (R, 1 + C) float64    total distance of each pair, then its distance by each component alone, before the
+        multiplication by the component's share in the total
 
     Raises
     ------
@@ -239,8 +241,8 @@ def _distance(clips: Mapping[int, MeasuredClip], metric: PerceptualMetric, pair:
         if error.code != "alignment-impossible":
             raise
         raise MotionError(
-            f"clips {pair[0] + 1} and {pair[1] + 1} have {one.frame_count} and {other.frame_count} frames, and the "
-            "moments of clips whose lengths differ so much cannot be matched; compare loops of one cycle, or cut the "
-            "longer clip",
+            f"clips {pair[0] + 1} and {pair[1] + 1} have {one.frame_count} and {other.frame_count} frames; the frames "
+            "of clips whose lengths differ so much cannot be matched; compare loops of one cycle, or cut the longer "
+            "clip",
             code="lengths-differ",
         ) from error

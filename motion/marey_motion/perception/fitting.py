@@ -96,7 +96,8 @@ def fit_component(
     perceived : (R,) float64    perceived difference of each pair; pairs with NaN are left out
     shaping : str    the shaping F
     exponent : float    exponent of the shaping `power`
-    weights : (R,) float64, optional    weights of the pairs in the sum of squares, such as shown / (p (1 - p))
+    weights : (R,) float64, optional    weights of the pairs in the sum of squares, such as the inverse variances of the
+        perceived differences; 1 if None
 
     Returns
     -------
@@ -135,7 +136,7 @@ def fit_power(differences: PairDifferences, perceived: Floats) -> Component:
 
     Raises
     ------
-    MotionError    for the same reasons as in `fit_component`
+    MotionError    if too few pairs have a perceived difference, or if the best fit gives every class the weight 0
     """
     known = np.isfinite(perceived)
 
@@ -271,7 +272,7 @@ def leave_one_motion_out(parts: Sequence[PairDifferences], perceived: Floats, sh
 
     Returns
     -------
-    (R,) float64    for each pair, the mean of two predictions: one without each motion of the pair
+    (R,) float64    for each pair, the mean of two predictions, each from a fit without one motion of the pair
 
     Raises
     ------

@@ -16,7 +16,10 @@ from marey_schemas.documents.studies import SHOWN
 
 TRIALS = 63
 LEAST_REPEATS = 30
-"""Least number of repeated answers (those after the first about each pair), which give the noise within a quarter."""
+"""Least number of repeated answers from which the noise can be estimated to within a quarter.
+
+An answer about a pair of motions is repeated if the pair was shown before.
+"""
 _CANDIDATE_DRAWS = 24
 _FIRST, _SECOND = np.triu_indices(SHOWN, 1)
 _PAIR_OF = {(int(one), int(other)): pair for pair, (one, other) in enumerate(zip(_FIRST, _SECOND, strict=True))}
@@ -48,7 +51,7 @@ class Judgements:
         if self.shown.shape != (trials, SHOWN) or {self.participants.shape, self.chosen.shape} != {(trials,)}:
             raise MotionError("each trial needs a participant, four motions and a chosen pair")
         if not trials:
-            raise MotionError("there are no answered trials")
+            raise MotionError("the judgements contain no answered trial; at least one is needed")
         ordered = np.sort(self.shown, axis=1)
         wrong = (ordered[:, 0] < 0) | (ordered[:, -1] >= self.motion_count) | (np.diff(ordered) == 0).any(axis=1)
         wrong |= (self.chosen < 0) | (self.chosen >= len(_FIRST)) | (self.participants < 0)
@@ -125,7 +128,7 @@ def draw_trials(
     """Draw the motions of a study's trials so that all motions, and all pairs, are shown about equally often.
 
     The numbers of times that a participant sees each motion differ by at most one. For each participant, several draws
-    are made. The draw is kept with which the counts of all pairs, over the participants so far, differ least.
+    are made; the kept draw is the one with which the counts of all pairs differ least over the participants so far.
 
     Parameters
     ----------
@@ -182,7 +185,7 @@ def simulate_judgements(differences: Floats, participants: int, seed: int, noise
 
 
 def difference_table(judgements: Judgements) -> DifferenceTable:
-    """Count judgements.
+    """Compute the difference of each pair of motions: 1 minus the share of its showings in which it was chosen.
 
     Parameters
     ----------
@@ -190,7 +193,7 @@ def difference_table(judgements: Judgements) -> DifferenceTable:
 
     Returns
     -------
-    DifferenceTable    differences and counts of all pairs
+    DifferenceTable    differences and counts of all pairs; NaN for pairs that were never shown together
     """
     n = judgements.motion_count
     shown, chosen = (counts.sum(axis=0) for counts in _counts_by_participant(judgements))

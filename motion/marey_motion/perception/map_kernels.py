@@ -38,7 +38,10 @@ def _add(x, scale, weight, shaping, exponent, row):
 
 @inlined
 def _turns(a, b, cosines, sines):
-    """Find the rotations about the vertical that superpose ground points b (P, 2, m) on a (P, 2)."""
+    """Fill cosines and sines (m,) with the rotations about the vertical that superpose points b (P, 2, m) on a (P, 2).
+
+    The points are on the ground, relative to their mean.
+    """
     cosines[:] = 0.0
     sines[:] = 0.0
     for p in range(a.shape[0]):

@@ -17,7 +17,7 @@ MOST_CELLS = 50_000_000
 """Maximum number of cells of a map that `motion_map` returns; compute a larger map by `map_blocks`."""
 SHAPING_NUMBERS = {"euclid": 0, "manhattan": 1, "sigmoid": 2, "power": 3}
 ANGLE_NUMBERS = {"half_angle": 0, "log_norm": 0, "angle": 1, "one_minus_dot": 2}
-"""Numbers of shapings (`SHAPING_NUMBERS`) and of measures of angles (`ANGLE_NUMBERS`) in kernels."""
+"""Numbers that stand for shapings (`SHAPING_NUMBERS`) and for measures of angles (`ANGLE_NUMBERS`) in kernels."""
 _BLOCK_CELLS = 4_000_000
 _NO_POINTS = np.empty((1, 0, 2))
 
@@ -193,7 +193,10 @@ def _raw(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric, component: 
 
 
 def _layout(clip: MeasuredClip, metric: PerceptualMetric, component: Component) -> tuple[Ints, Floats]:
-    """Find the ranges (K + 1,) of the classes' points, and the factors (K,) of the sums of their distances."""
+    """Return the first point of each class and the number of points, as one array (K + 1,), and factors (K,).
+
+    The difference of a class is its factor times the sum of the distances of its points.
+    """
     kept = classes_measured(clip, component.measurement)
     counts = np.diff(clip.starts)[[name in kept for name in clip.classes]]
     starts = np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
@@ -224,7 +227,10 @@ def _centred(clip: MeasuredClip) -> Floats:
 
 
 def _superposed(a: MeasuredClip, b: MeasuredClip, vectors: Floats) -> Floats:
-    """Rotate `vectors` (n, P, 3) about the vertical as the points of `b` must be rotated to superpose those of `a`."""
+    """Rotate `vectors` (n, P, 3) about the vertical, by the rotation that superposes the points of `b` on those of `a`.
+
+    Each frame has its own rotation.
+    """
     ones, others = (_centred(clip) @ (1.0, 1.0j) for clip in (a, b))
     turn = np.sum(ones * others.conj(), axis=1, keepdims=True)
     turn = np.where(np.abs(turn) > 0.0, turn / np.maximum(np.abs(turn), np.finfo(float).tiny), 1.0)

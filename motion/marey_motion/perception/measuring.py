@@ -113,9 +113,9 @@ def measure_motion(motion: Motion, body: MatchingBody, rate_hz: float, *, seam: 
     """Measure a motion for the metric.
 
     In each frame, the point on the ground below the hips becomes the origin, and a smoothed heading is removed. The
-    heading is smoothed by a line fitted to the second around the frame, which is about one cycle of walking. So the
-    rotation of the pelvis to and fro within a cycle is not removed. Near the ends of the clip, the line is fitted to
-    its first or last second.
+    heading is smoothed by a line that is fitted to a window of one second around the frame. One second is about one
+    cycle of walking, so the rotations of the pelvis within a cycle are not removed. Near the ends of the clip, the line
+    is fitted to its first or last second.
 
     Parameters
     ----------
@@ -217,7 +217,10 @@ def _classes(body: MatchingBody) -> tuple[tuple[str, ...], list[int], Ints]:
 
 
 def _line_of_a_second(values: Floats, rate_hz: float) -> Floats:
-    """Smooth values by a line fitted to the second around each value, or to all values if they are fewer."""
+    """Smooth values by a line fitted to a window of one second around each value.
+
+    If there are fewer values than in a second, the window contains nearly all values.
+    """
     from scipy.signal import savgol_filter
 
     window = min(window_frames(DIRECTION_WINDOW_S, rate_hz), len(values) - (len(values) + 1) % 2)

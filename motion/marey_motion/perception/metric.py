@@ -65,7 +65,7 @@ class Component:
         allowed = classes_of(self.measurement)
         if unknown := [name for name in self.weights if name not in allowed]:
             raise MotionError(
-                f"{self.measurement} have no class {unknown[0]}; use {', '.join(allowed)}", where="weights"
+                f"the measured {self.measurement} have no class {unknown[0]}; use {', '.join(allowed)}", where="weights"
             )
         numbers = [self.constant, self.norm, self.exponent, *self.weights.values()]
         if not (np.isfinite(numbers).all() and min(numbers) >= 0 and sum(self.weights.values()) > 0):

@@ -64,11 +64,15 @@ def order_motions(differences: Floats, seed: int = 0) -> MotionOrder:
 
 
 def order_along_first_component(differences: Floats) -> Ints:
-    """Order motions as `order_motions` does, without groups.
+    """Order motions by their projections on the first principal component.
+
+    Each motion is a point whose coordinates are its row of the table. The sign of the component is chosen so that its
+    entry of largest magnitude is positive.
 
     Parameters
     ----------
-    differences : (n, n) float64    symmetric table; missing differences (NaN) are replaced as in `order_motions`
+    differences : (n, n) float64    symmetric table; a missing difference (NaN) of two motions is replaced by the mean
+        of both motions' mean differences
 
     Returns
     -------

@@ -34,7 +34,7 @@ class RegistrationCurve:
     path : (L, 2) int32    cheapest path, as pairs of frames; frames of the second clip are counted from `shift`
     shift : int    frame of the second clip that corresponds to frame 0 of the first; 0 unless both clips are cyclic
     times : (n,) float64    for each of n frames of the first clip, the corresponding frame of the second clip; strictly
-        increasing, so beyond the number of frames after the seam of a cyclic clip
+        increasing. If both clips are loops, and the second one has m frames, m + k stands for frame k of its next round
     mean_cost : float    mean cost along the path
     """
 
@@ -51,7 +51,8 @@ class ClipDistance:
     Parameters
     ----------
     total : float    mean frame distance along the registration curve, averaged over both directions
-    by_component : tuple of float    distance by each component of the metric alone, not multiplied by its share
+    by_component : tuple of float    distance by each component of the metric alone, before the multiplication by the
+        component's share in the total
     """
 
     total: float
@@ -172,11 +173,12 @@ def clip_distance(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric) ->
 
     Returns
     -------
-    ClipDistance    distance, and its components
+    ClipDistance    total distance, and the distance by each component
 
     Raises
     ------
-    MotionError    for the same reasons as in `registration_curve`
+    MotionError    if the clips cannot be compared, if their lengths differ too much for the slope limit of the curve,
+        or if a cycle has too many frames for trying all shifts
     """
     directions = np.array([_directed(*pair, metric) for pair in ((a, b), (b, a))])
     raw = directions.mean(axis=0)
@@ -202,7 +204,8 @@ def differences_along_curve(a: MeasuredClip, b: MeasuredClip, metric: Perceptual
 
     Raises
     ------
-    MotionError    for the same reasons as in `registration_curve`
+    MotionError    if the clips cannot be compared, if their lengths differ too much for the slope limit of the curve,
+        or if a cycle has too many frames for trying all shifts
     """
     pairs = [(one, other.at(registration_curve(one, other, metric).times)) for one, other in ((a, b), (b, a))]
     return tuple(

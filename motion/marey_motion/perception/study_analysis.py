@@ -125,7 +125,7 @@ class StudyAnalysis:
 
 
 def measure_pairs(clips: Sequence[MeasuredClip], progress: Progress) -> list[PairDifferences]:
-    """Measure the differences of the joint classes of all pairs of clips along their registration curves.
+    """Measure, for all pairs of clips, the differences of each joint class along the pair's registration curve.
 
     Parameters
     ----------
@@ -206,7 +206,10 @@ def _fit(
     seed: int,
     refusals: list[str],
 ) -> FittedMetric | None:
-    """Fit one component for each measurement, and then their shares; None if no component could be fitted."""
+    """Fit one component for each measurement, and then their shares; None if no component could be fitted.
+
+    The reasons for components that could not be fitted are appended to `refusals`.
+    """
     perceived = table.differences[np.triu_indices(len(table.differences), 1)]
     parts, fitted = [], []
     for differences in pairs:

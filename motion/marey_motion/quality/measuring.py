@@ -92,8 +92,9 @@ class ClipQuality:
     ----------
     values : value of each measure of `marey_schemas.documents.quality.MEASURES`; None if it is undefined
     frames : number of measured frames
-    speed_seconds, turn_seconds : (bins,) float64    seconds of one-second windows (1 / rate for each) by bins of speed
-        and of turn rate; their sum is about a second less than the clip, and 0 for a clip of a second or less
+    speed_seconds, turn_seconds : (bins,) float64    seconds of motion in each bin of speed and of turn rate. Both are
+        measured over windows of one second, each of which counts 1 / rate seconds. The sum over the bins is therefore
+        about one second less than the clip, and 0 for a clip of one second or less
     """
 
     values: Mapping[str, float | None]
@@ -161,10 +162,10 @@ def measure_quality(
 
 
 def _beyond_limits(clip: Clip, body: QualityBody, options: QualityOptions) -> tuple[Floats, Floats | None]:
-    """Compute depth below the floor (F,) and excess of joint limits (F,) in every frame of the clip.
+    """Compute, per frame, the depth below the floor (F,) in metres and the excess of joint limits (F,) in degrees.
 
-    The clip is not resampled: these measures are compared with fixed limits, so they do not depend on the frame rate,
-    and a frame that resampling leaves out might be the worst one.
+    The clip is not resampled, because a frame that resampling leaves out might be the worst one. The measures do not
+    depend on the frame rate. The excess is None without knees and elbows.
     """
     motion, skeleton = Motion.of(clip), clip.skeleton
     points = _points(clip, motion)
@@ -211,7 +212,7 @@ def _at_rate(clip: Clip, rate_hz: float) -> Motion:
 
 
 def _points(clip: Clip, motion: Motion) -> Floats:
-    """Compute the positions (F, J + E, 3) of joints and end sites."""
+    """Compute the positions (F, J + E, 3) of joints and end sites in the world, in metres."""
     found = kinematics.forward_kinematics(
         clip.skeleton,
         motion.poses,

@@ -18,7 +18,10 @@ DRAWN_AT_ONCE = 4_000_000
 
 
 class MeanOverClips(NamedTuple):
-    """Mean weighted by duration; `low` and `high` are None if there are fewer than `LEAST_TAKES` takes."""
+    """Mean of a measure over clips, weighted by duration, with its confidence interval from `low` to `high`.
+
+    Without an interval, because there are fewer than `LEAST_TAKES` takes, `low` and `high` are None.
+    """
 
     value: float | None
     low: float | None

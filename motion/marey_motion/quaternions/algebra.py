@@ -167,8 +167,8 @@ def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLi
     result = joined(0.5 * np.sum(middle * middle, axis=-1, keepdims=True), cross(start, end))
     opposite = np.linalg.norm(result, axis=-1) < NEARLY_OPPOSITE
     if np.any(opposite):
-        wished = None if half_turn_axis is None else np.broadcast_to(half_turn_axis, start.shape)[opposite]
-        result[opposite] = _between_opposite(start[opposite], end[opposite], wished)
+        turn_axis = None if half_turn_axis is None else np.broadcast_to(half_turn_axis, start.shape)[opposite]
+        result[opposite] = _between_opposite(start[opposite], end[opposite], turn_axis)
     return unit(result, "quaternion").astype(dtype, copy=False)
 
 
@@ -287,16 +287,16 @@ def _rotated(q: Floats, v: Floats) -> Floats:
     return v + q[..., :1] * twice + cross(q[..., 1:], twice)
 
 
-def _between_opposite(start: Floats, end: Floats, wished: NDArray[Any] | None) -> Floats:
+def _between_opposite(start: Floats, end: Floats, turn_axis: NDArray[Any] | None) -> Floats:
     """Find rotations (n, 4) from `start` (n, 3) to nearly opposite unit vectors `end` (n, 3).
 
     Each is half a turn about an axis perpendicular to `start`, then the small rotation from the opposite of `start` to
-    `end`. `wished` (..., 3) gives the axis of the half turn where `start` and `end` are exactly opposite; it may be
+    `end`. `turn_axis` (..., 3) gives the axis of the half turn where `start` and `end` are exactly opposite; it may be
     None.
     """
     candidates = [cross(start, end), np.eye(3)[np.argmin(np.abs(start), axis=-1)]]
-    if wished is not None:
-        candidates.insert(1, np.asarray(wished, dtype=np.float64))
+    if turn_axis is not None:
+        candidates.insert(1, np.asarray(turn_axis, dtype=np.float64))
     axis = np.zeros_like(start)
     for candidate in reversed(candidates):
         across = candidate - np.sum(candidate * start, axis=-1, keepdims=True) * start

@@ -71,7 +71,7 @@ def joined(scalar: Floats, vector: Floats) -> Floats:
 
 
 def product(a: Floats, b: Floats) -> Floats:
-    """Multiply quaternions as `multiply` does, without checks.
+    """Multiply quaternions (the Hamilton product a·b), without checks of the arguments.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 
 def rotation_vector(q: Floats) -> Floats:
-    """Compute the logarithm of quaternions as `as_rotation_vector` does, without checks.
+    """Compute rotation vectors of at most half a turn from unit quaternions, without checks of the arguments.
 
     Parameters
     ----------

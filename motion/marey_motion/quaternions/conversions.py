@@ -163,11 +163,12 @@ def from_euler(order: str, angles_rad: ArrayLike, *, intrinsic: bool = True) -> 
 
 
 def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> AnyFloats:
-    """Convert quaternions to Euler angles about three axes; see `from_euler`.
+    """Convert quaternions to Euler angles about three axes.
 
-    The middle angle is from -pi/2 to pi/2, or from 0 to pi if the first and last axes are the same. In gimbal lock,
-    only the sum or the difference of the first and last angles is defined; the angle of the rotation that acts first is
-    then set to zero.
+    Intrinsic rotations turn about the axes of the moving frame in the order written: "zxy" is Z·X·Y. Extrinsic
+    rotations turn about fixed axes, so that the first letter acts first. The middle angle is from -pi/2 to pi/2, or
+    from 0 to pi if the first and last axes are the same. In gimbal lock, only the sum or the difference of the first
+    and last angles is defined; the angle of the rotation that acts first is then set to zero.
 
     Parameters
     ----------

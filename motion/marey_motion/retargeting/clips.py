@@ -44,16 +44,16 @@ class RetargetedClip:
 def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
     """Retarget a clip to the plan's target skeleton.
 
-    A mapped joint takes the orientation of its source joint. Any other joint keeps its rest rotation or, if both
-    skeletons are copies of one rig, copies the local rotation of the source joint with the same name. Bones keep the
-    lengths of the target. If the clip translates joints, the target's bones point in the directions of the clip's
-    translated bones; if the target is the source skeleton itself, the clip keeps its translations. The path of the
-    pelvis is the source's path times the plan's scale; a root above the pelvis moves with the pelvis without turning.
+    A mapped joint takes the orientation of its source joint. Any other joint keeps its rest rotation; if both skeletons
+    are copies of one rig, it copies the local rotation of the source joint with the same name. Bones keep the lengths
+    of the target. If the clip translates joints, the target's bones point in the directions of the clip's translated
+    bones. If the target is the source skeleton itself, the clip keeps its translations. The path of the pelvis is the
+    source's path times the plan's scale. A root above the pelvis moves with the pelvis without turning.
 
-    There are three corrections. Pelvis, spine and neck are turned where the rotations of the source alone would not
-    give the hip line and the spine the directions that they have in the source. The middle of the hips, instead of the
-    pelvis, follows the scaled path of the source if a rest pose does not show how far the hips are below the pelvis.
-    The whole clip is moved up or down if its soles would not stand on the floor of the source.
+    There are three corrections. Pelvis, spine and neck are turned, where necessary, so that the line of the hips and
+    the spine have the directions that they have in the source. If a rest pose does not show how far the hips are below
+    the pelvis, the middle of the hips follows the scaled path of the source, instead of the pelvis. If the soles would
+    not stand on the floor of the source, the whole clip is moved up or down.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
 
 
 def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOptions | None = None) -> RetargetedClip:
-    """Retarget a clip as `retarget` does, and report the corrections.
+    """Retarget a clip to the plan's target skeleton, and report the corrections.
 
     Parameters
     ----------
@@ -114,7 +114,9 @@ def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOption
     """
     if not same_hierarchy(clip.skeleton, plan.source, tolerance_m=SAME_SKELETON_M):
         raise ClipError(
-            "the clip has a different skeleton from the source skeleton of the retargeting plan", where="skeleton"
+            "the clip has a different skeleton from the source skeleton of the retargeting plan; make a plan for the "
+            "skeleton of the clip",
+            where="skeleton",
         )
     bones = (
         FollowedBones(clip.poses[:, 3:], {}) if plan.changes_no_pose else follow_moved_bones(clip, plan.source_joints)

@@ -25,17 +25,17 @@ from marey_schemas.wording import counted
 
 _OPTIONS = PlantOptions()
 FAST_KNEES = 1.25
-"""Greatest knee speed in the result, divided by the greatest in the source, above which the result has a warning."""
+"""Ratio of the greatest knee speed in the result to that in the source; above it, the result has a warning."""
 
 
-class KeptFeet(NamedTuple):
+class CorrectedFeet(NamedTuple):
     """A clip whose feet stay in place, and findings about the changes."""
 
     clip: Clip
     checks: tuple[CheckWarning, ...]
 
 
-def keep_feet(source: Clip, result: Clip, plan: RetargetPlan, floor: Floor | None) -> KeptFeet:
+def keep_feet(source: Clip, result: Clip, plan: RetargetPlan, floor: Floor | None) -> CorrectedFeet:
     """Keep the feet of a retargeted clip in place while those of the source touch the floor.
 
     While a sole touches the floor, its height is the height of the source's sole times the scale. The feet are planted
@@ -50,7 +50,7 @@ def keep_feet(source: Clip, result: Clip, plan: RetargetPlan, floor: Floor | Non
 
     Returns
     -------
-    KeptFeet    F frames, with the feet moved, and findings
+    CorrectedFeet    F frames, with the feet moved, and findings
 
     Raises
     ------
@@ -78,7 +78,7 @@ def keep_feet(source: Clip, result: Clip, plan: RetargetPlan, floor: Floor | Non
     checks = [_check(planted, motion, plan, feet)]
     if now > FAST_KNEES * before:
         checks.append(_fast_knees(before, now))
-    return KeptFeet(made, tuple(checks))
+    return CorrectedFeet(made, tuple(checks))
 
 
 def _toe(joints: Mapping[str, int], side: str) -> int:

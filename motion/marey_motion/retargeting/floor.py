@@ -1,4 +1,4 @@
-"""The floor of a retargeted clip: depths of hands and feet below the floor that the source does not have."""
+"""The floor of a retargeted clip: how much deeper its hands and feet are below the floor than those of the source."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ ELBOW_DAMPING_RAD = math.radians(10.0)
 """Bend of an elbow, in radians, below which the stretching of the arm is damped."""
 
 
-class KeptHands(NamedTuple):
+class CorrectedHands(NamedTuple):
     """A clip whose hands have the scaled positions of the source's hands, and a finding about the changes."""
 
     clip: Clip
@@ -67,7 +67,7 @@ class _Arms(NamedTuple):
         return self.arm_m + 0.5 * float(np.linalg.norm(self.shoulders[:, 0] - self.shoulders[:, 1], axis=-1).mean())
 
 
-def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom, floor: Floor | None) -> KeptHands:
+def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom, floor: Floor | None) -> CorrectedHands:
     """Move the hands of a retargeted clip to the scaled positions of the source's hands.
 
     If `about` is "shoulders", the vector from the middle of the shoulders to a hand is that of the source, times a
@@ -88,7 +88,7 @@ def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom,
 
     Returns
     -------
-    KeptHands    F frames, with the hands moved
+    CorrectedHands    F frames, with the hands moved
 
     Raises
     ------
@@ -118,7 +118,7 @@ def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom,
     made = _Arms.of(kept.positions(plan.target), plan.target_joints)
     moved, missed = (float(np.linalg.norm(one - made.wrists, axis=-1).max()) for one in (after.wrists, targets))
     check = _check(moved, missed, lifted, scale, plan, limbs)
-    return KeptHands(kept.as_clip(plan.target, source.frame_rate_hz), check)
+    return CorrectedHands(kept.as_clip(plan.target, source.frame_rate_hz), check)
 
 
 def _reached(motion: Motion, targets: Floats, plan: RetargetPlan, limbs: Sequence[TwoBoneLimb]) -> Motion:

@@ -17,11 +17,11 @@ from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, JointAxes, Join
 from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import SAME_SKELETON_M, Skeleton, same_hierarchy
 
-FEWEST_ESSENTIAL = 8  # of the essential joints: a pelvis, and more than the legs or the arms alone
-SAME_RAD = 1e-6  # by which axes may differ that went through a document
+FEWEST_ESSENTIAL = 8  # least number of essential joints: a pelvis, and more than the legs or the arms alone
+SAME_RAD = 1e-6  # greatest angle between equal axes of which one was stored in a document
 SAME_DIRECTION = 0.94  # cosine of about 20 degrees: bones of one rig on two people differ by less
-STANDING = 0.7  # cosine between legs and trunk from which a rest pose is taken for one that stands
-FOOT_DROP = 0.45  # of the ankle-to-toe length: the height of the ankle above the toe of a foot that stands
+STANDING = 0.7  # least cosine between legs and trunk in a rest pose that stands
+FOOT_DROP = 0.45  # height of the ankle above the toe of a standing foot, as a share of the distance from ankle to toe
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,8 @@ def plan_retarget(
         mapped joints
     target : Skeleton    the skeleton to which clips are transferred
     target_mapping : JointMapping    its standard joints
-    target_axes : mapping of str to JointAxes    twist and swing axes of the target, like `source_axes`
+    target_axes : mapping of str to JointAxes    twist and swing axes of the target by joint name, at least of the
+        mapped joints
     scale : float, optional    metres that the target's pelvis moves per metre that the source's pelvis moves; the ratio
         of the hip heights if None
 
@@ -296,8 +297,8 @@ def _heights(
     hip, knee, ankle = (positions[joints[f"{side}_{joint}"]] for joint in ("hip", "knee", "ankle"))
     leg = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
     trunk = _trunk(skeleton, pelvis, up)
-    told = _shows_drop(skeleton, joints, up, side)
-    drop = float((positions[pelvis] - hip) @ trunk) if told else np.nan
+    known = _shows_drop(skeleton, joints, up, side)
+    drop = float((positions[pelvis] - hip) @ trunk) if known else np.nan
     toe = joints.get(f"{side}_toe")
     foot = np.nan if toe is None else FOOT_DROP * float(np.linalg.norm(positions[toe] - ankle))
     return drop, leg, foot

@@ -13,14 +13,14 @@ CARRIED = 2
 
 
 @compiled
-def rotations(local, parents, ways, sources, corrections, rests, target_parents, out):
+def rotations(local, parents, modes, sources, corrections, rests, target_parents, out):
     """Fill `out` (F, 4·K) with local rotations of the K target joints, continuous in sign from frame to frame.
 
     `local` (F, 4·J) are the local rotations of the source joints, `parents` (J,) the indices of their parents. The
-    other arrays describe the target joints. `ways` (K,) is `AT_REST` for a joint that keeps its rest rotation, `MAPPED`
-    for a joint that follows the global rotation of its source joint, and `CARRIED` for a joint that copies the local
-    rotation of its source joint. `sources` (K,) are the source joints. Their global rotations are multiplied by
-    `corrections` (K, 4) from the right. `rests` (K, 4) are the rest rotations of the target joints, and
+    other arrays describe the target joints. `modes` (K,) is `AT_REST` for a joint that keeps its rest rotation,
+    `MAPPED` for a joint that follows the global rotation of its source joint, and `CARRIED` for a joint that copies
+    the local rotation of its source joint. `sources` (K,) are the source joints. Their global rotations are multiplied
+    by `corrections` (K, 4) from the right. `rests` (K, 4) are the rest rotations of the target joints, and
     `target_parents` (K,) the indices of their parents.
     """
     joints, targets = parents.shape[0], target_parents.shape[0]
@@ -38,13 +38,13 @@ def rotations(local, parents, ways, sources, corrections, rests, target_parents,
             source[j, 0], source[j, 1], source[j, 2], source[j, 3] = w / length, x / length, y / length, z / length
         for k in range(targets):
             p, s = target_parents[k], sources[k]
-            if ways[k] == MAPPED:
+            if modes[k] == MAPPED:
                 w, x, y, z = product(source[s], corrections[k])
                 put_rotation(target, k, (w, x, y, z))
                 if p >= 0:
                     w, x, y, z = product(inverse(target[p]), (w, x, y, z))
             else:
-                if ways[k] == CARRIED:
+                if modes[k] == CARRIED:
                     w, x, y, z = local[f, 4 * s], local[f, 4 * s + 1], local[f, 4 * s + 2], local[f, 4 * s + 3]
                 else:
                     w, x, y, z = rests[k, 0], rests[k, 1], rests[k, 2], rests[k, 3]

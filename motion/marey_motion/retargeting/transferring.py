@@ -43,16 +43,16 @@ def transfer(clip: Clip, plan: RetargetPlan, rotations: NDArray[np.float32]) -> 
     from marey_motion.retargeting import transfer_kernels as kernels
 
     target = plan.target
-    ways = np.where(plan.sources >= 0, kernels.MAPPED, kernels.AT_REST).astype(np.int8)
+    modes = np.where(plan.sources >= 0, kernels.MAPPED, kernels.AT_REST).astype(np.int8)
     sources = plan.sources.copy()
     for name in plan.carried:
         joint = target.index_of(name)
-        ways[joint], sources[joint] = kernels.CARRIED, joint
+        modes[joint], sources[joint] = kernels.CARRIED, joint
     poses = np.empty((clip.frame_count, 3 + 4 * target.joint_count), dtype=np.float32)
     kernels.rotations(
         rotations,
         plan.source.parents,
-        ways,
+        modes,
         sources,
         plan.corrections,
         target.rest_rotations,

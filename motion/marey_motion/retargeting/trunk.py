@@ -3,8 +3,8 @@
 The rotation of the source's pelvis may disagree with the line between the hips, for example because joints between
 pelvis and hips turn. The legs of the target would then cross, so the pelvis of the target follows the line. Also, one
 of the skeletons may have joints in the spine or neck that the other skeleton lacks. The rotations of these joints would
-be lost. So the part of the target's spine or neck that corresponds to them gets the direction that it has in the
-source, from its first to its last joint.
+be lost. So the part of the target's spine or neck with the additional or missing joints is turned as a whole: the line
+from its first to its last joint gets the direction that it has in the source.
 """
 
 from __future__ import annotations

@@ -157,7 +157,7 @@ def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ..
 
     Raises
     ------
-    MappingError    for the same reasons as in `guess_axes`
+    MappingError    if the mapping lacks the joints that define left and up, or if joints of an arm coincide
     """
     rest = _resting_body(skeleton, mapping)
     parts = dict.fromkeys(_part(standard) for standard in STANDARD_JOINTS if standard in rest.joints)
@@ -168,7 +168,8 @@ def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
     joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
     if not any({f"{side}_{joint}" for side in SIDES} <= joints.keys() for joint in ("hip", "shoulder")):
         raise MappingError(
-            "the mapping needs both hips or both shoulders, from which axes are computed", where="left_hip"
+            "the axes are computed from both hips or both shoulders; add one of these pairs to the mapping",
+            where="left_hip",
         )
     return _PosedBody(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
 
@@ -176,7 +177,7 @@ def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
 def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _PosedBody:
     if not same_hierarchy(skeleton, motion.skeleton):
         raise ClipError(
-            "the skeleton of this motion differs from the skeleton whose axes are computed; use a motion of the latter",
+            "the skeleton of this motion differs from the given skeleton; use a motion of the given skeleton",
             where="motion",
         )
     count = min(motion.frame_count, FRAMES_READ)
@@ -199,7 +200,7 @@ class _PosedBody:
     positions: Floats
     rotations: Floats
 
-    def way(self, start: str, end: str) -> Floats | None:
+    def direction(self, start: str, end: str) -> Floats | None:
         """Compute unit directions (K, 3) from one standard joint to another.
 
         Returns None if one of the joints is not mapped. The direction is zero in frames where the two joints coincide.
@@ -225,12 +226,12 @@ class _PosedBody:
 
     @cached_property
     def hips_left(self) -> Floats:
-        across = self.way("right_hip", "left_hip")
+        across = self.direction("right_hip", "left_hip")
         return self.shoulders_left if across is None else across
 
     @cached_property
     def shoulders_left(self) -> Floats:
-        across = self.way("right_shoulder", "left_shoulder")
+        across = self.direction("right_shoulder", "left_shoulder")
         return self.hips_left if across is None else across
 
     @cached_property
@@ -242,7 +243,8 @@ class _PosedBody:
         levels = [level for level in map(self._level, _LEVELS) if level is not None]
         if len(levels) < 2:
             raise MappingError(
-                "the mapping needs the hips and a joint above or below them, from which axes are computed",
+                "the upward direction is computed from joints at two of three heights: spine, neck, head or shoulders; "
+                "pelvis or hips; knees or ankles; add the missing joints to the mapping",
                 where="pelvis",
             )
         trunk = levels[0] - levels[1]
@@ -267,7 +269,7 @@ class _PosedBody:
         These are the parts that have the pose of a standing body in that frame.
         """
         left, up = self.hips_left[0], self.up[0]
-        legs = [way[0] for side in SIDES if (way := self.way(f"{side}_hip", f"{side}_ankle")) is not None]
+        legs = [leg[0] for side in SIDES if (leg := self.direction(f"{side}_hip", f"{side}_ankle")) is not None]
         if left @ self.shoulders_left[0] < 0.7 or not np.any(up) or any(leg @ up > -0.7 for leg in legs):
             return frozenset()
         parts = {"trunk"}
@@ -283,7 +285,7 @@ class _PosedBody:
 
         If the toe joint is straight below the ankle, the directions end at the tip of the toe instead.
         """
-        shank, foot = self.way(f"{side}_knee", f"{side}_ankle"), self.way(f"{side}_ankle", f"{side}_toe")
+        shank, foot = self.direction(f"{side}_knee", f"{side}_ankle"), self.direction(f"{side}_ankle", f"{side}_toe")
         if foot is None or shank is None or float(np.mean(np.sum(foot * shank, axis=-1))) < ALONG:
             return foot
         toe = self.joints[f"{side}_toe"]
@@ -294,13 +296,13 @@ class _PosedBody:
         return _unit(end - self.positions[:, self.joints[f"{side}_ankle"]])
 
     def _leg_stands(self, side: str, up: Floats) -> bool:
-        thigh, shank = self.way(f"{side}_hip", f"{side}_knee"), self.way(f"{side}_knee", f"{side}_ankle")
+        thigh, shank = self.direction(f"{side}_hip", f"{side}_knee"), self.direction(f"{side}_knee", f"{side}_ankle")
         foot = self.foot(side)
         straight = all(bone is None or bone[0] @ up < -0.7 for bone in (thigh, shank))
         return straight and (foot is None or shank is None or abs(float(foot[0] @ shank[0])) < ALONG)
 
     def _arm_hangs_or_reaches_out(self, side: str, up: Floats, outwards: Floats) -> bool:
-        bones = (self.way(f"{side}_shoulder", f"{side}_elbow"), self.way(f"{side}_elbow", f"{side}_wrist"))
+        bones = (self.direction(f"{side}_shoulder", f"{side}_elbow"), self.direction(f"{side}_elbow", f"{side}_wrist"))
         return all(bone is None or (bone[0] @ up < 0.5 and bone[0] @ outwards > -0.3) for bone in bones)
 
 
@@ -316,17 +318,17 @@ def _twist(standard: str, body: _PosedBody) -> Floats:
     side, _, joint = standard.partition("_")
     prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
     for target in _TOWARDS.get(joint, ()):
-        way = body.foot(side) if joint == "ankle" else body.way(standard, prefix + target)
-        if way is not None and np.any(way):
-            return _unit(body.in_joint(standard, way))
+        direction = body.foot(side) if joint == "ankle" else body.direction(standard, prefix + target)
+        if direction is not None and np.any(direction):
+            return _unit(body.in_joint(standard, direction))
     if prefix:
         tip = _tip(body.skeleton, body.joints[standard])
         if tip is not None:
             return _unit(tip)
         before = f"{prefix}{_BEFORE.get(joint, 'elbow')}"
-        way = body.way(before, standard)
-        if way is not None and np.any(way):
-            return _unit(body.in_joint(standard, way))
+        direction = body.direction(before, standard)
+        if direction is not None and np.any(direction):
+            return _unit(body.in_joint(standard, direction))
     return _unit(body.in_joint(standard, body.up))
 
 
@@ -354,11 +356,11 @@ def _swing(standard: str, body: _PosedBody) -> Floats:
     if joint in ("hip", "knee"):
         return _leg_hinge(side, body)
     if joint in ("ankle", "toe", "heel"):
-        shank, foot = body.way(f"{side}_knee", f"{side}_ankle"), body.foot(side)
+        shank, foot = body.direction(f"{side}_knee", f"{side}_ankle"), body.foot(side)
         return body.hips_left if shank is None or foot is None else np.cross(foot, shank)
     if joint == "clavicle":
         return body.up if side == "left" else -body.up
-    knuckles = body.way(f"{side}_pinky_finger_base", f"{side}_index_finger_base")
+    knuckles = body.direction(f"{side}_pinky_finger_base", f"{side}_index_finger_base")
     if joint == "wrist" and knuckles is not None and np.any(knuckles):
         # Across the palm: out of the back of a left hand, out of the palm of a right one.
         hand = _twist(standard, body)
@@ -368,7 +370,7 @@ def _swing(standard: str, body: _PosedBody) -> Floats:
 
 def _leg_hinge(side: str, body: _PosedBody) -> Floats:
     """Find the axes (K, 3) about which a knee bends backwards; if it never bends, the direction of the body's left."""
-    thigh, shank = body.way(f"{side}_hip", f"{side}_knee"), body.way(f"{side}_knee", f"{side}_ankle")
+    thigh, shank = body.direction(f"{side}_hip", f"{side}_knee"), body.direction(f"{side}_knee", f"{side}_ankle")
     if len(body.positions) > 1 and thigh is not None and shank is not None:
         bend = np.cross(thigh, shank)
         if np.linalg.norm(body.in_joint(f"{side}_hip", bend)) > HINGE_BEND:
@@ -382,7 +384,7 @@ def _arm_hinge(side: str, joint: str, body: _PosedBody) -> Floats:
     If the elbow never bends, return the direction of the body's left, rotated like the arm from hanging down to its
     pose.
     """
-    upper, fore = body.way(f"{side}_shoulder", f"{side}_elbow"), body.way(f"{side}_elbow", f"{side}_wrist")
+    upper, fore = body.direction(f"{side}_shoulder", f"{side}_elbow"), body.direction(f"{side}_elbow", f"{side}_wrist")
     if len(body.positions) > 1 and upper is not None and fore is not None:
         bend = np.cross(fore, upper)
         if np.linalg.norm(body.in_joint(f"{side}_shoulder", bend)) > HINGE_BEND:

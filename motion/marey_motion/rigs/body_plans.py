@@ -17,25 +17,27 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_motion.rigs.limbs import BoneTree, LimbPair
 
-# Joints nearer than this to their parent are rigging aids.
+# Shorter distances between a joint and its parent are not bones, but aids of the rig.
 SHORTEST_BONE_M = 1e-3
-# Pairs and readings of each that are looked at; a rig with more of them than this is no person's.
+# Greatest numbers of pairs of chains, and of interpretations of each pair, that are compared.
 MOST_PAIRS, MOST_READINGS = 32, 4
-# A limb bends nowhere beyond so many joints.
+# Number of joints at the start of a chain among which hip, knee and ankle are looked for.
 LONGEST_CHAIN = 14
-# What no proportion costs more than.
-LEAST_WORTH = -8.0
-# Two bones are one with a joint in the middle when they are straighter than this.
+# Lowest score of a single proportion.
+LEAST_SCORE = -8.0
+# Least quotient of the direct distance and the length of a chain at which the chain counts as one straight bone.
 STRAIGHT = 0.998
+# Scores of each joint within a long bone, and of each additional bone before the limb.
 TWIST_JOINT, STRAIGHT_JOINT, BENT_JOINT, EXTRA_JOINT = -0.2, -0.8, -2.0, -0.4
-# Twist joints divide a bone evenly, but for this share of it.
+# Joints are twist joints if the parts of the bone differ by at most this share of its length.
 EVENNESS = 0.04
-# Rigs may end at the wrist or ankle, or soon after it.
+# Lowest score of a hand or foot that is shorter than usual, because rigs may end at the wrist or ankle.
 SHORT_END = -0.7
-# What it is worth that a wrist branches into nothing, a hand, a hand and a thumb; into more, 1.
+# Score of a wrist by its number of children: none, a hand, a hand and a thumb. More children have the score 1.
 FINGERS = {0: 0.0, 1: 0.0, 2: 0.5}
+# Factor of 1 + the cosine of the angle between legs and trunk: the score falls if the legs point up.
 AGAINST_TRUNK = -1.5
-# Few have anything longer than their legs.
+# Factor of the logarithm of how much longer the longest pair of chains is than the legs: few people have longer limbs.
 SHORTER = -1.5
 
 
@@ -44,12 +46,12 @@ class Build:
     """Usual proportions of an arm or a leg of a person.
 
     `ratio` is the length of the upper long bone divided by that of the lower one. `end` is the length from wrist or
-    ankle to the farthest tip, and `before` the length before the upper long bone; both are divided by the length of the
-    long bones together. `ratio` and `end` each consist of a usual value and the spread of its logarithm; `before` is an
-    upper limit.
+    ankle to the farthest tip, and `before` the length from the start of the chain to the upper long bone; both are
+    divided by the length of the long bones together. `ratio` and `end` each consist of a usual value and the spread of
+    its logarithm; `before` is an upper limit.
     """
 
-    ratio: tuple[float, float]  # upper by lower long bone
+    ratio: tuple[float, float]  # upper divided by lower long bone
     end: tuple[float, float]  # what follows, to the tip of toes or fingers, by both long bones
     before: float  # most that precedes the long bones, by their length
 
@@ -58,7 +60,7 @@ LEG = Build(ratio=(1.02, 0.15), end=(0.27, 0.5), before=0.35)
 ARM = Build(ratio=(1.12, 0.25), end=(0.32, 0.4), before=0.6)
 ARM_BY_LEG = (0.62, 0.2)
 TRUNK_BY_LEG = (0.42, 0.45)
-# Pairs that differ more from legs and arms are no such.
+# Limits of the length of an arm divided by the length of a leg; other pairs are not arms and legs.
 ARM_BY_LEG_LIMITS = (0.3, 1.2)
 
 
@@ -72,7 +74,7 @@ class LimbReading:
     pair: LimbPair
     places: tuple[int, int, int]
     length: float
-    worth: float
+    score: float
 
     @property
     def triple(self) -> tuple[int, int, int]:
@@ -105,7 +107,7 @@ class BodyPlan:
 
     legs: LimbReading
     arms: LimbReading
-    worth: float
+    score: float
 
 
 def body_plans(tree: BoneTree) -> list[BodyPlan]:
@@ -124,20 +126,20 @@ def body_plans(tree: BoneTree) -> list[BodyPlan]:
     arms = {pair: _readings(tree, pair, ARM) for pair in pairs}
     longest = max((reading.length for readings in legs.values() for reading in readings), default=0.0)
     plans = []
-    # What two pairs are to each other is worked out once for all their readings: a rig may be thousands of joints deep.
+    # The relation of two pairs is computed once for all their interpretations: a rig may be thousands of joints deep.
     for above, below in ((a, b) for a in pairs for b in pairs if tree.are_apart(b, a)):
         trunk = tree.distance(below.parent, above.parent)
         for leg, arm in product(legs[below], arms[above]):
             if ARM_BY_LEG_LIMITS[0] < arm.length / leg.length < ARM_BY_LEG_LIMITS[1]:
-                together = _worth_together(tree, leg, arm, trunk) + SHORTER * log(longest / leg.length)
-                plans.append(BodyPlan(leg, arm, leg.worth + arm.worth + together))
-    return sorted(plans, key=lambda plan: -plan.worth)
+                together = _score_together(tree, leg, arm, trunk) + SHORTER * log(longest / leg.length)
+                plans.append(BodyPlan(leg, arm, leg.score + arm.score + together))
+    return sorted(plans, key=lambda plan: -plan.score)
 
 
 def _readings(tree: BoneTree, pair: LimbPair, build: Build) -> list[LimbReading]:
     count = min(len(pair.limbs[0].chain), LONGEST_CHAIN)
     found = [
-        LimbReading(pair, (a, b, c), sum(pair.bones[a:c]), _worth(tree, pair, (a, b, c), build))
+        LimbReading(pair, (a, b, c), sum(pair.bones[a:c]), _score(tree, pair, (a, b, c), build))
         for a, b, c in combinations(range(count), 3)
         if min(pair.bones[b - 1], pair.bones[c - 1]) > SHORTEST_BONE_M and sum(pair.bones[a:b]) > SHORTEST_BONE_M
     ]
@@ -151,25 +153,25 @@ def _likeliest_first(reading: LimbReading) -> tuple[float, int, int, int]:
     elbow, and the one nearest to the root as ankle or wrist.
     """
     a, b, c = reading.places
-    return -round(reading.worth, 6), -a, -b, c
+    return -round(reading.score, 6), -a, -b, c
 
 
-def _worth(tree: BoneTree, pair: LimbPair, places: tuple[int, int, int], build: Build) -> float:
+def _score(tree: BoneTree, pair: LimbPair, places: tuple[int, int, int], build: Build) -> float:
     a, b, c = places
     upper, lower, end = (sum(pair.bones[start:stop]) for start, stop in ((a, b), (b, c), (c, len(pair.bones))))
     length = upper + lower
-    worth = commonness(upper / lower, build.ratio)
-    worth += max(commonness(end / length, build.end), SHORT_END if end < build.end[0] * length else LEAST_WORTH)
+    score = commonness(upper / lower, build.ratio)
+    score += max(commonness(end / length, build.end), SHORT_END if end < build.end[0] * length else LEAST_SCORE)
     before = [bone for bone in pair.bones[:a] if bone > SHORTEST_BONE_M]
-    worth -= 0.5 * (max(0.0, sum(before) / length - build.before) / 0.2) ** 2
-    worth += EXTRA_JOINT * max(0, len(before) - 1)
-    worth += sum(_worth_of_joints_between(tree, pair, *span) for span in ((a, b), (b, c)))
+    score -= 0.5 * (max(0.0, sum(before) / length - build.before) / 0.2) ** 2
+    score += EXTRA_JOINT * max(0, len(before) - 1)
+    score += sum(_score_of_joints_between(tree, pair, *span) for span in ((a, b), (b, c)))
     if build is ARM:
-        worth += FINGERS.get(min(len(tree.skeleton.children[limb.chain[c]]) for limb in pair.limbs), 1.0)
-    return max(worth, 3 * LEAST_WORTH)
+        score += FINGERS.get(min(len(tree.skeleton.children[limb.chain[c]]) for limb in pair.limbs), 1.0)
+    return max(score, 3 * LEAST_SCORE)
 
 
-def _worth_of_joints_between(tree: BoneTree, pair: LimbPair, start: int, stop: int) -> float:
+def _score_of_joints_between(tree: BoneTree, pair: LimbPair, start: int, stop: int) -> float:
     """Score the extra joints between the ends of a long bone: 0 without such joints, otherwise negative.
 
     Each joint lowers the score: by the least amount if the joints divide a straight bone evenly, as twist joints do, by
@@ -188,12 +190,12 @@ def _worth_of_joints_between(tree: BoneTree, pair: LimbPair, start: int, stop: i
     return count * (TWIST_JOINT if max(parts) - min(parts) < EVENNESS * sum(parts) else STRAIGHT_JOINT)
 
 
-def _worth_together(tree: BoneTree, legs: LimbReading, arms: LimbReading, trunk: float) -> float:
-    worth = commonness(arms.length / legs.length, ARM_BY_LEG) + commonness(trunk / legs.length, TRUNK_BY_LEG)
+def _score_together(tree: BoneTree, legs: LimbReading, arms: LimbReading, trunk: float) -> float:
+    score = commonness(arms.length / legs.length, ARM_BY_LEG) + commonness(trunk / legs.length, TRUNK_BY_LEG)
     positions = tree.skeleton.rest_global_positions
     up = unit(positions[arms.pair.parent] - positions[legs.pair.parent])
     down = [unit(end - start) for start, end in _ends(positions, legs)]
-    return worth + AGAINST_TRUNK * float(np.mean([1.0 + way @ up for way in down]))
+    return score + AGAINST_TRUNK * float(np.mean([1.0 + way @ up for way in down]))
 
 
 def _ends(positions: Floats, legs: LimbReading) -> Iterator[tuple[Floats, Floats]]:
@@ -226,9 +228,9 @@ def commonness(value: float, usual: tuple[float, float]) -> float:
 
     Returns
     -------
-    float    0 for the usual value, negative for other values, at least `LEAST_WORTH`
+    float    0 for the usual value, negative for other values, at least `LEAST_SCORE`
     """
     expected, spread = usual
     if value <= 0.0:
-        return LEAST_WORTH
-    return max(LEAST_WORTH, -0.5 * (log(value / expected) / spread) ** 2)
+        return LEAST_SCORE
+    return max(LEAST_SCORE, -0.5 * (log(value / expected) / spread) ** 2)

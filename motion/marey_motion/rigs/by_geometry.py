@@ -17,23 +17,23 @@ from marey_motion.rigs.names import parse_name
 from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import Skeleton
 
-# Branches that reach less far than this share of their largest sibling are rigging aids too.
+# Branches that reach less far than this share of the reach of their largest sibling are aids of the rig.
 SMALL_BRANCH = 0.3
-# From the arms' branch to the head's joint, by the length of a leg.
+# Distance from the branch of the arms to the head's joint, divided by the length of a leg: usual value and spread.
 NECK_BY_LEG = (0.25, 0.6)
-# What no neck costs, or one that looks like anything else.
+# Score if there is no neck, and lowest score of a neck.
 NO_NECK = -2.5
-# Branches that differ less are left and right of something.
+# Branches whose lengths differ by less than this share are the left and right of a pair.
 TWIN = 0.02
-# Plans of the body whose necks are looked at.
+# Greatest number of interpretations of the body for which a neck is looked for.
 MOST_PLANS = 30
-# Cosine of the sharpest turn within a neck.
+# Cosine of the sharpest bend within a neck.
 HAIR_TURN = 0.75
 # Factors of the confidence where the sides are distinguished by the rest pose, or guessed.
 SIDES_UNNAMED, SIDES_GUESSED = 0.8, 0.7
-TOLD = "were distinguished by the rest pose alone"
+KNOWN_BY_REST_POSE = "were distinguished by the rest pose alone"
 GUESSED = "are a guess: no foot shows the direction the body faces, so left was taken for +x; check before use"
-# Plans that are worth so little less are as likely, and what that takes from the confidence.
+# Interpretations whose score is lower by less than `CLOSE` are as likely; `DOUBTED` is then a factor of the confidence.
 CLOSE, DOUBTED = 0.3, 0.6
 
 
@@ -70,8 +70,8 @@ def find_body(skeleton: Skeleton) -> GeometryMatch | None:
         return None
     # A neck costs more to look for than limbs do.
     necks = [_neck(tree, plan) for plan in plans[:MOST_PLANS]]
-    worths = [plan.worth + worth for plan, (worth, _) in zip(plans, necks, strict=False)]
-    best = int(np.argmax(worths))
+    scores = [plan.score + score for plan, (score, _) in zip(plans, necks, strict=False)]
+    best = int(np.argmax(scores))
     plan, (_, neck_and_head) = plans[best], necks[best]
     legs, arms = plan.legs, plan.arms
     joints = {"pelvis": tree.common_ancestor(legs.pair.parent, arms.pair.parent)}
@@ -84,12 +84,13 @@ def find_body(skeleton: Skeleton) -> GeometryMatch | None:
         sides, by_name = _left_and_right(skeleton, reading, np.array((1.0, 0.0, 0.0)) if left is None else left)
         if not by_name:
             confidence *= SIDES_GUESSED if left is None else SIDES_UNNAMED
-            notes.append(f"left and right of {names[0]} to {names[2]} {GUESSED if left is None else TOLD}")
+            origin = GUESSED if left is None else KNOWN_BY_REST_POSE
+            notes.append(f"left and right of {names[0]} to {names[2]} {origin}")
         for side, limb in zip(SIDES, sides, strict=True):
             places = (*range(3), -1 if reading is arms else 3)
             named = {f"{side}_{name}": reading.joint(limb, place) for name, place in zip(names, places, strict=True)}
             joints |= {name: index for name, index in named.items() if index is not None}
-    rivals = [one for one, worth in zip(plans, worths, strict=False) if worth > worths[best] - CLOSE]
+    rivals = [one for one, score in zip(plans, scores, strict=False) if score > scores[best] - CLOSE]
     doubts = _doubts(skeleton, plan, rivals)
     return GeometryMatch(joints, confidence * (DOUBTED if doubts else 1.0), (*notes, *doubts))
 
@@ -120,8 +121,8 @@ def _neck(tree: BoneTree, plan: BodyPlan) -> tuple[float, list[int]]:
     limbs = {limb.chain[0] for limb in arms.limbs} | set(skeleton.path_to_root(legs.parent))
     chains = [_neck_chain(tree, joint) for joint in skeleton.children[arms.parent] if joint not in limbs]
     found = [(_looks_like_neck(tree, plan, chain), chain) for chain in chains]
-    worth, chain = max(found, key=lambda one: one[0], default=(NO_NECK, []))
-    return max(worth, NO_NECK), chain
+    score, chain = max(found, key=lambda one: one[0], default=(NO_NECK, []))
+    return max(score, NO_NECK), chain
 
 
 def _neck_chain(tree: BoneTree, start: int) -> list[int]:
@@ -144,12 +145,12 @@ def _looks_like_neck(tree: BoneTree, plan: BodyPlan, chain: list[int]) -> float:
     parent = plan.arms.pair.parent
     length = float(np.sum(tree.lengths[chain]))
     up = unit(positions[parent] - positions[plan.legs.pair.parent])
-    worth = commonness(length / plan.legs.length, NECK_BY_LEG) + float(
+    score = commonness(length / plan.legs.length, NECK_BY_LEG) + float(
         up @ unit(positions[chain[-1]] - positions[parent])
     )
     extents = [tree.extent(joint) for joint in tree.skeleton.children[parent] if joint != chain[0]]
     has_twin = any(abs(extent - tree.extent(chain[0])) < TWIN * extent for extent in extents)
-    return worth + (NO_NECK if has_twin else 0.0)
+    return score + (NO_NECK if has_twin else 0.0)
 
 
 def _turn(skeleton: Skeleton, a: int, b: int, c: int) -> float:

@@ -12,9 +12,9 @@ from marey_motion.skeleton import Skeleton
 
 # Two limbs belong together when their bones differ by less than this share of their length.
 ASYMMETRY_LIMIT = 0.15
-# Limbs of unequal ends are still a pair when they have this many bones in common: an arm to the wrist.
+# Limbs with different ends are still a pair if at least this many bones are equal: an arm to the wrist.
 LEAST_COMMON_BONES = 2
-# Limbs of one joint that are compared with each other; nothing that walks has more.
+# Greatest number of limbs of one joint that are compared with each other.
 MOST_LIMBS = 12
 
 

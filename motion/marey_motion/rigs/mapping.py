@@ -17,11 +17,11 @@ from marey_motion.skeleton import Skeleton
 
 Method = Literal["names", "geometry", "manual"]
 
-# Names that cover less of the body than this are tried against geometry.
+# If the names cover a smaller share of the essential joints, they are compared with the geometry.
 TRUSTED_SHARE = 0.75
-# What a mapping of something that seems to have four legs is worth.
+# Confidence of a mapping of a skeleton that seems to have four legs.
 ANIMAL_CONFIDENCE = 0.2
-# Below this a person must have looked before anything is made of a mapping.
+# A mapping with a lower confidence must be checked by a person before it is used.
 LEAST_CONFIDENCE = 0.5
 # A clavicle shorter than this share of the upper arm is a joint without a bone.
 _SHORTEST_CLAVICLE = 1e-3

@@ -69,7 +69,7 @@ def _marked(names: Names) -> Names:
 
 
 def _shared_start(names: Sequence[str]) -> str:
-    # What the first and the last in order share, all between them share.
+    # All names begin with the text with which both the first and the last name in sorted order begin.
     first, last = min(names, default=""), max(names, default="")
     length = next(
         (at for at, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), min(len(first), len(last))

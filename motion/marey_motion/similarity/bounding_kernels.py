@@ -1,11 +1,11 @@
 """Kernels of searches by example: lower bounds of the distances of poses and windows from an example.
 
 A row holds the features of one pose. A ball encloses a few consecutive rows of a clip: it has a centre and a radius for
-each vector and each rotation. By the triangle inequality, the distance of a vector of a pose from that of any row in
-the ball is at least its distance from the centre minus the radius. For rotations, this holds for the chord of
-quaternions, which is never longer than half of the angle. The shapings F increase, so the bounds of single vectors and
-rotations give a bound of the metric. Several samples (compared poses) of the example can be enclosed in a ball, too. If
-the radius of this ball is also subtracted, one bound holds for all these samples.
+each vector and each rotation. If a vector of a pose has the distance d from the centre, its distance from the same
+vector of any row in the ball is at least d minus the radius, by the triangle inequality. For rotations, this holds for
+the chord of quaternions, which is never longer than half of the angle. The shapings F increase, so the bounds of single
+vectors and rotations give a bound of the metric. Several samples (compared poses) of the example can be enclosed in a
+ball, too. If the radius of this ball is also subtracted, one bound holds for all these samples.
 
 All arithmetic is in single precision. Inner loops run over adjacent numbers of one-dimensional arrays, so that the
 compiler uses vector instructions.
@@ -72,7 +72,10 @@ def _add_shaped(x, weight, shaping, exponent, raw):
 
 @contracted_inlined
 def _add_constant(constant, always, raw, total):
-    """Add the distances by a component, raw (n,) and the constant, to total (n,)."""
+    """Add the distances by a component to total (n,): raw (n,) plus the constant of the component.
+
+    Where raw is 0, the constant is added only if `always` is true.
+    """
     for j in range(raw.shape[0]):
         total[j] += raw[j] + (constant if always or raw[j] > np.float32(0.0) else np.float32(0.0))
 
@@ -179,7 +182,7 @@ def _row_distances(sample, row, vectors, measure, distances):
 def row_bound(sample, row, tables, vectors, distances):
     """Compute a lower bound of the distance between two rows in single precision; distances (41,) is a scratch array.
 
-    The bound differs from the distance by rounding, and by chords in place of angles.
+    The bound differs from the distance by rounding errors, and because chords are used instead of angles.
     """
     rotated, places, factors, weights, starts, constants, shapings, exponents, measure, always = tables
     _row_distances(sample, row, vectors, measure, distances)

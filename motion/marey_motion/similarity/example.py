@@ -40,7 +40,7 @@ class Example:
         return np.argsort([int(f"{place:05b}"[::-1], 2) for place in range(count)], kind="stable")
 
     def rows_around(self, frame: float, rate_hz: float) -> tuple[int, int]:
-        """Find the rows of the example's own clip at which windows start that overlap the example.
+        """Find the rows of the example's own clip at which the windows that overlap the example start.
 
         Parameters
         ----------

@@ -34,7 +34,10 @@ ROTATIONS_AT = 3 * VECTORS
 WIDTH = ROTATIONS_AT + 4 * len(ROTATED_JOINTS)
 """Numbers in a row of features: positions (m), velocities (m/s), rotations (unit quaternions)."""
 CONTEXT_S = 1.0
-"""Seconds before and after a range of frames on which its features depend, by the mean heading and the velocities."""
+"""Seconds of motion before and after a range of frames that are needed to compute the features of this range.
+
+The heading is smoothed over time, and velocities are differences of frames.
+"""
 _ROUNDED_FRAMES = 1e-6
 
 Rows = NDArray[np.float32]

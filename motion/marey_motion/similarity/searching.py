@@ -33,9 +33,10 @@ _MORE_STEPS = 8
 
 
 class Hit(NamedTuple):
-    """Window that resembles the example: indices of shard, run (clip) and first row in the run, and its distance.
+    """Window that resembles the example, and its distance from the example.
 
-    `mirrored` is True if the mirrored example is nearer than the example itself.
+    `shard`, `run` and `row` are the indices of the shard, of the run (the clip) in the shard, and of the window's first
+    row in the run. `mirrored` is True if the mirrored example is nearer than the example itself.
     """
 
     shard: int
@@ -80,7 +81,7 @@ def search_windows(
     examples = [example] if not mirror else [example, Example(mirrored(example.poses), example.offsets)]
     with ThreadPoolExecutor(threads) as pool:
         search = _Searches(shards, [grouped(one, tables) for one in examples], metric, count, pool)
-        return [search.told(shards[number], number, window) for window, number in search.best()]
+        return [search.as_hit(shards[number], number, window) for window, number in search.best()]
 
 
 def search_clips(
@@ -107,11 +108,12 @@ def search_clips(
 
     Returns
     -------
-    list of tuple of int    indices of shard and run of each clip, ascending; the result is exact
+    list of (int, int)    for each clip, the index of its shard and of its run in the shard, ascending; the result is
+        exact
 
     Raises
     ------
-    MotionError    as for `search_windows`
+    MotionError    if the metric superposes pairs of poses, or needs joints that the example does not have
     """
     most = float(np.nextafter(distance, -np.inf)) if below else distance
     examples = [grouped(example, _tables_for(example, metric))]
@@ -200,7 +202,7 @@ class _Searches:
         best = self._best
         return best[-1][0].distance if len(best) == self._count else np.inf
 
-    def told(self, searched: SearchedShard, number: int, window: RankedWindow) -> Hit:
+    def as_hit(self, searched: SearchedShard, number: int, window: RankedWindow) -> Hit:
         """Convert a window to a hit, and find whether the example or its mirrored copy is nearer to the window."""
         hit = Hit(number, window.run, window.row, window.distance, False)
         if len(self._examples) == 1:

@@ -37,6 +37,8 @@ _RADII = VECTORS + len(ROTATED_JOINTS)
 class Runs(NamedTuple):
     """First row, first step and first ball of each of R runs in a shard, and the ends of the last run.
 
+    A run contains the rows of one clip.
+
     Parameters
     ----------
     starts : (R + 1,) int64    run r has the rows [starts[r], starts[r + 1])

@@ -13,7 +13,10 @@ from marey_motion.similarity.bounding_kernels import row_bound
 
 @compiled
 def loosened(most, samples):
-    """Compute a limit for sums of bounds in single precision: above it, the mean distance certainly exceeds `most`."""
+    """Compute a limit for the sum of the lower bounds of `samples` distances, with a margin for rounding errors.
+
+    If a sum in single precision exceeds the limit, the mean distance certainly exceeds `most`.
+    """
     return (most + 1e-5) * samples / (1.0 - 1e-4)
 
 
@@ -129,8 +132,8 @@ def _windows_in(rows, windows):
 def _still_near(query, rows, bounds, places, windows, layout, tables, limit):
     """Return the indices of the windows whose sum of distances is not certainly above a limit.
 
-    For one sample after the other, the bound of its group is replaced, in the sum of the window, by the bound for the
-    exact row, until the sum is above the limit.
+    The sum of a window begins with the bounds of the groups of samples. For one sample after another, the bound of its
+    group is replaced by the tighter bound for the exact row. A window is dropped as soon as its sum exceeds `limit`.
     """
     samples, offsets, groups, _, turns = query
     by_group, step_sums = bounds
@@ -156,14 +159,16 @@ def _still_near(query, rows, bounds, places, windows, layout, tables, limit):
 def step_distances(query, shard, bounds, steps, runs, layout, tables, rotations_at, most, out):
     """Lower the elements of out (n, size) to the distances of the windows that start in n steps of `size` rows.
 
-    An element does not change if it is less than the distance already, if the distance is above `most`, or if the
+    An element does not change if it is already less than the distance, if the distance is above `most`, or if the
     window exceeds its run.
 
-    query holds samples (T, width), offsets (T,), groups (T,), the order in which the distances of samples are added,
-    and the order in which their bounds are computed. bounds holds the bounds of groups (G, balls) and their sums (n,)
-    for the steps. steps (n,) are ascending. runs are the first rows, steps and balls of all runs. layout holds the
-    numbers of rows per step, of steps per ball and of vectors, and a scratch array with an element for each vector and
-    rotation.
+    * query holds samples (T, width), offsets (T,), groups (T,), the order in which the distances of samples are added,
+      and the order in which their bounds are computed.
+    * bounds holds the bounds of groups (G, balls), and their sums (n,) for the steps.
+    * steps (n,) are ascending.
+    * runs holds the first rows, steps and balls of all runs.
+    * layout holds the numbers of rows per step, of steps per ball and of vectors, and a scratch array with an element
+      for each vector and rotation.
     """
     samples, offsets, _, order, _ = query
     size, count = layout[0], samples.shape[0]

@@ -23,11 +23,11 @@ UNITS = {
 
 
 _REACH = 0.4
-"""Greatest extension of an axis at either end in order to show intervals, as a share of the length of the axis."""
+"""Largest share of an axis's length by which each end of the axis is extended to show intervals."""
 
 
 def add_chart(figure: Figure, place: Place, *, title: str, x: str, y: str = "") -> Axes:
-    """Add a panel like `add_panel`, but write the names in its texts literally, without mathematical notation."""
+    """Add a panel to a figure, and write its texts literally: dollar signs do not begin mathematical notation."""
     panel = add_panel(figure, place, title=title, x=plain(x), y=plain(y))
     for axis in (panel.xaxis, panel.yaxis):
         axis.label.set_parse_math(False)
@@ -65,7 +65,7 @@ def spread(low: float, high: float, *, log: bool) -> tuple[float, float]:
 
 
 def widened(low: float, high: float, summaries: Sequence[FieldSummary]) -> tuple[float, float]:
-    """Extend the ends of an axis to contain the intervals of means, but only so far that runs stay distinct."""
+    """Extend the ends of an axis so that the intervals of means fit; wide intervals may still be cut off."""
     ends = [end for one in summaries for end in (one.low, one.high) if end is not None]
     reach = _REACH * (high - low)
     return max(min([low, *ends]), low - reach), min(max([high, *ends]), high + reach)

@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
 MOST_BARS_DRAWN = 30
 NARROW = 0.7
-"""Ratio of the least to the greatest value above which bars that start at 0 would look equally long."""
+"""Limit for the ratio of the least to the greatest value.
+
+Above it, bars from 0 would look equally long, so dots are drawn instead.
+"""
 _ROW, _ABOVE, _UNDER, _RIGHT, _PAGE = 0.27, 0.62, 0.6, 1.65, 9.6
 _SIGN = 0.068
 """Width of a character in inches."""

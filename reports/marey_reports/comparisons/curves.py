@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MOST_OTHERS = 40
 """Greatest number of runs that are drawn in grey, behind the settings with colours."""
 MOST_BEYOND = 0.1
-"""Greatest extension of the axis at either end in order to show intervals, as a share of the range of the runs."""
+"""Largest share of the range of the runs by which each end of the axis is extended to show intervals."""
 
 
 class _MeanCurve(NamedTuple):

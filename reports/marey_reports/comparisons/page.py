@@ -27,7 +27,7 @@ Plot = Literal["lines", "scatter", "bars"]
 PLOTS: tuple[Plot, ...] = ("lines", "scatter", "bars")
 
 _CAPTION_SIGNS, _CAPTION_LINE = 148, 0.16
-"""Characters in a line of a caption, and its height in inches."""
+"""Number of characters in a line of a caption, and height of the line in inches."""
 MOST_COLUMNS = 24
 MOST_PARAMETERS = 3
 """Greatest number of parameters over which a page draws each field."""
@@ -45,9 +45,10 @@ def draw_comparison(
 
     Parameters
     ----------
-    comparison : with curves, if lines are to be drawn
-    plot : kind of the charts; None: all kinds on a page, in a picture the first kind for which the runs have values
-    parameter : name of the parameter on the horizontal axis; None: each parameter that differs
+    comparison : the compared runs; charts of the kind "lines" need its curves
+    plot : kind of the charts. If None, a page has charts of all kinds, and a picture has a chart of the first kind for
+        which the runs have values
+    parameter : name of the parameter on the horizontal axis; if None, each parameter that differs
     log : whether axes of fields with positive values are logarithmic
 
     Returns
@@ -153,7 +154,7 @@ def render_page(subject: ComparedSubject, plot: Plot | None, parameter: str | No
 
 
 def _verdict(subject: ComparedSubject) -> str:
-    """Describe the best setting for the first field with a goal; mention an overlap with other intervals."""
+    """Describe which setting is best for the first field with a goal, and whether chance may explain the difference."""
     column = next((one for one in subject.fields if one.goal is not None and one.best_mean is not None), None)
     if column is None:
         return f"{counted(len(subject.comparison.runs), 'run')} are compared."

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDE = 100.0
-"""Ratio of the largest to the smallest value of a parameter from which its axis is logarithmic."""
+"""Least ratio of the largest to the smallest value of a parameter for a logarithmic axis."""
 MOST_NAMES = 12
 """Greatest number of different texts on the horizontal axis."""
 MOST_NUMBERED = 24
@@ -36,7 +36,10 @@ _MOST_SIGNS = 60
 
 
 class _Across(NamedTuple):
-    """Place of each setting on the horizontal axis; `names` are the texts at 0, 1, ..., empty for numbers."""
+    """Place of each setting on the horizontal axis.
+
+    If the parameter has texts as values, `names` lists the texts at the places 0, 1, ...; otherwise, `names` is empty.
+    """
 
     places: dict[int, float]
     names: tuple[str, ...]

@@ -24,7 +24,7 @@ ratios stay finite.
 
 
 class Point(NamedTuple):
-    """Field of a setting: its summary, and the number of each counted run."""
+    """Values of one field in one setting: index of the setting, summary, and the number of each counted run."""
 
     setting: int
     summary: FieldSummary
@@ -42,7 +42,7 @@ class ComparedSubject:
 
     Parameters
     ----------
-    comparison : the comparison as the server answered it
+    comparison : the comparison, as the server returns it
     log : whether axes of fields with positive values are logarithmic
     """
 
@@ -96,7 +96,10 @@ class ComparedSubject:
         return self.comparison.runs[self.comparison.settings[setting].runs[0]]
 
     def points(self, field: str) -> list[Point]:
-        """Return the settings whose runs all have a number that can be drawn, in the order of `order_of`."""
+        """Return a point for each setting whose runs all have a number for `field` that can be drawn.
+
+        The points are in the order of `order_of`.
+        """
         found = []
         for place in self.order_of(field):
             setting = self.comparison.settings[place]

@@ -64,9 +64,9 @@ def contact_sheet(
 ) -> bytes:
     """Draw a PNG with one row per take: at each of several times, the source and the result side by side.
 
-    The result has a tinted background. The figures of a take have the same scale and the same view: from the front left
-    of the source in its first frame, and nothing of a figure leaves its cell. Each figure is drawn over its own patch
-    of the floor y = 0, with an arrow in its facing direction.
+    The result has a tinted background. The figures of a take have the same scale, and are seen from the front left of
+    the source in its first frame. No part of a figure leaves its cell. Each figure is drawn over its own patch of the
+    floor y = 0, with an arrow in its facing direction.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def contact_sheet(
     moments : number of evenly spaced times at which a take is drawn, at most `MAX_MOMENTS` and one per frame
     total : number of takes from which the drawn takes were chosen; None if all takes are drawn
     choice : order in which they were chosen, such as "the worst first"; written only if not all takes are drawn
-    sides : what the clips on white and on tinted background are
+    sides : names, for the header, of the clips on the white and on the tinted background
 
     Raises
     ------
@@ -124,9 +124,11 @@ class _SheetRow:
 
     @property
     def seen_extent_m(self) -> tuple[float, float, float]:
-        """Lowest and highest point in the picture and greatest distance to a side, from the floor under the pelvis.
+        """Extent of the row's figures in the picture, in metres from the point of the floor under the pelvis.
 
-        Bones, heads, patches of floor and arrows count. The camera looks down, so what is near is lower in the picture.
+        The three numbers are the lowest point, the highest point, and the greatest distance to a side. They contain
+        bones, heads, patches of floor and arrows. The lowest point can be below the floor line, because the camera
+        looks down.
         """
         spot, head = FLOOR_SHARE * self.height_m, HEAD_SHARE * self.height_m
         corners = [np.array([[spot, spot * np.sin(self.camera.tilt_rad)]]), self._arrow_tips(spot)]
@@ -146,14 +148,17 @@ class _SheetRow:
 
 
 def _head_centre(body: StickFigure, bones: AnyFloats) -> AnyFloats:
-    """Return the centre of the head from the ends (..., n, 2, k) of all bones, (..., k)."""
+    """Return the centre (..., k) of the head, computed from the ends (..., n, 2, k) of all n bones."""
     assert body.head is not None
     bone, share = body.head
     return share * bones[..., bone, 0, :] + (1.0 - share) * bones[..., bone, 1, :]
 
 
 def _arrow_tip(camera: Camera, facing: AnyFloats, spot_m: float) -> AnyFloats:
-    """Return where the camera sees the tips of arrows in facing directions (..., 2), (..., 3) in metres."""
+    """Return the tips (..., 3) of the arrows in the facing directions (..., 2), as the camera sees them, in metres.
+
+    `spot_m` is the radius of the patch of floor under the body; the arrows end a little outside it.
+    """
     ahead = np.stack((facing[..., 0], np.zeros_like(facing[..., 0]), facing[..., 1]), axis=-1)
     return camera.seen(1.15 * spot_m * ahead)
 

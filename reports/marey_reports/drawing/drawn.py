@@ -40,7 +40,7 @@ class DrawnFigure:
     ----------
     sketch : the page, the numbers that it shows, and its caption
     name : name by which callers request the figure
-    number : number that the figure has in its paper, or "" if no paper contains the figure
+    number : number of the same figure in the published paper, or "" if no paper contains the figure
     """
 
     sketch: Sketch

@@ -38,7 +38,7 @@ class ReportHead(NamedTuple):
     inputs: Sequence[ReportInput] = ()
 
     def html(self) -> Html:
-        """Return subject, title and facts; project, author and date are inserted when the report is handed out."""
+        """Return subject, title and facts; the server inserts project, author and date when it sends the report."""
         facts = [
             _fact("Marey", self.code_version.removeprefix("marey@")),
             *([_inputs(self.inputs)] if self.inputs else []),

@@ -9,7 +9,7 @@ from typing import TypeAlias
 from markupsafe import Markup, escape
 
 Html = Markup
-"""Text that is HTML already; only functions of this module and constants have this type."""
+"""Text that is already HTML. Only the functions of this module, and constants, make texts of this type."""
 
 VOID = frozenset({"br", "hr", "img", "meta", "col"})
 # Not allowed in HTML, or reordering what follows: names of clips come from outside.

@@ -48,7 +48,7 @@ class Section(NamedTuple):
 def page(head: ReportHead, lead: Content, sections: Sequence[Section], *, plays_motion: bool = False) -> str:
     """Return a whole HTML document: the head, a summary (`lead`) and the sections.
 
-    With `plays_motion`, the document has a place for the player, which is inserted when the report is handed out.
+    With `plays_motion`, the document has a place for the player, which the server inserts when it sends the report.
     """
     links = [element("li", element("a", section.heading, href=f"#{section.anchor}")) for section in sections]
     declared = element(
@@ -71,7 +71,7 @@ def page(head: ReportHead, lead: Content, sections: Sequence[Section], *, plays_
 
 
 def scripts_of(page: str) -> tuple[str, ...]:
-    """Return the digest of the script of a page in the syntax of Content-Security-Policy; nothing without a script.
+    """Return the digest of the script of a page in the syntax of Content-Security-Policy; empty without a script.
 
     The script is the last `<script>` in the page, because earlier ones can be parts of names of clips.
     """

@@ -202,7 +202,7 @@ def shortened(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
-    """Choose the upper end of an axis, from `wanted` to twice `wanted`; the largest values may be greater."""
+    """Choose the upper end of an axis, at least `wanted` and at most twice as much; values beyond it are cut off."""
     if not len(values):
         return wanted
     most = float(np.quantile(values, 0.98))

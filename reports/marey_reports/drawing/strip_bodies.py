@@ -45,7 +45,7 @@ class StripCell:
         return np.asarray(seen + below, dtype=np.float64)
 
 
-class Look(NamedTuple):
+class BodyStyle(NamedTuple):
     """Style of the lines of a body.
 
     If `colour` is None, each side of the body has its own colour. A `rim` is a light edge that separates overlapping
@@ -58,18 +58,23 @@ class Look(NamedTuple):
     rim: bool = False
 
 
-GHOST = Look(LINE_POINTS, 0.55, REFERENCE)
+GHOST = BodyStyle(LINE_POINTS, 0.55, REFERENCE)
 
 
-def draw_way(axes: Axes, way: Floats, frame: BboxBase) -> None:
+def draw_path(axes: Axes, path: Floats, frame: BboxBase) -> None:
     """Draw a path (N, 2) on the floor, in inches on the page."""
-    if len(way):
-        (line,) = axes.plot(way[:, 0], way[:, 1], color=QUIET, lw=0.9, alpha=0.8)
+    if len(path):
+        (line,) = axes.plot(path[:, 0], path[:, 1], color=QUIET, lw=0.9, alpha=0.8)
         line.set_clip_box(frame)
 
 
 class BodyShapes(NamedTuple):
-    """Shapes of a body: for each side, lines of joined bones (`runs`) and the single bones (n, 2); and the head."""
+    """Shapes of a body, as indices of points.
+
+    `runs` are the lines of joined bones, and `bones` the single bones (n, 2), both by side of the body. `head` contains
+    the points of the head's bone, and the place of the head's centre on this bone as in `StickFigure`; None without a
+    head. `head_m` is the radius of the head in metres.
+    """
 
     runs: dict[int, list[Indices]]
     bones: dict[int, Indices]
@@ -78,7 +83,7 @@ class BodyShapes(NamedTuple):
 
 
 def shapes_of(body: StickFigure, drawn: Iterable[Floats]) -> BodyShapes:
-    """Return the shapes of a body that is drawn with the points (m, T, P, 3) of several rows."""
+    """Return the shapes of a body; the size of the head is computed from the drawn points (m, T, P, 3) of each row."""
     shown = np.ones(len(body.bones), dtype=bool)
     if body.head is not None and body.head[1] < 1.0:
         shown[body.head[0]] = False  # the circle stands for it
@@ -93,7 +98,9 @@ def shapes_of(body: StickFigure, drawn: Iterable[Floats]) -> BodyShapes:
     )
 
 
-def draw_body(axes: Axes, shapes: BodyShapes, stage: StripCell, points: Floats, look: Look, frame: BboxBase) -> None:
+def draw_body(
+    axes: Axes, shapes: BodyShapes, stage: StripCell, points: Floats, look: BodyStyle, frame: BboxBase
+) -> None:
     """Draw the bones of a body with points (P, 3): each side as one shape, the far side before the near one."""
     from matplotlib.patches import Circle, PathPatch
 

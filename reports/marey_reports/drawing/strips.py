@@ -25,10 +25,10 @@ from marey_reports.drawing.strip_bodies import (
     LINE_POINTS,
     SIDE_COLOURS,
     BodyShapes,
-    Look,
+    BodyStyle,
     StripCell,
     draw_body,
-    draw_way,
+    draw_path,
     shapes_of,
 )
 
@@ -58,14 +58,14 @@ class StripRow:
     ----------
     label, note : texts to the left of the row; `note` is written below `label`, in small letters
     bodies : (m, T, P, 3) points of m motions in T frames, metres, drawn on top of each other
-    ways : (m, N, 3) paths of the root in metres, drawn on the floor; N may be 0
+    paths : (m, N, 3) paths of the root in metres, drawn on the floor; N may be 0
     ghost : (T, P, 3) points of a motion for comparison, drawn in grey behind the bodies
     """
 
     label: str
     note: str
     bodies: Floats
-    ways: Floats
+    paths: Floats
     ghost: Floats | None = None
 
 
@@ -154,7 +154,7 @@ class PoseRow:
     label, note : texts to the left of the row
     poses : one frame of the motion for each moment
     ghost : one frame of another motion for each moment, drawn in grey behind the poses
-    headings_rad : (T,) headings to which the poses are turned, about +Y, 0 for +z; None: the poses are not turned
+    headings_rad : (T,) headings to which the poses are turned, about +Y, 0 for +z; if None, poses are not turned
     """
 
     label: str
@@ -174,7 +174,7 @@ def draw_pose_rows(
     Parameters
     ----------
     names, labels : two texts for each of the T columns, written below the column
-    ghost : name of the ghosts in the legend; empty: there are none
+    ghost : name of the ghosts in the legend; empty if there are none
     about : text above the rows
     """
     body = body_of(rows[0].poses[0].skeleton)
@@ -269,7 +269,7 @@ def _draw_label(axes: Axes, row: StripRow, middle: float) -> None:
 
 
 def _lines(label: str) -> list[str]:
-    """Break a label into lines; a label that is too long even for them loses its middle."""
+    """Break a label into lines; a label that does not fit on these lines is shortened in its middle."""
     return wrap(shortened(label, MOST_LABEL_LINES * LABEL_LETTERS), LABEL_LETTERS) or [""]
 
 
@@ -282,11 +282,12 @@ def _draw_cell(axes: Axes, stage: StripCell, shapes: BodyShapes, row: StripRow, 
     # One box for all artists: each `set_clip_path` would make another one, which takes a tenth of the time of a strip.
     frame = TransformedBbox(Bbox.from_bounds(left, bottom - GAP, width, height + 2 * GAP), axes.transData)
     axes.plot([left + 0.03, left + width - 0.03], [floor] * 2, color=HAIRLINE, lw=0.8)
-    for way in row.ways:
-        draw_way(axes, stage.placed(way * (1.0, 0.0, 1.0)), frame)
+    for path in row.paths:
+        draw_path(axes, stage.placed(path * (1.0, 0.0, 1.0)), frame)
     if row.ghost is not None:
         draw_body(axes, shapes, stage, row.ghost[column], GHOST, frame)
     count = len(row.bodies)
-    look = Look(LINE_POINTS, rim=True) if count == 1 else Look(0.6 * LINE_POINTS, max(0.25, 1.0 / np.sqrt(count)))
+    faint = BodyStyle(0.6 * LINE_POINTS, max(0.25, 1.0 / np.sqrt(count)))
+    look = BodyStyle(LINE_POINTS, rim=True) if count == 1 else faint
     for points in row.bodies[:, column]:
         draw_body(axes, shapes, stage, points, look, frame)

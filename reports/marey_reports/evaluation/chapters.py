@@ -267,7 +267,11 @@ TRIAL_COLUMNS: tuple[tuple[str, str, tuple[Measure, ...], int, float], ...] = (
     ("transitions (1/s)", "transitions_per_s", ("jumping",), 2, 1.0),
     ("treading (1/s)", "treading_per_s", ("treading",), 2, 1.0),
 )
-"""Number columns of the table of trials: heading, metric, measures with a limit for it, decimals, and factor."""
+"""Numeric columns of the table of trials: heading, name of the metric, names of limits, decimals, and factor.
+
+If a trial has one of the limits, the column shows the value that was compared with the limit, instead of the metric.
+The value is multiplied by the factor.
+"""
 SIGNED = ("settled_se_v", "se_v", "se_omega_deg")
 TRIAL_HEADS = ("trial", *(column[0] for column in TRIAL_COLUMNS))
 TRIAL_NUMBERS = range(1, len(TRIAL_COLUMNS) + 1)

@@ -28,7 +28,7 @@ METRICS = {
     "offset_mean": Metric(
         "distance from the path", "m", 2, "mean distance of the character from the desired position at the same moment"
     ),
-    "offset_max": Metric("largest distance", "m", 2, "largest such distance in a trial"),
+    "offset_max": Metric("largest distance", "m", 2, "largest distance from the desired position in a trial"),
     "offset_final": Metric("distance at the end", "m", 2, "distance from the desired position at the end of a trial"),
     "along_track_rms": Metric(
         "ahead or behind", "m", 2, "root mean square of the part of the distance along the path: lag or lead"
@@ -56,7 +56,10 @@ METRICS = {
         "switches without response count as longer than all others",
     ),
     "response_s": Metric(
-        "response, if there is one", "s", 2, "mean of the same time over the switches with a response only"
+        "response, if there is one",
+        "s",
+        2,
+        "mean time from a switch until the response, as above; switches without response are left out",
     ),
     "response_missed": Metric(
         "speeds never reached", "", 0, "number of switches to which the character did not respond before the next one"
@@ -67,18 +70,25 @@ METRICS = {
         2,
         "mean speed of the toes on the ground while the foot is in contact in the displayed clip",
     ),
-    "foot_skate_clips": Metric("feet slide in the clips", "m/s", 2, "the same in the clips shown, without transitions"),
+    "foot_skate_clips": Metric(
+        "feet slide in the clips", "m/s", 2, "mean speed of the toes in contact in the clips shown, without transitions"
+    ),
     "foot_depth_p95": Metric(
         "feet sink", "m", 3, "depth of the lower toe below the mean height of toes in contact; 95 % of it is less"
     ),
     "contacts_per_m": Metric("steps per metre", "1/m", 2, "number of times that a foot comes into contact, per metre"),
-    "contacts_per_m_clips": Metric("steps per metre in the clips", "1/m", 2, "the same in the clips shown"),
+    "contacts_per_m_clips": Metric(
+        "steps per metre in the clips", "1/m", 2, "number of contacts of the feet per metre in the clips shown"
+    ),
     "pose_cost_mean": Metric(
         "transition cost", "m", 3, "distance over hips, spine, head, hands and feet from one displayed pose to the next"
     ),
-    "pose_cost_p95": Metric("transition cost, 95 %", "m", 3, "95 % of the transition costs are below"),
+    "pose_cost_p95": Metric("transition cost, 95 %", "m", 3, "95 % of the transition costs are below this value"),
     "pose_cost_clips": Metric(
-        "change of pose in the clips", "m", 3, "the same distance between successive frames of the clips shown"
+        "change of pose in the clips",
+        "m",
+        3,
+        "distance over the same joints between successive frames of the clips shown",
     ),
     "transitions_per_s": Metric(
         "transitions", "1/s", 2, "number of jumps per second that a search chose although the clip could have continued"
@@ -87,7 +97,7 @@ METRICS = {
         "treading", "1/s", 2, "number of transitions per second to a frame of the same clip at most 1/3 s away"
     ),
     "treading_share": Metric(
-        "share of treading", "", 2, "share of these transitions in all transitions", limited_as="treading_per_s"
+        "share of treading", "", 2, "share of all transitions that are treading", limited_as="treading_per_s"
     ),
     "clip_ends": Metric("clip ends met", "", 0, "number of jumps at the end of a clip and of restarts of a loop"),
     "offset_asymmetry": Metric(

@@ -49,7 +49,7 @@ _PROBLEMS: dict[Measure, _Wording] = {
 
 
 def verdict(result: EvaluationResult) -> str:
-    """Summarise quality, largest errors, looks, coverage and unused data in one sentence."""
+    """Summarise the result in one sentence: followed trials, worst errors, visible flaws, coverage and unused data."""
     judgement = judge(result)
     if not judgement.trials:
         return "Not judged: the evaluation has no trials."

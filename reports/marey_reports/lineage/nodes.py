@@ -59,7 +59,7 @@ def boxes_of(graph: LineageGraph) -> tuple[list[Box], list[Arrow]]:
 
 
 def _into(link: GroupLink, groups: list[LineageGroup], job_boxes: dict[str, int]) -> Arrow:
-    """Return the arrow of a link to the job that made the result, or to the result itself if no job made it."""
+    """Return the arrow of a link: from its source to the job that made the result, or without a job, to the result."""
     return Arrow(link.source, job_boxes.get(groups[link.result].job or "", link.result), _line(link.role))
 
 

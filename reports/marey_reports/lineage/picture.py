@@ -44,7 +44,7 @@ def draw_lineage(graph: LineageGraph, file_type: FileType) -> bytes:
 
     Parameters
     ----------
-    graph : answer of the server
+    graph : the lineage graph, as the server returns it
     file_type : `svg`, `png`, or `dot`, the language of Graphviz
 
     Returns

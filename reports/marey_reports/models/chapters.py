@@ -154,7 +154,7 @@ def variation_chapter(subject: ModelSubject, figures: Figures) -> Section:
 def example_chapter(subject: ModelSubject, figures: Figures) -> Section:
     """Write the chapter on the fit of each example, the least likely first."""
     examples = subject.report.examples
-    order = sorted(range(len(examples)), key=lambda place: (-_oddness(examples[place]), examples[place].uid))
+    order = sorted(range(len(examples)), key=lambda place: (_log_likelihood(examples[place]), examples[place].uid))
     rows = [_example_row(examples[place], subject.names[place]) for place in order]
     heads = ("example", "unusual", "log-likelihood", "left-out error (cm)", "alignment (cm)", "duration (s)")
     listing: Content = table("The examples, the least likely first", heads, rows[:MOST_ROWS], numbers=range(2, 6))
@@ -168,16 +168,16 @@ def example_chapter(subject: ModelSubject, figures: Figures) -> Section:
     return Section("examples", "Unusual examples", (element("p", text), shown(figures, "likelihood"), listing))
 
 
-def _oddness(example: ExampleReport) -> float:
+def _log_likelihood(example: ExampleReport) -> float:
     held_out = example.held_out_log_likelihood
-    return -(example.log_likelihood if held_out is None else held_out)
+    return example.log_likelihood if held_out is None else held_out
 
 
 def _example_row(example: ExampleReport, name: str) -> list[Cell]:
     return [
         element("span", name, title=example.uid),
         element("b", "unusual", class_="bad") if example.outlier else "",
-        number(-_oddness(example), 1, look="bad" if example.outlier else ""),
+        number(_log_likelihood(example), 1, look="bad" if example.outlier else ""),
         number(example.left_out_error_cm, 1),
         number(CM_PER_M * float(np.sqrt(max(example.alignment_cost, 0.0))), 1),
         number(example.duration_s),

@@ -128,10 +128,11 @@ class ComparedSet:
             )
         if missing := self.missing_classes():
             yield (
-                f"The skeleton has no {', no '.join(missing)}; the other joints count more, which nobody has judged."
+                f"The skeleton has no {', no '.join(missing)}. The weights of these joints are spread over the other "
+                "joints; no judgements of people confirm such weights."
             )
         if self.distances.totals.max() > 1.0:
-            yield "Distances above 1 lie outside what people can answer; only their order has a meaning."
+            yield "Distances above 1 have no counterpart in people's judgements; only their order has a meaning."
         yield from self.metric.notes
 
 
@@ -162,7 +163,7 @@ def _claims_of(metric: MetricDocument) -> Iterator[str]:
         f"distances that differ by less than {2 * metric.judgement_error:.2f}."
     )
     if metric.origin == "published":
-        yield "Only natural walks were judged. For runs, turns, dances or single poses, nobody was asked."
+        yield "Only natural walks were judged. Runs, turns, dances and single poses were not judged."
 
 
 def _thinned(clip: MeasuredClip, step: int) -> MeasuredClip:

@@ -54,11 +54,11 @@ def draw_registration(
     recorded: NamedClip | None = None,
     rate_hz: float | None = None,
 ) -> Sketch:
-    """Draw a clip against itself with its period, and two clips with their registration curve (figure 1).
+    """Draw two motion maps (figure 1): of a clip and itself, with its period, and of two clips, with their curve.
 
-    `recorded` is the clip in which the period was found, by default the clip `one`. Without a period, only the second
-    map is drawn. `rate_hz` is the frame rate of period and curve, by default the frame rate of the clip `one`; the
-    clips may have lower frame rates.
+    `recorded` is the clip in which the period was found, by default the clip `one`. Without a period, only the map of
+    the two clips is drawn. `rate_hz` is the frame rate of period and curve, by default the frame rate of the clip
+    `one`; the clips may have lower frame rates.
     """
     rate = rate_hz or one.clip.rate_hz
     pairs = [(one, other)] if period is None else [(recorded or one, recorded or one), (one, other)]

@@ -83,7 +83,7 @@ def verdict(document: QualityDocument) -> str:
     said = f"{measure.title[0].upper()}{measure.title[1:]}: {_with_interval(total, measure.digits)} {measure.unit}."
     change = document.changes.get(MAIN_MEASURE)
     if document.reference is None or change is None:
-        return f"{said} Without a reference, nobody can say how much of this recorded motion has, too."
+        return f"{said} Without a reference, the report cannot say whether this is more than in recorded motion."
     other = document.reference.totals[MAIN_MEASURE]
     said += f" The reference has {_with_interval(other, measure.digits)} {measure.unit}"
     if change.low is None or change.high is None:

@@ -75,7 +75,7 @@ def test_nodes_that_list_no_samples_have_those_of_their_children(empty: str) -> 
         (["data", 3, 1], 1e308, "'data', row 3: a number is too large for single precision"),
         (["root", "indices"], [0, 1], "root: the field `indices` must contain the number of each of the 40"),
         (["root", "indices"], [*range(39), 40], "root: each number in the field `indices` must be from 0 to 39"),
-        (["root", "children", 0, "indices"], [], "root.0: the field `indices` must contain at least one sample"),
+        (["root", "children", 0, "indices"], [], "root.0: the field `indices` must list at least one sample"),
         (["root", "children", 0, "indices"], [0, 0.5], "root.0"),
         (["root", "children", 0, "children", 0, "children", 0, "indices"], None, "'indices' must be list"),
         (["root", "children", 1, "indices"], [0], "must together have all samples"),

@@ -68,7 +68,8 @@ def test_labels_that_overlap_become_one_annotation_each() -> None:
     assert segments(both) == {"walk left": [("left", 0, 3)], "walk right": [("right", 2, 4)]}
     many = {"semantic_annotation": {f"label {number}": [0, 1] for number in range(65)}}
     assert (
-        "only 64 labels may become one annotation each" in refusal({**CLIP, "walk_sections.json": many}, "walk.bson")[1]
+        "imported as one annotation each, for at most 64 labels, not"
+        in refusal({**CLIP, "walk_sections.json": many}, "walk.bson")[1]
     )
 
 

@@ -113,7 +113,10 @@ def test_extra_joints_bring_their_position_and_velocity_between_hips_and_traject
 def test_many_joints_are_warned_of() -> None:
     options = DatabaseOptions(extra_joints=("left_wrist", "right_wrist", "head"))
     notes = [note for note in built(clip_named("walk to the left"), options).notes if note.code == "many-joints"]
-    assert [str(note) for note in notes] == ["6 joints are matched; with more than 5 the trajectory hardly counts"]
+    assert [str(note) for note in notes] == [
+        "6 joints are matched; with more than 5, the trajectory hardly affects the search; match fewer joints, or "
+        "raise the weights of the trajectory"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from tests.support.tiers import is_soak
 
 from marey_motion.alignment.aligned import Recording
 from marey_motion.modelling.training import TrainedPrimitive
-from marey_motion.modelling.training_warnings import Warned
+from marey_motion.modelling.training_warnings import ModelWarning
 from marey_motion.modelling.verdict import verdict_of
 from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.models.figures import ModelSubject, draw_alignment_figures, draw_model_figures
@@ -85,7 +85,7 @@ def test_the_numbers_of_every_example_are_listed(page: Page, model: tuple[Traine
 
 def test_warnings_are_told_first_and_with_their_codes(model: tuple[TrainedPrimitive, ModelSubject]) -> None:
     trained, subject = model
-    warned = replace(trained, warnings=(Warned("odd-durations", "half of the samples <last> longer"),))
+    warned = replace(trained, warnings=(ModelWarning("odd-durations", "half of the samples <last> longer"),))
     text = is_sound(rendered(warned, subject)).text
     assert "Half of the samples <last> longer. odd-durations" in text
     assert "There are no warnings." in is_sound(rendered(replace(trained, warnings=()), subject)).text

@@ -242,7 +242,7 @@ def test_legs_alone_have_axes_too(body: Skeleton) -> None:
 
 def test_hips_alone_do_not_tell_where_up_is(body: Skeleton) -> None:
     mapping = JointMapping(None, {"left_hip": "LeftUpLeg", "right_hip": "RightUpLeg"}, 0.1, "manual")
-    with pytest.raises(MappingError, match="above or below"):
+    with pytest.raises(MappingError, match="two of three heights"):
         guess_axes(body, mapping)
 
 

@@ -397,7 +397,7 @@ def test_facets_are_read_and_belong_to_revisions_of_the_archive() -> None:
     assert checked(with_facets(facets)).facets() == facets
     assert checked(example().write()).facets() == {}
     stranger = digest_of(b"another revision")
-    with pytest.raises(BadArchive, match=f"^facets/.*no version in the archive contains {stranger}"):
+    with pytest.raises(BadArchive, match=f"^facets/.*no version in the archive contains the revision {stranger}"):
         checked(with_facets({stranger: {"usage": 0.5}}))
     wrong: list[Any] = [[], {content: 1}, {"no digest": {}}]
     wrong += [{content: values} for values in ({"usage": "much"}, {"usage": True}, {"No name": 1.0}, {"usage\n": 1.0})]

@@ -117,7 +117,10 @@ class _Check:
         strangers = sorted(self.archive.facets().keys() - self.known)
         for member in [one for one in self.archive.members if one.kind is MemberKind.FACETS]:
             if strangers:
-                raise BadArchive(f"{member.name}: no version in the archive contains {strangers[0]}")
+                raise BadArchive(
+                    f"{member.name}: no version in the archive contains the revision {strangers[0]}, whose facets the "
+                    "member gives; copy or export the archive again"
+                )
             self._mark(member)
 
     def _mark(self, member: ArchiveMember) -> None:

@@ -94,9 +94,9 @@ class ArchiveMember(NamedTuple):
 def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
     """Yield the header of each member of an archive, with the position of the member's bytes.
 
-    Only headers of the kind that `ArchiveWriter` writes are accepted: headers of other kinds, such as those for long
-    names, can make a reader use as much memory as the file has bytes. Raises `BadArchive` for other headers, and where
-    the file was cut off.
+    Only headers of the kind that `ArchiveWriter` writes are accepted. Other headers, such as those for long names, can
+    make a reader use as much memory as the file has bytes. Raises `BadArchive` for other headers, and if the file was
+    cut off.
     """
     size_bytes = file.seek(0, io.SEEK_END)
     position = 0
@@ -114,7 +114,7 @@ def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
         header.offset_data = position + tarfile.BLOCKSIZE
         position = header.offset_data + -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
         if position > size_bytes:
-            raise BadArchive(f"{header.name}: the archive was cut off")
+            raise BadArchive(f"{header.name}: the archive was cut off; copy or export it again")
         yield header
 
 
@@ -169,4 +169,7 @@ def stored_differences(member: ArchiveMember, data: bytes) -> list[ArrayDifferen
 def require_digest(member: ArchiveMember, digest: str) -> None:
     """Raise `BadArchive` if the digest of a member's content is not the digest in the member's name."""
     if digest != member.digest:
-        raise BadArchive(f"{member.name}: the content has the digest {digest}; it was changed or damaged")
+        raise BadArchive(
+            f"{member.name}: the content has the digest {digest}, so it was changed or damaged; copy or export the "
+            "archive again"
+        )

@@ -56,7 +56,7 @@ class EntryChange(NamedTuple):
     value: Value | None
     """The entry after the commit; None if the commit removed it."""
     unchanged: Mapping[str, str]
-    """Parts whose documents the archive lacks, each with the content digest of an earlier revision that has it."""
+    """Parts whose documents the archive lacks, each with the content digest of an earlier revision that has them."""
 
 
 class Archive:
@@ -81,7 +81,10 @@ class Archive:
             else:
                 self._add(ArchiveMember.of_name(header.name), header)
         if manifest is None:
-            raise BadArchive(f"the archive has no {MANIFEST}: the archive was not written completely, or was cut off")
+            raise BadArchive(
+                f"the archive has no {MANIFEST}: the archive was not written completely, or was cut off; copy or "
+                "export it again"
+            )
         return manifest
 
     def _add(self, member: ArchiveMember, header: tarfile.TarInfo) -> None:
@@ -123,7 +126,7 @@ class Archive:
             self._file.seek(position)
             piece = self._file.read(min(left, _PIECE_BYTES))
             if not piece:
-                raise BadArchive(f"{member.name}: the archive was cut off")
+                raise BadArchive(f"{member.name}: the archive was cut off; copy or export it again")
             hashed.update(piece)
             position, left = position + len(piece), left - len(piece)
             yield piece
@@ -158,7 +161,7 @@ class Archive:
 
     def _place(self, member: ArchiveMember) -> tuple[int, int]:
         if member not in self.members:
-            raise BadArchive(f"{member.name}: the archive has no such member")
+            raise BadArchive(f"{member.name}: the archive has no such member; copy or export it again")
         return self.members[member]
 
     def _bytes(self, name: str, position: int, size_bytes: int) -> bytes:
@@ -167,7 +170,7 @@ class Archive:
         self._file.seek(position)
         data = self._file.read(size_bytes)
         if len(data) < size_bytes:
-            raise BadArchive(f"{name}: the archive was cut off")
+            raise BadArchive(f"{name}: the archive was cut off; copy or export it again")
         return data
 
     # -- versions ------------------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ def build(store: ChunkStore, entries: Iterable[Entry]) -> str:
 
 
 class Splitter(Generic[T]):
-    """Splitter of a sequence of keys with their values into the chunks of one level of a tree."""
+    """Splitter that divides a sequence of keys with values into the chunks of one level of a tree."""
 
     def __init__(self, level: int) -> None:
         self._level = level

@@ -31,7 +31,7 @@ def change(store: ChunkStore, root: str, changes: Changes) -> str:
 
 
 class _Change:
-    """Change of one tree."""
+    """Change of the tree with the root digest `root`: rewrites the chunks with changed keys, level by level."""
 
     def __init__(self, writer: ChunkWriter, root: str) -> None:
         self._writer = writer
@@ -95,7 +95,7 @@ class _ChunksOfLevel:
         top = reader.one(root)
         self._root = Child(top.last_key, root, top.count)
         self._path: list[tuple[Branch, int]] = []
-        """Branches on the way from the root down to the present chunk, each with the index of the child on this way."""
+        """Branches on the way from the root down to the current chunk, each with the index of the child on this way."""
 
     def seek(self, key: str) -> None:
         """Go to the chunk in which `key` is or would be."""
@@ -107,7 +107,7 @@ class _ChunksOfLevel:
             (chunk,) = self._reader.below([chunk.children[place]], chunk.level - 1)
 
     def advance(self) -> None:
-        """Go to the next chunk. The present chunk must not be the last."""
+        """Go to the next chunk of the level. The current chunk must not be the last one."""
         while self._path[-1][1] == len(self._path[-1][0].children) - 1:
             self._path.pop()
         branch, place = self._path.pop()
@@ -119,7 +119,7 @@ class _ChunksOfLevel:
 
     @property
     def current(self) -> tuple[Child, Chunk, bool]:
-        """The reference to the present chunk, the chunk, and whether it is the last one of its level."""
+        """The reference to the current chunk, the chunk, and whether it is the last one of its level."""
         reference = self._path[-1][0].children[self._path[-1][1]] if self._path else self._root
         is_last = all(place == len(branch.children) - 1 for branch, place in self._path)
         return reference, self._reader.one(reference.digest), is_last

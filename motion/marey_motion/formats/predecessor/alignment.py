@@ -60,7 +60,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
 
 
 def alignment_of_document(document: Mapping[str, Any], file: str) -> PredecessorAlignment:
-    """Read an alignment from a decoded document, as `read_predecessor_alignment` does.
+    """Read the alignment of a clip from a decoded document of Marey's predecessor.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[
     Parameters
     ----------
     time_function : (N,) float64    source frame of each canonical frame
-    sections : sequence of (int, int)    canonical frames [start, end) of each
+    sections : sequence of (int, int)    canonical frames [start, end) of each section
 
     Returns
     -------

@@ -29,7 +29,7 @@ from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationFor
 
 SEMANTIC, KEYFRAMES = "semantic_annotation", "keyframes"
 MOST_LAYERS = 64
-"""Greatest number of annotations that one document may become."""
+"""Greatest number of annotations that are made from one document with overlapping labels: one for each label."""
 
 
 def read_predecessor_annotation(
@@ -73,14 +73,14 @@ def layer_of_document(
     end_index: EndIndex = DEFAULT_END_INDEX,
     labels: Sequence[str] | None = None,
 ) -> Layer:
-    """Read an annotation from a decoded document, as `read_predecessor_annotation` does.
+    """Read an annotation of a clip from a decoded document of Marey's predecessor, in any of its three forms.
 
     Parameters
     ----------
     document : mapping    the document
     file : str    name of the file, for messages
     frame_count : int    frames of the clip
-    end_index : str    "inclusive" or "exclusive"
+    end_index : str    "inclusive" if the last frame of a section is `end_idx`; "exclusive" if it is the frame before
     labels : sequence of str, optional    labels to read; all labels by default
 
     Returns
@@ -119,8 +119,8 @@ def layers_of_document(
     document : mapping    the document
     file : str    name of the file, for messages
     frame_count : int    frames of the clip
-    end_index : str, optional    "inclusive" or "exclusive"; by default, "exclusive" if the sections of a label overlap
-        or exceed the clip otherwise
+    end_index : str, optional    "inclusive" if the last frame of a section is `end_idx`; "exclusive" if it is the frame
+        before. By default, "inclusive" is tried first, and "exclusive" only if the document is not valid otherwise
 
     Returns
     -------
@@ -140,7 +140,11 @@ def layers_of_document(
     by_label = document.get(SEMANTIC) if isinstance(document.get(SEMANTIC), Mapping) else document.get(SECTIONS)
     assert refused is not None
     if isinstance(by_label, Mapping) and len(by_label) > MOST_LAYERS:
-        raise FormatLimit(f"{refused.message}; only {MOST_LAYERS} labels may become one annotation each", file=file)
+        raise FormatLimit(
+            f"{refused.message}; overlapping labels are imported as one annotation each, for at most {MOST_LAYERS} "
+            f"labels, not {len(by_label)}",
+            file=file,
+        )
     if isinstance(by_label, Mapping) and len(by_label) > 1:
         for meaning in tried:
             try:
@@ -179,8 +183,9 @@ def write_predecessor_annotation(
     Parameters
     ----------
     layer : Layer    segments and keyframes
-    form : str    "labels", "list" or "frames"
-    end_index : str    "inclusive" or "exclusive"
+    form : str    "labels": sections by label; "list": sections without labels; "frames": frame numbers by label
+    end_index : str    "inclusive" to write the last frame of a section as `end_idx`; "exclusive" to write the frame
+        after the last frame; without effect in the form "frames"
 
     Returns
     -------

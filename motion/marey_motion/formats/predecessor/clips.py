@@ -132,12 +132,12 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
 def write_predecessor_skeleton(
     skeleton: Skeleton, *, form: SkeletonForm = "database", encoding: Encoding = "json"
 ) -> bytes:
-    """Write a skeleton document of Marey's predecessor, in the form of its database or in the form of its files.
+    """Write a skeleton document of Marey's predecessor.
 
     Parameters
     ----------
     skeleton : Skeleton    J joints
-    form : str    "database" or "file"
+    form : str    "database": a list of joints, mirrored in x; "file": nested nodes
     encoding : str    "json", "bson" or "bson.bz2"
 
     Returns

@@ -66,7 +66,7 @@ def has_text(value: Any) -> bool:
     return False
 
 
-def tells_credential(text: str) -> bool:
+def contains_credential(text: str) -> bool:
     """Check whether a text contains a credential: `TOKEN=abc`, `--password abc`, `Bearer abc` or `//user:abc@host`.
 
     Parameters
@@ -79,7 +79,7 @@ def tells_credential(text: str) -> bool:
 
     Examples
     --------
-    >>> [tells_credential(text) for text in ("run --password hunter2", "run --max_token_length 512")]
+    >>> [contains_credential(text) for text in ("run --password hunter2", "run --max_token_length 512")]
     [True, False]
     """
     small = text.lower()
@@ -118,7 +118,7 @@ def _is_secret(words: Sequence[str]) -> bool:
 
 
 def _is_given(name: str, value: str) -> bool:
-    """Return whether a name and its value are a credential.
+    """Return whether a value is a credential, judged by the name to which it is assigned.
 
     A whole number counts only if the name ends with a word for a credential: `PASSWORD=12`, but not `TOKEN_COUNT=12`.
     """

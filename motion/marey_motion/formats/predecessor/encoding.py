@@ -16,7 +16,7 @@ _BZ2_MARK = b"BZh"
 
 
 def encode_document(document: dict[str, Any], encoding: Encoding) -> bytes:
-    """Encode a document.
+    """Encode a document of Marey's predecessor as JSON, BSON, or BSON compressed with bz2.
 
     Parameters
     ----------
@@ -51,12 +51,14 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
     """
     document = decode_content(data, file)
     if not isinstance(document, dict):
-        raise FormatError("the file contains no document", code="document-damaged", file=file)
+        raise FormatError(
+            "the file contains a list instead of a document with named fields", code="document-damaged", file=file
+        )
     return document
 
 
 def decode_content(data: bytes, file: str) -> dict[str, Any] | list[Any]:
-    """Decode a file like `decode_document`, but accept a JSON list as well as a document.
+    """Decode a document, or a list in JSON; nothing larger than `MOST_UNPACKED_BYTES` is unpacked.
 
     Parameters
     ----------
@@ -69,7 +71,7 @@ def decode_content(data: bytes, file: str) -> dict[str, Any] | list[Any]:
 
     Raises
     ------
-    FormatError    if the bytes are in none of the three encodings or contain neither
+    FormatError    if the bytes are in none of the three encodings, or contain neither a document nor a list
     """
     if data.startswith(_BZ2_MARK):
         data = _decompressed(data, file)
@@ -100,5 +102,5 @@ def _decompressed(data: bytes, file: str) -> bytes:
     if len(document) > MOST_UNPACKED_BYTES:
         raise FormatLimit(f"the document unpacks to more than {MOST_UNPACKED_BYTES} bytes", file=file)
     if not decompressor.eof:
-        raise FormatError("the bz2 data is cut off", code="file-truncated", file=file)
+        raise FormatError("the bz2 data is cut off; copy or export the file again", code="file-truncated", file=file)
     return document

@@ -88,7 +88,7 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
             if place in places:
                 raise FormatError(f"action {action}: two nodes are called {place[1]!r}; rename one", file=file)
             if len(places) == MOST_PRIMITIVES:
-                raise FormatError(f"the graph has more than {MOST_PRIMITIVES} nodes", file=file)
+                raise FormatError(f"the graph has more than {MOST_PRIMITIVES} nodes, which is the limit", file=file)
             places.add(place)
             listed[action, model_id] = node
             names[action, model_id] = place
@@ -148,9 +148,9 @@ def _transitions(
     if not isinstance(given, Mapping):
         raise FormatError(f"{'/'.join(place)}: 'transitions' must be an object", file=file)
     found = []
-    for key, told in given.items():
+    for key, target in given.items():
         action, _, model = key.rpartition(":")
-        wanted = told if isinstance(told, Mapping) else {}
+        wanted = target if isinstance(target, Mapping) else {}
         action = str(wanted.get("action_name", action))
         candidates = [(action, str(one)) for one in (wanted.get("model_id"), wanted.get("model_name"), model) if one]
         other = next((known[one] for one in candidates if one in known), None)

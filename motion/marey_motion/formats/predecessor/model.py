@@ -51,10 +51,10 @@ class PredecessorModel:
     Parameters
     ----------
     primitive : the model in Marey's units and conventions
-    layout : layout of the document
+    layout : layout of the document: "1", "2", "3" or "static"
     animated_joints : joints whose rotations are in the document; all other joints keep their rest rotation
-    time : time function of the document (see `time_functions`), with those of its components that the mixture covers;
-        None if the document has no time function, so that the model runs at constant speed
+    time : time function (time warp) of the document, limited to the components whose scores the mixture contains; None
+        if the document has no time function, so that the model runs at constant speed
     time_error_frames : largest difference between the time functions of `primitive` and of the document, in frames
     moved_keyframes : labels of keyframes that the document places after the last frame; in `primitive`, they are at
         the last frame
@@ -89,7 +89,7 @@ def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None 
 
 
 def model_of_document(document: Document, file: str, *, skeleton: Skeleton | None = None) -> PredecessorModel:
-    """Read a model from a decoded document, as `read_predecessor_model` does.
+    """Read a model of any layout from a decoded document of Marey's predecessor.
 
     Parameters
     ----------
@@ -309,7 +309,10 @@ def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDA
 
 
 def _time(parts: ModelParts, frames: int, file: str) -> PredecessorTime:
-    """Read the time function: the first channel of the time part; other channels are semantic annotations, not read."""
+    """Read the time function, which is the first channel of the time part.
+
+    The other channels are semantic annotations and are ignored.
+    """
     assert parts.time is not None
     basis, mean, vectors = _functions(parts.time, "time", file)
     if basis.frame_count != frames:

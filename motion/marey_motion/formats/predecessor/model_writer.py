@@ -30,10 +30,10 @@ def write_predecessor_model(
     time: PredecessorTime | None = None,
     encoding: Encoding = "json",
 ) -> bytes:
-    """Write a primitive.
+    """Write a motion primitive as a model document of Marey's predecessor.
 
-    A primitive without components gets one that changes nothing, because the predecessor's reader rejects a mixture of
-    no dimensions.
+    A primitive without components gets a component of zeros, because the predecessor's reader rejects a mixture with
+    zero dimensions.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from marey_motion.formats.predecessor.credentials import has_text, is_secret_list, is_secret_name, tells_credential
+from marey_motion.formats.predecessor.credentials import contains_credential, has_text, is_secret_list, is_secret_name
 from marey_motion.formats.texts import cut_text, plain_text
 from marey_schemas.documents.predecessor_records import HIDDEN, LONGEST_TEXT, MOST_SHOWN, FieldValue, RecordForm
 
@@ -119,13 +119,13 @@ def _secrets_of(value: Mapping[str, Any]) -> set[str]:
 
 
 def _is_secret(value: Any) -> bool:
-    """Return whether a value contains a credential: in a text, or in a list as a text or after its name."""
+    """Return whether a text contains a credential, or a list contains one, either in a text or after its name."""
     if isinstance(value, str):
-        return tells_credential(value)
+        return contains_credential(value)
     if not isinstance(value, list):
         return False
     return is_secret_list(value) or (
-        _is_row(value) and any(isinstance(one, str) and tells_credential(one) for one in value)
+        _is_row(value) and any(isinstance(one, str) and contains_credential(one) for one in value)
     )
 
 

@@ -94,11 +94,13 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
     for node in document["jointDescs"]:
         name = field_of(node, "name", str, file)
         if name in listed:
-            raise FormatError("jointDescs contains the joint twice", file=file, joint=name)
+            raise FormatError("jointDescs contains this joint twice; remove one entry", file=file, joint=name)
         listed[name] = node
         for child in text_list(node, "children", file):
             if child in parents:
-                raise FormatError("two joints list this joint as their child", file=file, joint=child)
+                raise FormatError(
+                    "two joints list this joint as their child; remove it from one of them", file=file, joint=child
+                )
             parents[child] = name
     unknown = next((child for child in parents if child not in listed), None)
     roots = [name for name in listed if name not in parents]
@@ -112,7 +114,7 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
         nodes.append((name, parents.get(name), listed[name]))
         waiting.extend(reversed(text_list(listed[name], "children", file)))
     if len(nodes) != len(listed):
-        raise FormatError("the joints are not a tree: some are not connected to the root", file=file)
+        raise FormatError("the joints are not a tree: some joints are not connected to the root", file=file)
     return nodes
 
 
@@ -126,7 +128,7 @@ def _nested_nodes(root: Document, file: str) -> list[tuple[str, str | None, Docu
         nodes.append((name, parent, node))
         children = node.get("children") or []
         if not isinstance(children, list):
-            raise FormatError("'children' is not a list", file=file, joint=name)
+            raise FormatError("field 'children' must be a list of nodes", file=file, joint=name)
         waiting.extend((child, name) for child in reversed(children))
     return nodes
 
@@ -140,7 +142,7 @@ def _source(nodes: list[tuple[str, str | None, Document]], mirrored: bool, file:
     for name, parent, node in nodes:
         offset = number_list(node, "offset", 3, file, name) * (MIRROR_VECTOR if mirrored else 1.0)
         if name in indices:
-            raise FormatError("two joints have this name", file=file, joint=name)
+            raise FormatError("two joints have this name; rename one of them", file=file, joint=name)
         if name not in inner:
             tips.append((indices[str(parent)], offset))
             continue

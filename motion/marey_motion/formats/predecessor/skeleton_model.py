@@ -1,9 +1,9 @@
 """Skeleton models of Marey's predecessor: standard joints, and anatomical axes of joints.
 
 A document is `{"joints": {standard joint: joint or null}, "cos_map": {joint: {"x": swing or null, "y": twist or null}},
-...}`, often inside `{"name", "model"}`. Its names of standard joints are those of Marey, and its axes are directions in
-the joint's local frame, too. Other members, such as limits of joints and shapes of feet, have no counterpart in Marey;
-they are stored unchanged.
+...}`, often inside `{"name", "model"}`. The names of the standard joints are the same as in Marey. An axis is a
+direction in the joint's local frame, as in Marey. Other members, such as joint limits and foot shapes, have no
+counterpart in Marey; they are stored unchanged.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ JOINTS, AXES = "joints", "cos_map"
 
 @dataclass(frozen=True)
 class PredecessorSkeletonModel:
-    """A skeleton model.
+    """A skeleton model of Marey's predecessor: standard joints of a skeleton, and anatomical axes of its joints.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def is_skeleton_model(document: Mapping[str, Any]) -> bool:
 
 
 def skeleton_model_of_document(document: Mapping[str, Any], skeleton: Skeleton, file: str) -> PredecessorSkeletonModel:
-    """Read a skeleton model.
+    """Read a skeleton model from a decoded document of Marey's predecessor.
 
     Parameters
     ----------

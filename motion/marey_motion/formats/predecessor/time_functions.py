@@ -83,6 +83,10 @@ def as_log_slopes(
     -------
     components : FunctionalComponents    Marey's form
     error_frames : float    largest difference between the two forms at these scores, in frames
+
+    Raises
+    ------
+    FormatError    if the time function decreases, or if its slope is too steep or too flat
     """
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
         wanted = time.time_functions(scores)
@@ -103,12 +107,11 @@ def as_log_slopes(
 
 
 def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variances: Floats) -> FunctionalComponents:
-    """Make components from the change of the coefficients for each unit of each score.
+    """Make functional components from their directions: the change of the spline coefficients per unit of each score.
 
-    The pseudo-inverse of these changes gives the projections, which compute scores from coefficients.
-
-    The variance that the components do not explain is unknown. Therefore, `energy` contains cumulative shares not of
-    the total variance, but of the variance that all components explain together.
+    The projections, which compute scores from coefficients, are the pseudo-inverse of the directions. The variance
+    that the components do not explain is unknown. Therefore, `energy` contains cumulative shares of the variance that
+    all components explain together, not of the total variance.
 
     Parameters
     ----------
@@ -178,8 +181,8 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
 def _written_count(primitive: MotionPrimitive) -> int:
     """Return the number of spline coefficients of a written time function: one for each canonical frame, if possible.
 
-    With fewer coefficients, such as the eight that the predecessor's training uses, its two forms and Marey's form
-    represent different functions, and a time function would be up to a tenth of a frame off.
+    The predecessor's training uses eight coefficients. With so few coefficients, the two forms of the predecessor and
+    the form of Marey represent different functions: a time function would differ by up to a tenth of a frame.
     """
     return max(DEGREE + 1, min(KNOTS_AT_MOST, primitive.frame_count))
 
@@ -187,8 +190,8 @@ def _written_count(primitive: MotionPrimitive) -> int:
 def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
     """Draw the temporal scores (m, k) of m latent vectors from the model, and compute their time functions (m, N).
 
-    The limits that keep a model's motions within its examples' range are not applied, because with them the time
-    functions would not be close to a function that is linear in the scores.
+    The limits that keep a model's motions within its examples' range are not applied, because they would make the time
+    functions less linear in the scores.
     """
     free = replace(primitive, duration_range_s=None, log_slope_range=None)
     latents = free.sample(DRAWN, SEED)

@@ -50,7 +50,7 @@ def read_predecessor_tree(data: bytes, file: str) -> SampleTree:
 
     Returns
     -------
-    SampleTree    the samples
+    SampleTree    the samples, grouped in the tree
 
     Raises
     ------
@@ -60,7 +60,7 @@ def read_predecessor_tree(data: bytes, file: str) -> SampleTree:
 
 
 def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
-    """Read a cluster tree from a decoded document, as `read_predecessor_tree` does.
+    """Read a cluster tree from a decoded document of Marey's predecessor.
 
     Parameters
     ----------
@@ -95,8 +95,8 @@ def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
         tree = SampleTree(samples[order].astype(np.float32), sizes, np.array(children, dtype=np.int32))
     except MotionError as error:
         raise FormatError(str(error), code="tree-invalid", file=file) from error
-    for number, (start, held) in enumerate(zip(tree.starts.tolist(), indices, strict=True)):
-        if not np.array_equal(np.sort(order[start : start + len(held)]), np.sort(held)):
+    for number, (start, members) in enumerate(zip(tree.starts.tolist(), indices, strict=True)):
+        if not np.array_equal(np.sort(order[start : start + len(members)]), np.sort(members)):
             message = f"node {number}, counted level by level, must contain the samples of its children and no others"
             raise FormatError(message, code="tree-invalid", file=file)
     return tree
@@ -108,7 +108,7 @@ def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, en
     Parameters
     ----------
     tree : SampleTree    the samples
-    spatial : int    number of spatial components of a latent vector; these are written as the features of a sample
+    spatial : int    number of spatial scores at the start of a latent vector; they are written as the sample's features
     branching : int    largest number of children of a node
     encoding : str    "json", "bson" or "bson.bz2"
 
@@ -150,11 +150,15 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
         if not isinstance(below, list):
             raise FormatError(f"{place}: the field `children` must be a list of nodes", file=file)
         if level > MOST_LEVELS:
-            raise FormatError(f"{place}: the tree has more than {MOST_LEVELS} levels below its root", file=file)
-        indices.append(_held(node, place, count, file) if node.get("indices") is not None or not below else None)
+            raise FormatError(
+                f"{place}: the tree has more than {MOST_LEVELS} levels below its root, which is the limit", file=file
+            )
+        indices.append(_indices_of(node, place, count, file) if node.get("indices") is not None or not below else None)
         children.append(len(below))
         if len(indices) + len(waiting) + len(below) > MOST_NODES:
-            raise FormatError(f"the tree has more than {MOST_NODES} nodes", code="format-limit", file=file)
+            raise FormatError(
+                f"the tree has more than {MOST_NODES} nodes, which is the limit", code="format-limit", file=file
+            )
         waiting.extend((child, f"{place}.{number}", level + 1) for number, child in enumerate(below))
     complete = _completed(indices, children)
     if len(np.unique(complete[0])) != count or len(complete[0]) != count:
@@ -164,14 +168,14 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
     return complete, children
 
 
-def _held(node: Node, place: str, count: int, file: str) -> Ints:
+def _indices_of(node: Node, place: str, count: int, file: str) -> Ints:
     """Read the samples of a node; `place` is its path from the root, `count` the number of samples in the document."""
-    held = number_array(field_of(node, "indices", list, file), file, f"{place}: indices")
-    if held.ndim != 1 or not len(held) or (held != np.floor(held)).any():
-        raise FormatError(f"{place}: the field `indices` must contain at least one sample", file=file)
-    if held.min() < 0 or held.max() >= count:
+    numbers = number_array(field_of(node, "indices", list, file), file, f"{place}: indices")
+    if numbers.ndim != 1 or not len(numbers) or (numbers != np.floor(numbers)).any():
+        raise FormatError(f"{place}: the field `indices` must list at least one sample, by whole numbers", file=file)
+    if numbers.min() < 0 or numbers.max() >= count:
         raise FormatError(f"{place}: each number in the field `indices` must be from 0 to {count - 1}", file=file)
-    return held.astype(np.int64)
+    return numbers.astype(np.int64)
 
 
 def _completed(indices: list[Ints | None], children: list[int]) -> list[Ints]:
@@ -182,9 +186,9 @@ def _completed(indices: list[Ints | None], children: list[int]) -> list[Ints]:
     firsts = _first_children(children)
     complete: list[Ints] = [np.zeros(0, np.int64)] * len(indices)
     for node in range(len(indices) - 1, -1, -1):
-        held = indices[node]
+        listed = indices[node]
         below = complete[firsts[node] : firsts[node] + children[node]]
-        complete[node] = np.concatenate(below) if held is None else held
+        complete[node] = np.concatenate(below) if listed is None else listed
     return complete
 
 

@@ -44,7 +44,7 @@ _STATES = {"start_states": "start", "end_states": "end", "idle_states": "idle", 
 _MOST_MEMBERS = 4 * MOST_PRIMITIVES
 # Methods whose members `zipfile` unpacks only up to the declared size.
 _BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-# All that a damaged or hostile archive raises; RuntimeError stands for encryption and for unknown compression, too.
+# Errors that a damaged or hostile archive can raise; encryption and unknown compression raise RuntimeError.
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile, zlib.error, struct.error, EOFError, IndexError, OSError, OverflowError, RuntimeError,
     ValueError,
@@ -214,7 +214,10 @@ def _whole_name(member: str) -> str:
 
 
 def _trees(members: Collection[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Map names of models, with their folders, to members with trees: those in JSON, and those of other encodings."""
+    """Return two mappings from model names, with their folders, to the members with their trees.
+
+    The first mapping contains the trees in JSON, the second one the trees in other encodings, which are not read.
+    """
     readable: dict[str, str] = {}
     pickled: dict[str, str] = {}
     for name in members:
@@ -296,7 +299,10 @@ class _Nodes:
         return {place: tuple(found) for place, found in follows.items()}, unknown
 
     def start(self) -> Place:
-        """Return the start node: that of the definition, or the first idle node of `walk`, as the predecessor does."""
+        """Return the start node of the definition or, without one, the first idle node of `walk`.
+
+        The predecessor does the same.
+        """
         given = self._definition.get("startNode")
         if given is None:
             idle = _list_of(self._meta.get("walk", {}), "idle_states", self._file)

@@ -1,4 +1,4 @@
-"""Check of searches by hand and foot positions of examples that were left out of the training of the model."""
+"""Check of searches: the targets are positions of hands and feet in examples that were left out of the training."""
 
 from __future__ import annotations
 

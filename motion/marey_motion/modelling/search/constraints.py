@@ -33,7 +33,7 @@ def tolerance_of(constraint: SearchConstraint) -> float:
 
     Parameters
     ----------
-    constraint : constraint    any kind
+    constraint : constraint    a constraint of any kind
 
     Returns
     -------

@@ -66,7 +66,7 @@ def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
 
     Parameters
     ----------
-    steps : sequence of Step    the steps
+    steps : sequence of Step    the steps, for their models
     sequel : Sequel    latent vectors and placements found for them
 
     Returns

@@ -214,7 +214,10 @@ def errors(chains, clocks, rows, placement, latents, out):
 
 @compiled
 def costs(prices, errors, out):
-    """Fill `out` (n,) with sums of errors (n, m) times `prices` (m,), weights of constraints divided by tolerances."""
+    """Fill `out` (n,) with the costs of n latent vectors: sums of `errors` (n, m) times `prices` (m,) over constraints.
+
+    The price of a constraint is its weight divided by its tolerance.
+    """
     for n in range(out.shape[0]):
         total = 0.0
         for row in range(prices.shape[0]):

@@ -26,7 +26,7 @@ class FoundSamples:
     ----------
     samples : (t,) indices of the samples in the tree; -1 for latent vectors from a further pass, which are not samples
     latents : (t, L) latent vectors
-    costs : (t,) costs as in `Objective.costs`
+    costs : (t,) sums of weight · error / tolerance over the constraints
     evaluations : number of motions that were evaluated
     """
 
@@ -77,7 +77,7 @@ def search_closely(
 
     Returns
     -------
-    FoundSamples    the best sample
+    FoundSamples    the best latent vector
     """
     best = search_tree(objective, tree, candidates=candidates)
     middle = tree.means[0]

@@ -18,10 +18,10 @@ from marey_motion.modelling.search.optimise import DEFAULT_REFINING, Refined, re
 from marey_motion.modelling.search.samples import FoundSamples, search_closely
 from marey_motion.modelling.search.steps import (
     DEFAULT_TRANSITIONS,
-    CarriedOn,
     Measured,
     SeveralSteps,
     Step,
+    StepStart,
 )
 from marey_motion.modelling.search.tree import SampleTree
 from marey_schemas.options.searching import CANDIDATES, PASSES, RefineOptions, TransitionOptions
@@ -65,10 +65,11 @@ def search_steps(
 
     Parameters
     ----------
-    steps : sequence of Step    the steps
+    steps : sequence of Step    the steps with their constraints
     trees : sequence of SampleTree    samples of each step's primitive
     start : Placement    position and heading in the world at which the first step begins
-    candidates, passes : int    see `search_closely`
+    candidates : int    nodes of a tree that are followed from each level to the next
+    passes : int    searches of each tree; every search after the first one moves the samples closer to the best one
     refining : RefineOptions or None    None to keep the samples that were found
     transitions : TransitionOptions    continuity between steps
 
@@ -84,7 +85,7 @@ def search_steps(
     problem = SeveralSteps.of(steps, start, transitions)
     searched: list[FoundSamples] = []
     for step, tree in zip(steps, trees, strict=True):
-        begun = problem.carried_on([one.latents[0] for one in searched])
+        begun = problem.start_of_next([one.latents[0] for one in searched])
         searched.append(_search_step(step, tree, begun, candidates, passes, transitions))
     stacked = np.concatenate([one.latents[0] for one in searched])
     measured = sampled = problem.measure(stacked)
@@ -105,7 +106,7 @@ def _require_finite(*found: Floats) -> None:
 
 
 def _search_step(
-    step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, passes: int, transitions: TransitionOptions
+    step: Step, tree: SampleTree, begun: StepStart, candidates: int, passes: int, transitions: TransitionOptions
 ) -> FoundSamples:
     """Find the best motion in the tree of a step that starts at `begun`, where the previous step ended."""
     _require_finite(*begun.joints.values())

@@ -47,7 +47,7 @@ class Step:
 DEFAULT_TRANSITIONS = TransitionOptions()
 
 
-class CarriedOn(NamedTuple):
+class StepStart(NamedTuple):
     """Start of a step that continues the previous step.
 
     The fields are the placement at which the step begins in the world, and the positions of the transition joints at
@@ -90,7 +90,7 @@ class _Link(NamedTuple):
     first: int
 
 
-class _Walked(NamedTuple):
+class _PlacedStep(NamedTuple):
     """A step placed in the world after the steps before it; W is the total length of the latent vectors of all steps.
 
     Parameters
@@ -131,7 +131,7 @@ class SeveralSteps:
 
         Parameters
         ----------
-        steps : sequence of Step    the steps
+        steps : sequence of Step    the steps with their constraints
         start : Placement    position and heading in the world at which the first step begins
         transitions : TransitionOptions    continuity between steps
 
@@ -188,13 +188,13 @@ class SeveralSteps:
         residuals : (r,) float64    errors in multiples of their tolerances
         derivatives : (r, W) float64    of the residuals with respect to the latent vectors
         """
-        walked = list(self._walk(stacked, len(self.links)))
-        residuals = [part for one in walked for part in (one.found.residuals, self._scale * one.jumps.ravel())]
-        jumps = [self._scale * one.jump_slopes.reshape(one.jumps.size, len(stacked)) for one in walked]
-        slopes = [part for one, jump in zip(walked, jumps, strict=True) for part in (one.found.slopes, jump)]
+        placed = list(self._place_steps(stacked, len(self.links)))
+        residuals = [part for one in placed for part in (one.found.residuals, self._scale * one.jumps.ravel())]
+        jumps = [self._scale * one.jump_slopes.reshape(one.jumps.size, len(stacked)) for one in placed]
+        slopes = [part for one, jump in zip(placed, jumps, strict=True) for part in (one.found.slopes, jump)]
         return np.concatenate(residuals), np.concatenate(slopes)
 
-    def carried_on(self, latents: Sequence[Floats]) -> CarriedOn:
+    def start_of_next(self, latents: Sequence[Floats]) -> StepStart:
         """Compute the start of a step that continues the motion of given steps.
 
         Parameters
@@ -203,14 +203,14 @@ class SeveralSteps:
 
         Returns
         -------
-        CarriedOn    position and heading at the end of the last given step, and its transition joints
+        StepStart    position and heading at the end of the last given step, and its transition joints
         """
         if not latents:
-            return CarriedOn(self.start, {})
-        *_, last = self._walk(np.concatenate(latents), len(latents))
+            return StepStart(self.start, {})
+        *_, last = self._place_steps(np.concatenate(latents), len(latents))
         ended = last.found.points[2 + len(self.joints) :]
         placement = Placement(_heading(ended[1]), float(ended[0, 0]), float(ended[0, 2]))
-        return CarriedOn(placement, dict(zip(self.joints, ended[2:], strict=False)))
+        return StepStart(placement, dict(zip(self.joints, ended[2:], strict=False)))
 
     def measure(self, stacked: Floats) -> Measured:
         """Compute placements, errors and jumps.
@@ -223,19 +223,19 @@ class SeveralSteps:
         -------
         Measured    metres, radians and seconds
         """
-        walked = list(self._walk(stacked, len(self.links)))
-        placements = tuple(Placement(*one.placement.tolist()) for one in walked)
+        placed = list(self._place_steps(stacked, len(self.links)))
+        placements = tuple(Placement(*one.placement.tolist()) for one in placed)
         errors = tuple(
             replace(link.objective, placement=placement).errors(latent[None])[0]
             for link, placement, latent in zip(self.links, placements, self.parts(stacked), strict=True)
         )
-        return Measured(placements, errors, tuple(np.linalg.norm(one.jumps, axis=1) for one in walked[1:]))
+        return Measured(placements, errors, tuple(np.linalg.norm(one.jumps, axis=1) for one in placed[1:]))
 
     @cached_property
     def _scale(self) -> float:
         return float(np.sqrt(self.transitions.weight) / self.transitions.tolerance_m)
 
-    def _walk(self, stacked: Floats, count: int) -> Iterator[_Walked]:
+    def _place_steps(self, stacked: Floats, count: int) -> Iterator[_PlacedStep]:
         """Place the first `count` steps, each at the end of the one before; `stacked` (W,) are all latent vectors."""
         ends = 2 + len(self.joints)
         jumping = [0, *range(2, ends)]
@@ -246,11 +246,11 @@ class SeveralSteps:
                 placement, moved = _carry_on(before.points[ends:], before.point_slopes[ends:], link, stacked)
             found = link.objective.linearise(stacked, link.first, placement, moved)
             if before is None:
-                yield _Walked(placement, found, np.zeros((0, 3)), np.zeros((0, 3, len(stacked))))
+                yield _PlacedStep(placement, found, np.zeros((0, 3)), np.zeros((0, 3, len(stacked))))
             else:
                 ended = [ends + place for place in jumping]
                 jumps = found.points[jumping] - before.points[ended]
-                yield _Walked(placement, found, jumps, found.point_slopes[jumping] - before.point_slopes[ended])
+                yield _PlacedStep(placement, found, jumps, found.point_slopes[jumping] - before.point_slopes[ended])
             before = found
 
 
@@ -279,10 +279,10 @@ def _link(step: Step, ends: Sequence[Tracked], first: int) -> _Link:
 def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> tuple[Floats, Floats]:
     """Place a step so that it begins where the previous step ended.
 
-    Row 0 of `points` (2 or more, 3) is the position of the pelvis at the end of the previous step, and row 1 the axis
-    of the body at that time, from right to left. `slopes` (2 or more, 3, W) are the derivatives of the rows with
-    respect to the latent vectors `stacked` (W,) of all steps. Returns the placement (3,) of the step, as heading, x and
-    z, and its derivatives (3, W).
+    `points` (2 or more, 3) describes the end of the previous step: row 0 is the position of the pelvis, and row 1 the
+    axis of the body from right to left. `slopes` (2 or more, 3, W) are the derivatives of the rows with respect to the
+    latent vectors `stacked` (W,) of all steps. Returns the placement (3,) of the step, as heading, x and z, and its
+    derivatives (3, W).
     """
     width = len(stacked)
     begun, begun_slopes = np.empty((2, 3)), np.empty((2, 3, width))
@@ -303,7 +303,7 @@ def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> t
 
 
 def _heading(across: Floats) -> float:
-    """Compute the heading of a body from its axis from right to left."""
+    """Compute the heading of a body, in radians, from the axis (3,) of the body from right to left."""
     return float(np.arctan2(-across[2], across[0]))
 
 

@@ -125,7 +125,7 @@ def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
     if missing:
         raise MappingError(
             f"a constraint on the heading needs {', '.join(missing)}, which the joint mapping of "
-            "the skeleton does not contain"
+            "the skeleton does not contain; add them to the mapping"
         )
     lefts, rights = (tuple(standard_joints[name] for name in side) for side in (LEFTS, RIGHTS))
     return Tracked(frame, lefts, rights)

@@ -124,7 +124,7 @@ def build_tree(
     ----------
     primitive : MotionPrimitive    the model
     seed : int    the same seed gives the same tree
-    options : TreeOptions    options
+    options : TreeOptions    number of samples, and shape of the tree
     end_effectors : sequence of int    joint indices; used if samples are clustered by the positions of end effectors
 
     Returns
@@ -167,7 +167,7 @@ def _features(
     if not end_effectors:
         raise MotionError(
             "the tree is made from the positions of hands, feet and head, but the joint mapping of the skeleton "
-            "contains none of them",
+            "contains none of them; add them to the mapping",
             where="features",
         )
     frames = feature_frames(primitive)

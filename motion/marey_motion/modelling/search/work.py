@@ -39,7 +39,7 @@ def drawing_work(
     Parameters
     ----------
     primitive : MotionPrimitive    the model
-    options : TreeOptions    options
+    options : TreeOptions    number of samples and shape of the tree
     end_effectors : sequence of int    joint indices
 
     Returns
@@ -65,7 +65,7 @@ def searching_work(
 
     Parameters
     ----------
-    problem : SeveralSteps    the steps
+    problem : SeveralSteps    the steps with their constraints
     trees : sequence of SampleTree    samples of each step's primitive
     candidates : int    number of nodes that are followed from each level of a tree to the next
     passes : int    number of searches of each tree
@@ -96,7 +96,7 @@ def finishing_work(steps: Sequence[Step], found: FoundMotion) -> float:
 
     Parameters
     ----------
-    steps : sequence of Step    the steps
+    steps : sequence of Step    the steps with their constraints
     found : FoundMotion    the motion found for them
 
     Returns

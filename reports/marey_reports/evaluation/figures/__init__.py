@@ -60,7 +60,7 @@ class FigureKind(NamedTuple):
 
 
 PUBLISHED: tuple[Family, ...] = ("circle", "switching")
-"""Families of the paper."""
+"""Families of trials in Abichequer Sangalli et al. (2022)."""
 
 FIGURES = {
     "points": FigureKind("1", "Speeds and turn rates of every clip", "none", draw_points),
@@ -80,10 +80,13 @@ FIGURES = {
 """Every figure by its name."""
 
 COVERAGE_FIGURES = ("density", "points", "holes", "directions")
+"""Names of the figures in the chapter on coverage."""
 SCENARIO_FIGURES = ("scenario-circle", "scenario-switching", "scenario-course")
+"""Names of the figures that show a trial from above."""
 TRIAL_FIGURES = ("transition-cost", "errors")
+"""Names of the figures of costs and errors in a trial."""
 USE_FIGURES = ("usage", "frame-use", "clip-graph")
-"""Names of the figures of each chapter, in reports of one or two evaluations."""
+"""Names of the figures in the chapter on the most used clips."""
 SHARED_FIGURES = ("offsets", "density")
 """Figures that can show more than two results, as small multiples on one scale."""
 

@@ -32,7 +32,7 @@ TRANSITIONS = "Transitions"
 
 
 class _Use(NamedTuple):
-    """Use of the clips of a subject: ticks of display and name of each clip by uid, and total number of transitions."""
+    """Use of clips in one evaluation: for each uid, ticks of display and name; and the total number of transitions."""
 
     ticks: dict[str, int]
     names: dict[str, str]

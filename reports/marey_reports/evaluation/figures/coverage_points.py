@@ -48,7 +48,7 @@ ACROSS = 5  # small panels side by side
 
 
 Limits = tuple[tuple[float, float], tuple[float, float]]
-"""Ends of the horizontal and of the vertical axis."""
+"""Ends of the horizontal axis, in degrees per second, and of the vertical axis, in metres per second."""
 
 
 class _Points(NamedTuple):
@@ -102,7 +102,10 @@ def _draw_together(subjects: Sequence[Subject], chosen: Sequence[_Points], limit
 
 
 def _draw_small(subjects: Sequence[Subject], chosen: Sequence[_Points], limits: Limits) -> Figure:
-    """Draw a small panel for each clip, its points before those of all clips, and one for the other clips."""
+    """Draw a small panel for each of the clips with most data, and one panel for all other clips.
+
+    The points of a panel are drawn in colour on top of the grey points of all clips.
+    """
     named = _named(subjects, chosen)
     rest = max(_other_clips(subject, points) for subject, points in zip(subjects, chosen, strict=True))
     labels = labels_of([name for _, name in named], SMALL_NAME)
@@ -131,7 +134,10 @@ def _draw_small(subjects: Sequence[Subject], chosen: Sequence[_Points], limits: 
 
 
 def _draw_tile(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Points], uid: str | None) -> None:
-    """Draw the windows of one clip in colour, or those of the unnamed clips if `uid` is None, before all windows."""
+    """Draw windows in colour, on top of some windows of all clips in grey.
+
+    The coloured windows are those of the clip `uid` or, if `uid` is None, those of all clips without their own panel.
+    """
     for number, (subject, points) in enumerate(zip(subjects, chosen, strict=True)):
         coverage = subject.result.coverage
         step = max(1, -(-len(points.windows) // BEHIND))

@@ -182,7 +182,10 @@ def _least_ranges(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float
 
 
 def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell: tuple[float, float]) -> Floats:
-    """Compute the smoothed seconds of data in an area of size `cell` around each point of the map, (FINE, FINE)."""
+    """Compute the smoothed seconds of data (FINE, FINE) in the area of size `cell` around each point of the map.
+
+    The size `cell` is given along both axes of `plane`, in the units of the axes.
+    """
     from scipy.ndimage import gaussian_filter
 
     coverage = subject.result.coverage
@@ -194,7 +197,7 @@ def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell
 
 
 def _norm(ceiling: float) -> Any:
-    """Make a square-root colour scale, on which small amounts of data can be distinguished from none."""
+    """Make a square-root colour scale from 0 to `ceiling`; it distinguishes small amounts of data from none."""
     from matplotlib.colors import PowerNorm
 
     return PowerNorm(0.5, vmin=0.0, vmax=ceiling)

@@ -43,7 +43,7 @@ FAMILY_TITLES: dict[Family, str] = {
 
 
 class _Field(NamedTuple):
-    """Mean offset of the trials of one family on their grid; NaN where there is no trial."""
+    """Mean offset in each trial of one family, by speed (rows) and turn rate (columns); NaN where there is no trial."""
 
     turn_rates_deg_s: Floats
     speeds_m_s: Floats
@@ -58,7 +58,11 @@ def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: Figu
     families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
     if not families:
         wanted = ", ".join(FAMILY_TITLES)
-        raise MotionError(f"the figure needs trials on a grid of speeds and turn rates: {wanted}", code="unknown-trial")
+        raise MotionError(
+            f"the figure shows trials of the families {wanted}, but the evaluation has none of them; evaluate with at "
+            "least one of these families",
+            code="unknown-trial",
+        )
     fields = [[_field(subject, family) for subject in subjects] for family in families]
     levels = nice_levels(max(_largest(field) for row in fields for field in row))
     if len(subjects) == 1:

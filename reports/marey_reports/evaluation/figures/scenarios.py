@@ -72,7 +72,10 @@ def _followed(subject: Subject, trial: Trial) -> Floats | None:
 
 
 def _sections(trial: Trial, ticks: int, rate_hz: float) -> list[tuple[int, int, float]]:
-    """Return the first tick, the end tick and the speed of each section; the first section is the approach."""
+    """Return, for each section, the first tick, the tick after the last, and the speed in metres per second.
+
+    The first section is the approach.
+    """
     bounds = [0.0, trial.approach_s]
     end_s = ticks / rate_hz
     if (every_s := trial.changes_every_s) is not None:
@@ -140,7 +143,10 @@ def _section_table(trial: Trial, sections: Sequence[tuple[int, int, float]], rat
 
 
 def _turn_rate(trial: Trial, number: int, turn_rate: float) -> float:
-    """Return the turn rate of a section; section 0 is the approach."""
+    """Return the turn rate of section `number`; section 0 is the approach.
+
+    `turn_rate` is the turn rate of the trial; the result has the same unit.
+    """
     if number == 0 or (trial.family == "stopping" and number % 2 == 0):
         return 0.0
     return -turn_rate if trial.family == "eights" and number % 2 == 0 else turn_rate

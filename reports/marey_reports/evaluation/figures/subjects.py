@@ -25,7 +25,8 @@ class FigureOptions:
 
     Parameters
     ----------
-    negate_errors : draw errors as desired minus simulated, as in figure 8 of the paper, not simulated minus desired
+    negate_errors : draw errors as desired minus simulated, as figure 8 of Abichequer Sangalli et al. (2022), instead of
+        simulated minus desired
     logarithmic : whether the sizes of dots and the lengths of bars have a logarithmic scale
     most_clips : number of clips that are drawn one by one; all other clips are summed up
     """
@@ -108,7 +109,8 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
         raise MotionError(f"the evaluation has no trial {name!r}", code="unknown-trial")
     if len(subject.result.records) != len(names):
         raise MotionError(
-            "this figure needs the records of all trials, but the evaluation does not contain them",
+            "this figure needs the records of all trials, but they were not read with the evaluation; read its part "
+            "`records`, too",
             code="records-missing",
             where=name,
         )
@@ -116,11 +118,11 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
 
 
 def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequence[Family]) -> Trial:
-    """Choose the trial that a figure shows; every evaluation in the figure (subject) must have this trial.
+    """Choose the trial that a figure shows, among the trials that all `subjects` have.
 
-    If `name` is given, the trial must have this name. `families` are kinds of trials in the order of preference: the
-    first family with a possible trial is used. Of several possible trials in this family, the one in which the first
-    subject deviates most from the desired motion is chosen. Raises `MotionError` if no trial is possible.
+    `families` are kinds of trials in the order of preference: the first family with a possible trial is used. If `name`
+    is given, only the trial with this name is possible. Of several possible trials, the worst one is chosen: the trial
+    with the largest error relative to its limit, in the first subject. Raises `MotionError` if no trial is possible.
     """
     known = [{each.trial.name for each in subject.result.trials} for subject in subjects]
     shared = [each for each in subjects[0].result.trials if all(each.trial.name in names for names in known)]

@@ -17,11 +17,11 @@ CELL_IN = (1.2, 1.3)
 
 
 def draw_mean(subject: ModelSubject) -> Sketch:
-    """Draw the mean motion."""
+    """Draw the mean motion as a strip: the body at several moments of canonical time, and the path of the root."""
     frames, moments = subject.moments()
     points = subject.points(subject.mean_poses[frames])
     duration_s = float(subject.primitive.durations_s(np.zeros((1, subject.primitive.dimensions)))[0])
-    row = StripRow("mean", f"{duration_s:.2f} s", points[None], _ways(subject, subject.mean_poses[None]))
+    row = StripRow("mean", f"{duration_s:.2f} s", points[None], _paths(subject, subject.mean_poses[None]))
     figure = draw_strips(subject.body, [row], moments, subject.seen_from_rad, cell_in=(CELL_IN[0], 1.9))
     caption = (
         f"The mean motion of the model: {duration_s:.2f} s, at {len(frames)} moments of canonical time, seen from the "
@@ -31,13 +31,16 @@ def draw_mean(subject: ModelSubject) -> Sketch:
 
 
 def draw_component(subject: ModelSubject, component: int) -> Sketch:
-    """Draw one spatial component, with the mean motion in grey behind every figure."""
+    """Draw the effect of a spatial component as five strips, with the mean motion in grey behind every figure.
+
+    The motions are two and one standard deviations below the mean, the mean, and one and two above it.
+    """
     frames, moments = subject.moments()
     swept = sweep(subject, component)
     points = subject.points(swept[:, frames])
     rows = [
         StripRow(
-            written(deviation), "", points[[place]], _ways(subject, swept[[place]]), points[2] if deviation else None
+            written(deviation), "", points[[place]], _paths(subject, swept[[place]]), points[2] if deviation else None
         )
         for place, deviation in enumerate(DEVIATIONS)
     ]
@@ -55,7 +58,7 @@ def draw_component(subject: ModelSubject, component: int) -> Sketch:
 
 
 def sweep(subject: ModelSubject, component: int) -> Floats:
-    """Compute the poses (5, N, 3 + 4·J) of five motions along a spatial component."""
+    """Compute the poses (5, N, 3 + 4·J) of the motions at -2, -1, 0, 1 and 2 standard deviations of a component."""
     primitive = subject.primitive
     latents = np.zeros((len(DEVIATIONS), primitive.dimensions))
     latents[:, component] = np.array(DEVIATIONS) * np.sqrt(primitive.spatial.variances[component])
@@ -78,5 +81,5 @@ def most_moved(subject: ModelSubject, points: Floats) -> tuple[str, float]:
     return joints[joint], 100.0 * float(apart[joint])
 
 
-def _ways(subject: ModelSubject, poses: Floats) -> Any:
+def _paths(subject: ModelSubject, poses: Floats) -> Any:
     return subject.points(poses)[:, :, subject.body.pelvis]

@@ -56,7 +56,8 @@ def draw_latent_space(subject: ModelSubject) -> Sketch | None:
     odd = [example.name for example in subject.report.examples if example.outlier]
     caption = (
         f"The examples and {SCATTERED_SAMPLES} samples in the latent space of the model; samples are drawn from "
-        f"{counted(components, 'normal distribution')} (outlines at two standard deviations). {_odd_ones(len(odd))}"
+        f"{counted(components, 'normal distribution')} (outlines at two standard deviations). "
+        f"{_sentence_about_outliers(len(odd))}"
     )
     tables: Tables = {
         "examples": {
@@ -71,7 +72,7 @@ def draw_latent_space(subject: ModelSubject) -> Sketch | None:
     return Sketch(figure, tables, caption)
 
 
-def _odd_ones(count: int) -> str:
+def _sentence_about_outliers(count: int) -> str:
     if not count:
         return "No example is unusual."
     return f"Crosses mark {counted(count, 'unusual example')}."

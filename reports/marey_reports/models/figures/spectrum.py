@@ -169,8 +169,8 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
     tables: Tables = {"candidates": {name: [getattr(each, name) for each in candidates] for name in columns}}
     caption = (
         "Mixtures that were tried, by their number of normal distributions and the kind of their covariances; the "
-        f"model uses {counted(chosen, 'normal distribution')} ({covariance} covariance). Of mixtures that left-out "
-        "takes do not separate, the simplest is used, and none in which a distribution has fewer than 5 examples. BIC "
-        "weighs the fit against the number of parameters."
+        f"model uses {counted(chosen, 'normal distribution')} ({covariance} covariance). If mixtures fit left-out "
+        "takes equally well, the simplest is used. Mixtures in which a distribution has fewer than 5 examples are not "
+        "used. BIC weighs the fit against the number of parameters."
     )
     return Sketch(figure, tables, caption)

@@ -69,7 +69,10 @@ def draw_time_components(subject: ModelSubject) -> Sketch | None:
 
 
 def sweep_time(subject: ModelSubject, component: int) -> Floats:
-    """Compute the elapsed seconds (5, N) at each canonical frame of five motions along a time component."""
+    """Compute the elapsed seconds (5, N) at each canonical frame of five motions.
+
+    The motions are at -2, -1, 0, 1 and 2 standard deviations of the time component.
+    """
     primitive = subject.primitive
     latents = np.zeros((len(DEVIATIONS), primitive.dimensions))
     deviation = primitive.temporal_weight * np.sqrt(primitive.temporal.variances[component])
