@@ -116,7 +116,7 @@ def draw_body(
         _add(axes, PathPatch(lines, edgecolor=colour, lw=look.width, alpha=look.alpha, **options), frame)
     if shapes.head is not None:
         (outer, inner), share = shapes.head
-        centre = share * seen[inner, :2] + (1.0 - share) * seen[outer, :2]
+        centre = share * seen[outer, :2] + (1.0 - share) * seen[inner, :2]
         fill = PAPER if look.rim else "none"
         circle = Circle(tuple(centre), shapes.head_m * stage.scale, facecolor=fill, edgecolor=look.colour or INK)
         circle.set(linewidth=0.75 * look.width, alpha=look.alpha)

@@ -66,6 +66,22 @@ def test_each_cell_has_a_body_with_a_left_a_right_and_a_middle(walk: tuple[Skele
     assert not cut_off(figure)
 
 
+def test_the_circle_of_the_head_is_at_the_head_joint_or_half_way_to_its_tip(walk: tuple[Skeleton, Floats]) -> None:
+    skeleton, points = walk
+    head = skeleton.index_of("Head")
+    tipless = replace(skeleton, end_sites=()), points[:, : skeleton.joint_count]
+    assert (present(body_of(skeleton).head)[1], present(body_of(tipless[0]).head)[1]) == (0.5, 1.0)
+    assert body_of(tipless[0]).bones[present(body_of(tipless[0]).head)[0], 0] == head
+    for one, above in ((walk, True), (tipless, False)):
+        figure = strip(one)
+        circles = [patch for patch in figure.axes[0].get_children() if isinstance(patch, Circle)]
+        for circle, middle in zip(circles, coloured(figure, INK), strict=True):
+            vertices = points_of(middle)
+            top = vertices[vertices[:, 1].argmax()]  # the head joint: the tip's bone is not drawn
+            rise = np.asarray(circle.center) - top
+            assert rise[1] > 0.01 if above else np.allclose(rise, 0.0)
+
+
 def test_seen_from_ahead_the_left_side_is_on_the_right(walk: tuple[Skeleton, Floats]) -> None:
     figure = strip(walk)
     left, right = (np.mean([points_of(patch)[:, 0].mean() for patch in coloured(figure, colour)])
