@@ -86,7 +86,7 @@ def work(
 def main() -> None:
     """Run the command line of `python -m marey_worker`, with which launchers start workers."""
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
-    parser.add_argument("--server", help="address of the server; default: from MAREY_SERVER or the stored login")
+    parser.add_argument("--server", help="server address; default: MAREY_SERVER, the stored login, or this machine")
     parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time; default: 1")
     parser.add_argument(
         "--kind", action="append", default=[], help="run only jobs of this kind; may be repeated; default: all kinds"
@@ -101,7 +101,7 @@ def main() -> None:
     )
     parser.add_argument(
         "--token-file", type=Path,
-        help="file that contains a token with the scope `work`; default: MAREY_TOKEN or the stored login",
+        help="file with a token of the scope `work`; default: MAREY_TOKEN, the stored login, or a local server's token",
     )  # fmt: skip
     parser.add_argument(
         "--attached", action="store_true",

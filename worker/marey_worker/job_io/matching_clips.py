@@ -148,8 +148,9 @@ def build_set(
 ) -> MatchingDatabase:
     """Read the clips of a set, and return their matching database.
 
-    Without a `normaliser`, one is computed from the clips. Raises `JobRefused` if the clips have several skeletons or a
-    trim is outside its clip. Raises `MotionError` if the clips cannot be used for motion matching.
+    Without a `normaliser`, one is computed from the clips. Raises `JobRefused` if the clips have several skeletons, if
+    `wanted.rig` is another skeleton, or if a trim is outside its clip. Raises `MotionError` if the clips cannot be used
+    for motion matching.
     """
     motions = list(read_motions(context, wanted.clips))
     mapped = read_mapped(context, common_rig(context, wanted, [skeleton_of(motion) for _, motion in motions]))

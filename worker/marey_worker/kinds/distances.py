@@ -164,7 +164,7 @@ def _prepare(
     motions: Moving,
     refusals: Refusals,
 ) -> tuple[Prepared, dict[int, dict[str, str]]]:
-    """Measure the clips to compare; if the parameters demand it, also cut one cycle out of each clip.
+    """Measure the clips to compare; if `params.cycles` is "cut", cut one cycle out of each clip that is no loop.
 
     Return the measured clips, and the refusals of clips that cannot be compared, both by the position of the clip.
     """

@@ -139,7 +139,7 @@ class _Measuring:
         """Return the annotated contacts of a clip, of shape (frames, 2) for the left and the right foot.
 
         Return None if the job has no annotations, so that contacts are detected. Raises `AnnotationError` if it has
-        annotations, but none of this clip.
+        annotations, but none of them has a contact segment for this revision of the clip.
         """
         if self._contacts is None:
             return None

@@ -81,8 +81,8 @@ def output_path(name: str, declared: ScriptOutput) -> str:
 def collect(declared: ScriptDeclaration, folder: Path, target: Path) -> dict[str, Path]:
     """Copy the outputs of a script that has ended from `folder` to `target`; return the path of each copy by output.
 
-    Raises `JobRefused` if a required output is missing, too large, a link, or not an ordinary file. Nothing below
-    `folder` is trusted: the script may have replaced any file or folder by a link.
+    Raises `JobRefused` if a required output is missing, or if an output is too large, a link, or not an ordinary file.
+    Nothing below `folder` is trusted: the script may have replaced any file or folder by a link.
     """
     try:
         run = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
