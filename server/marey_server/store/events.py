@@ -149,8 +149,8 @@ def start_of_feed(tx: Transaction, after: int) -> int:
 def find_last_old(tx: Transaction, age_us: int) -> int | None:
     """Return the number up to which `delete_until` may delete the events of the feed; None if no event is old enough.
 
-    All events up to this number are older than `age_us`. They are at most `DELETED_AT_ONCE`, and the newest event is
-    never among them.
+    All events of the feed up to this number are older than `age_us` (microseconds). They are at most `DELETED_AT_ONCE`,
+    and the newest event is never among them.
     """
     number = number_of(tx)
     oldest = select(number.label("number"), event.c.at_us).where(follows(tx, _last_deleted(tx)))

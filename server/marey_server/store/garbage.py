@@ -126,7 +126,7 @@ def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElemen
 
 
 def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_us: int) -> list[str]:
-    """Lock the rows with the given digests, and return the digests of those that still have no references."""
+    """Lock the rows with the given digests; return the digests of those that are still old and without references."""
     chosen = table.c.digest.in_(digests)
     tx.execute(select(table.c.digest).where(chosen).order_by(table.c.digest).with_for_update()).all()
     return list(tx.execute(select(table.c.digest).where(chosen, *_garbage(tx, table, grace_us))).scalars())

@@ -52,8 +52,8 @@ def link_identity(tx: Transaction, name: str, issuer: str | None, subject: str) 
     """Let a person at an identity provider sign in as a user. Only administrators may do this.
 
     If the person is linked with this user already, nothing changes. Raises `InvalidProblem` if `issuer`, the address of
-    the provider, is None. Raises `NotFoundProblem` if there is no such user, and `ConflictProblem` if the person is
-    linked with another user.
+    the provider, is None. Raises `NotFoundProblem` if there is no such user, `ConflictProblem` if the person is linked
+    with another user, and `QuotaExceededProblem` if the user has too many identities.
     """
     require_administrator(tx.principal)
     user_id = users.find_user(tx, name).id

@@ -104,9 +104,10 @@ def put_folder_role(
 ) -> FolderRole:
     """Set the role of a member, or of all members, in a folder.
 
-    Raises `NotFoundProblem` if the user is no member of the project. Raises `ConflictProblem` if the user is an owner,
-    or if the project has too many roles in folders. With `absent`, raises `PreconditionFailedProblem` if the role
-    exists already. Raises `InvalidProblem` for the root folder.
+    With `absent`, only a new role is set. Raises `PreconditionFailedProblem` if `absent` is true and the role exists
+    already, or if the role is not at `expected_rev`. Raises `NotFoundProblem` if the user is no member of the project,
+    `ConflictProblem` if the user is an owner or the project has too many roles in folders, and `InvalidProblem` for the
+    root folder.
     """
     project_row, path = _lock(tx, project, collection_id)
     key = _key(project_row, collection_id, _find_member(tx, project_row, user_name))

@@ -59,7 +59,7 @@ def is_open(tx: Transaction) -> ColumnElement[bool]:
 def withdraw_unauthorised(tx: Transaction, *which: ColumnElement[bool]) -> None:
     """Withdraw the invitations that meet `which` and whose inviter may no longer invite, after a change of rights.
 
-    Invitations that are used up or expired are left as they are.
+    Invitations to deleted projects are withdrawn, too; those that are used up or expired are left as they are.
     """
     withdraw(tx, tx.execute(_locked(*which, is_unspent(tx), ~IN_FORCE)).all())
 

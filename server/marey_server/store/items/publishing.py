@@ -170,7 +170,7 @@ class _Publication:
     refer_to_deleted: bool
     done: dict[str, Published] = field(default_factory=dict)
     added: dict[str | None, ItemTotals] = field(default_factory=dict)
-    """Numbers of new items and their bytes, by the creator of the items; hidden or deleted items do not count."""
+    """Numbers of new items and of bytes added to new or existing items, by creator; hidden new items do not count."""
     _collection_ids: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

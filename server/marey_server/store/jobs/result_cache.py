@@ -247,10 +247,10 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     """Publish the shared result as the result of a waiting job, and end this job; return the jobs that ended.
 
-    In four cases, nothing is done and the result is empty: the result is not to be shared any more (the other job has
-    no cache key); it is no longer stored; the author of the waiting job may not run jobs any more; or both jobs export
-    clips, and the clips whose consent has ended are not the same. The waiting job fails if its outputs cannot be
-    committed. Raises the errors of `publish`.
+    The waiting job does not end, and the answer is empty, if the result is not to be shared any more (the other job has
+    no cache key), or is no longer stored. The same applies if the author of the waiting job may not run jobs any more,
+    or if both jobs export clips and the clips whose consent has ended are not the same. The waiting job fails if its
+    outputs cannot be committed. Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")

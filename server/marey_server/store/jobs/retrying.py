@@ -38,8 +38,9 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
     retried before the job. Dependants that ended only because of this job are retried after it, so that the rest of a
     pipeline continues; dependants that the caller may not retry are left out.
 
-    Raises `ConflictProblem` for a task, and for a job that has not ended or has succeeded. Raises `ForbiddenProblem`
-    for a job, or a dependency, of another user, unless the caller is a maintainer.
+    Raises `ConflictProblem` for a task, for a job that has not ended or has succeeded, and if one of the jobs cannot
+    run again, for example because an input was purged. Raises `ForbiddenProblem` for a job, or an unsuccessful
+    dependency, of another user, unless the caller is a maintainer.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")

@@ -177,7 +177,7 @@ def withdraw_participant(tx: Transaction, project: str, kind: Kind, item_id: str
 
 
 def read_progress(tx: Transaction, project: str, kind: Kind, item_id: str) -> StudyProgress:
-    """Return how many participants and trials of a study have reached which state, without single participants."""
+    """Return the numbers of participants and trials of a study by state, without data of single participants."""
     _, row = require_study(tx, project, kind, item_id)
     t = study_participant.c
     alive, begun = t.withdrawn_us.is_(None), t.token_hash.is_not(None)

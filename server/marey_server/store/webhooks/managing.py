@@ -171,7 +171,7 @@ def _update(tx: Transaction, project_row: ProjectRow, webhook_id: str, values: d
 def rotate_secret(tx: Transaction, project: str, webhook_id: str, request: WebhookRotation) -> NewWebhook:
     """Replace the secret of a webhook, and return the webhook with the new secret.
 
-    For the next `grace_s` seconds of the request, deliveries have two signatures: with the new and with the old secret.
+    For the next `request.grace_s` seconds, deliveries have two signatures: with the new and with the old secret.
     """
     project_row = projects.require(tx, project)
     secret = issue_secret()
