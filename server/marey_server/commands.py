@@ -302,7 +302,7 @@ def move_blobs(**settings: Any) -> None:
 
 
 def _progress() -> Callable[[object], None]:
-    """Return a function that prints a line to standard error, but at most one line per `PROGRESS_EVERY_S`."""
+    """Return a function that prints its argument to standard error, at most once per `PROGRESS_EVERY_S` seconds."""
     printed_s = time.monotonic()
 
     def show(state: object) -> None:

@@ -99,7 +99,7 @@ def read_keys(document: Mapping[str, Any]) -> tuple[SigningKey, ...]:
 
 
 def _read_key(data: Any) -> SigningKey | None:
-    """Return a signing key from its JSON form; None if it is weak, malformed, or of another type or purpose."""
+    """Return a signing key from its JSON form; None if it is weak, malformed, or not for an accepted algorithm."""
     if not isinstance(data, dict) or data.get("kty") not in _MEMBERS or data.get("use", "sig") != "sig":
         return None
     key_id, algorithm = data.get("kid"), data.get("alg")

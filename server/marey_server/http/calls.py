@@ -98,7 +98,7 @@ Admission = tuple[str, Access, str | None, bool, bool, bool, bool, BodyTarget]
 
 
 def admission_of(caller: Caller, target: BodyTarget) -> Admission:
-    """Return the key under which the decision is cached whether a caller may send the body of a request."""
+    """Return the cache key of the decision whether a caller may send the body of a request."""
     operation = caller.operation
     return (
         hash_secret(caller.token or ""), operation.access, operation.scope, operation.public, operation.attempts,

@@ -90,8 +90,9 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
     """Return the precondition of a write, from the headers If-Match and If-None-Match.
 
-    Raises `PreconditionRequiredProblem` if the request has no precondition, and `BadRequestProblem` if the tags are
-    malformed or too many. Raises `PreconditionFailedProblem` if no tag begins with the `rev` of a resource.
+    Raises `PreconditionRequiredProblem` if the request has no precondition. Raises `BadRequestProblem` if the tags are
+    malformed or too many, or if If-None-Match of a request that may create the resource is not `*`. Raises
+    `PreconditionFailedProblem` if no tag begins with the `rev` of a resource.
     """
     if if_none_match is not None and may_create:
         if if_none_match.strip() != "*":

@@ -132,7 +132,8 @@ def search(searchables: Sequence[Searchable], request: SearchRequest, most_work:
     """Search the models of all steps for the motions that a request describes.
 
     `most_work` limits the estimated computing time, in nanoseconds of one thread. Raises `InvalidProblem` with a JSON
-    Pointer to the faulty constraint, and `TooLargeProblem` for searches that would take longer.
+    Pointer to the faulty constraint. Raises `TooLargeProblem` if the search would take longer, or if the found motion
+    has too many frames for one answer.
     """
     from marey_motion.errors import MotionError
     from marey_motion.modelling.search import work as search_work

@@ -28,7 +28,10 @@ def draw_plans(planned: PlannedDraw, count: int) -> list[Plan]:
 
 
 def find_differences(collected: CollectedAnswers) -> StudyDifferences:
-    """Compute how different the motions of a study look to its participants, and an order of the motions by this."""
+    """Compute how different the motions of a study look to its participants, and order the motions by this.
+
+    The order is None as long as a motion is in no answered trial.
+    """
     count = collected.motion_count
     if not collected.answers:
         none = ((0,) * count,) * count

@@ -147,7 +147,7 @@ class IdentityProvider:
 
         `issuer` is the issuer that the provider gave when it sent the browser back, if any. Raises
         `UnauthenticatedProblem` if the code or the token is not valid, `ForbiddenProblem` if the person may not sign
-        in, and `UnavailableProblem` if the provider does not answer as it should.
+        in, and `UnavailableProblem` if the provider does not answer as it should, or too many people sign in.
         """
         if self._places.locked():
             raise provider_unavailable("Too many people sign in at the moment; try again in a few seconds.")

@@ -143,7 +143,7 @@ class Services:
         self.metrics.database_connections.set_function(lambda: self.database.connections_in_use)
 
     def note_faults(self, faults: Sequence[str]) -> None:
-        """Log changes of the server's readiness.
+        """Log whether the server is ready, if this or the reasons have changed since the last call.
 
         `faults` are the reasons why the server is not ready; empty: it is ready.
         """

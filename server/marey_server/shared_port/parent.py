@@ -187,7 +187,10 @@ class Parent:
                 self._announce()
 
     async def _start_again(self, number: int) -> None:
-        """Start the process with this number. If the operating system cannot start it, only log this."""
+        """Replace the ended process with this number by a new process.
+
+        If the operating system cannot start it, only log this; the caller tries again after a pause.
+        """
         try:
             self._current[number] = await self._start(number)
         except ProcessesFailed as error:

@@ -140,7 +140,7 @@ def _refusal(status: int) -> str:
 
 
 def _sentence(error: Exception | None) -> str:
-    """Return the reason of a failure as a sentence that contains no text from the receiver."""
+    """Return the reason of a failure in words, without any text that the receiver has sent."""
     if isinstance(error, HTTPTimeoutError):
         return f"no answer within {TIMEOUT_S:g} s"
     if isinstance(error, AddressRefused):
