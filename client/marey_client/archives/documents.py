@@ -99,7 +99,7 @@ class DocumentWriter:
             data = canonical_json(body)
             if digest_of(data) != digest:
                 raise UnexpectedAnswer(
-                    f"the server's document {digest} does not match its digest; `marey db check` on the server finds "
+                    f"the server's document {digest} does not match its digest; `marey db fsck` on the server finds "
                     "damaged data"
                 )
             if found := differences[digest]:
@@ -128,7 +128,7 @@ class DocumentWriter:
                 if one is None:
                     raise UnexpectedAnswer(
                         f"a document refers to the revision with the content digest {content}, which the project "
-                        "lacks; `marey db check` on the server finds wrong references"
+                        "lacks; `marey db fsck` on the server finds wrong references"
                     )
                 self._add_documents(
                     {digest: PartOfContent(content=content, part=part) for part, digest in one["parts"].items()}

@@ -246,7 +246,7 @@ class _ArchiveInProgress:
         record = CommitRecord(commit.tree, commit.parents, commit.author, commit.message, at)
         if record.digest != commit.digest:
             raise UnexpectedAnswer(
-                f"the server's commit {commit.digest} does not match its digest; `marey db check` on the server finds "
+                f"the server's commit {commit.digest} does not match its digest; `marey db fsck` on the server finds "
                 "damaged data"
             )
         changes = self._changes(commit)
