@@ -76,7 +76,10 @@ class Users:
         )
 
     def disable(self, name: str) -> None:
-        """Disable a user, whose data is kept; password and tokens of the user do not work until `enable` is called."""
+        """Disable a user: password, tokens and sign-ins do not work until `enable` is called. The data is kept.
+
+        Also pauses the user's schedules and withdraws the user's invitations; `enable` does not undo this.
+        """
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
     def identities(self, name: str) -> Iterator[Identity]:
@@ -104,7 +107,7 @@ class Users:
         return change_quotas(self.transport, f"/users/{name}/quotas", change, QuotasInUse)
 
     def enable(self, name: str) -> User:
-        """Enable a disabled user again, with the same password and tokens."""
+        """Enable a disabled user again, with the same password and tokens; the user's schedules stay paused."""
         return self.change(name, checked(UserChange, disabled=False))
 
 
@@ -158,7 +161,7 @@ class Tokens:
 
 @dataclass(frozen=True)
 class Members:
-    """Members of a project, each with a role that applies in the whole project; folders may have other roles."""
+    """Members of a project, each with a role in the project; in some folders, members may have other roles."""
 
     transport: Transport
     project: str

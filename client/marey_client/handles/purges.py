@@ -9,7 +9,7 @@ from marey_schemas.purges import PurgeAnswer, PurgeRequest
 
 
 def purge_step_by_step(transport: Transport, project: str, request: PurgeRequest) -> Iterator[PurgeAnswer]:
-    """Send the requests of a purge until no items are left, and yield each answer."""
+    """Send the requests of a purge until all of its items have been examined, and yield each answer."""
     wanted = request
     while True:
         answer = transport.post(PurgeAnswer, f"/projects/{project}/purges", wanted)

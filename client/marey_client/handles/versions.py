@@ -73,7 +73,10 @@ class DatasetHandle:
         return self.transport.get(Dataset, self.url)
 
     def delete(self) -> None:
-        """Delete the dataset with its versions; the items of the project stay."""
+        """Delete the dataset; the items of the project stay, and the name can be used again.
+
+        The versions are stored until the deleted dataset is purged. Raises `Conflict` if a branch is protected.
+        """
         self.transport.send("DELETE", self.url, headers=ANY_STATE)
 
     @property

@@ -59,7 +59,8 @@ class Calibration:
 def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
     """Submit a backlog of jobs, then let simulated workers run all of its jobs.
 
-    The jobs per second are counted from the first completion to the last one. Raises `MareyError` if a request fails.
+    The jobs per second are counted from the first completion to the last one. Raises `MareyError` if a request fails,
+    or if jobs have not ended after `LONGEST_DRAIN_S`.
     """
     load = OfferedLoad(scratch, own_workers=True)
     load.submit_backlog(backlog_of(workers))

@@ -151,7 +151,7 @@ def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
 
 
 def _widened(clip: PosedItem, frames: slice | None, more: int) -> tuple[slice | None, slice]:
-    """Return a range of frames extended by `more` on both sides, and the slice of the given range in it."""
+    """Return a range of frames extended by `more` on both sides, and the given range as a slice of the extended one."""
     frames_text(frames)  # refuses other steps and negative bounds
     if frames is None:
         return None, slice(None)
