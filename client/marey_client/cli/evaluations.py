@@ -129,7 +129,7 @@ def add_clip_options(marey: Marey, params: Chosen, loop: Sequence[str] | None, t
 
 
 def _place_beside(path: str) -> tuple[str, str]:
-    """Return the folder and the name of a result from the address of its input, such as `lab/gaits@v1/raw`."""
+    """Return the folder and the name of a result of the input `path`: `lab`, `gaits-v1-raw` for `lab/gaits@v1/raw`."""
     named, at, version = path.partition("@")
     folder, _, last = named.rpartition("/")
     return folder, f"{last}{at}{version}".replace("@", "-").replace("/", "-")

@@ -261,7 +261,7 @@ def _chance_in_words(refused: Mapping[str, Any]) -> str:
 
 
 def _change(change: Mapping[str, Any]) -> str:
-    """Return a change as text, followed by its confidence interval if there is one."""
+    """Return a change as text, with the interval in which 95 % of repetitions would lie, if it is known."""
     low, high = change["again_low"], change["again_high"]
     interval = "" if low is None else f" ({low:+.4f} to {high:+.4f})"
     return f"{change['change']:+.4f}{interval}"

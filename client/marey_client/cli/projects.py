@@ -36,7 +36,7 @@ DefaultLimits = Annotated[
     typer.Option(
         "--defaults",
         help="Remove the limits set for this project or user: the limits in the server's settings apply, and "
-        "jobs have no limit. Other options of the same command still set their limits.",
+        "the number of running jobs has no limit. Other options of the same command still set their limits.",
     ),
 ]
 

@@ -141,9 +141,8 @@ def search(
             "--out",
             "--output",
             "-o",
-            help="File or folder to which the motion is also "
-            "written. Default: only the errors of the "
-            "constraints are printed.",
+            help="File or folder to which the motion is written. Default: the motion is not written, only "
+            "described.",
         ),
     ] = None,
     format: Annotated[str, typer.Option(help=f"Format of the file: {one_of(MOTION_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002

@@ -237,7 +237,7 @@ def change_password(
 
 @user.command("disable")
 def disable_user(context: typer.Context, name: UserName) -> None:
-    """Disable a user: password and tokens of the user do not work any more. The data of the user is kept."""
+    """Disable a user: password, tokens and sign-ins do not work any more, and schedules pause. The data is kept."""
     with connect(context) as marey:
         marey.users.disable(name)
     print_message(f"{name} is disabled; to undo this, run marey user enable {name}")
@@ -245,7 +245,7 @@ def disable_user(context: typer.Context, name: UserName) -> None:
 
 @user.command("enable")
 def enable_user(context: typer.Context, name: UserName) -> None:
-    """Enable a disabled user again, with the same password and tokens."""
+    """Enable a disabled user again, with the same password and tokens. The user's schedules stay paused."""
     with connect(context) as marey:
         marey.users.enable(name)
     print_message(f"{name} is enabled")

@@ -77,7 +77,7 @@ def evaluate_locomotion(
 
 
 def travels(clip: ClipHandle, root: str) -> bool:
-    """Return whether a clip is locomotion: its root moves a median of at least `TRAVEL_M` within `TRAVEL_WINDOW_S`."""
+    """Return whether the root's median horizontal displacement within `TRAVEL_WINDOW_S` is at least `TRAVEL_M`."""
     rate_hz = float(clip.item.summary["frame_rate_hz"])
     window = round(TRAVEL_WINDOW_S * rate_hz)
     if int(clip.item.summary["frames"]) <= window:

@@ -254,7 +254,7 @@ def _annotation(annotation: AnnotationDifference) -> Iterator[str]:
 
 
 def _shift(change: SegmentChange) -> int | None:
-    """Return the number of frames by which a segment moved; None if its label or its length changed, too."""
+    """Return the number of frames by which a segment moved; None for any other change, also of label or length."""
     old, new = change.before, change.after
     if old is None or new is None or old.label != new.label or new.start - old.start != new.end - old.end:
         return None

@@ -52,16 +52,16 @@ def download(
     part: Annotated[
         str | None,
         typer.Option(
-            help="With --format predecessor: part of the item to write instead of the item, which is tree (of a "
-            "model), alignment (of an aligned clip), or skeleton_model (of a skeleton)."
+            help="With --format predecessor: part to write instead of the whole item: tree (of a model), alignment "
+            "(of an aligned clip), or skeleton_model (of a skeleton)."
         ),
     ] = None,
     layout: Annotated[
         str | None,
         typer.Option(
-            help="With --format predecessor: layout of the file, which is 2 or 3 for models, database or file "
-            "for skeletons. Default: the imported file, if the item is unchanged; otherwise, the server "
-            "chooses."
+            help="With --format predecessor: layout of the file: 2 or 3 for models, database or file for "
+            "skeletons. Default: the imported file, if the item is unchanged; otherwise, database for "
+            "skeletons, and for models the layout that contains the time function exactly, or else 3."
         ),
     ] = None,
     fold_positions: Annotated[

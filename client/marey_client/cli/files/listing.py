@@ -82,7 +82,7 @@ def ls(
     stale: Annotated[
         bool,
         typer.Option(
-            "--stale", help="List only stale results: results of jobs of which an input now has a newer revision."
+            "--stale", help="List only stale results: items that a job made of an input that has a newer revision now."
         ),
     ] = False,
     sort: Annotated[

@@ -202,7 +202,7 @@ class _Option:
 
 
 class SchemaCommand(TyperCommand):
-    """Command with options from models; a subclass sets the function, and for its parameters the models."""
+    """Command with options from models; a subclass sets its function, and the models by parameter of the function."""
 
     function: ClassVar[Callable[..., Any]]
     groups: ClassVar[Mapping[str, OptionsOf]]
