@@ -272,8 +272,8 @@ def commit_planned_tasks(
 ) -> PublishedOutputs | None:
     """Commit the outputs `wanted` of a parent job, as `planned` by an earlier transaction.
 
-    Returns None if the commit must be planned again, because others have moved the branch. If the commit is refused,
-    the result contains the failure. `row` has the columns `JOB_COLUMNS`.
+    Returns None if the commit must be planned again (see `commit_planned`). If the commit is refused, the result
+    contains the failure. `row` has the columns `JOB_COLUMNS`.
     """
     try:
         with tx.connection.begin_nested():

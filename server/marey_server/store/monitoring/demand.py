@@ -54,8 +54,8 @@ def read_demand(
     reach : jobs that the workers can run
     workers : names of the workers that exist already
     limit : number of queued jobs at which counting stops
-    others : jobs that the workers of the other pools can run; if several pools can run a job, it counts only for the
-        pool with the fewest labels
+    others : jobs that the workers of the other pools can run; if several pools can run a job, it counts only for those
+        of them that have the fewest labels
     """
     return Demand(_count_queued(tx, _wanted(reach, others), limit), _count_running(tx, workers))
 
