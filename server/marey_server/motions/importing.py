@@ -317,7 +317,7 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
 
 
 class _Stored(NamedTuple):
-    """Result of storing some files together: their entries in the answer, and the bytes that are new on the server."""
+    """Result of storing some files together: their entries in the answer, and the number of bytes new to the server."""
 
     entries: list[ImportEntry]
     sent_bytes: int = 0

@@ -125,7 +125,7 @@ class _Importing:
         return GivenSkeleton(item.id, item.revision, hierarchy)
 
     def _graph_item(self, found: ImportedFile) -> ImportedItem:
-        """Return the item of the graph in a file; its models may be in the same file or in earlier files.
+        """Return the item of the graph in a file; its models may be in the project, in this file, or in earlier files.
 
         Raises `MotionError` if a model is missing or ambiguous.
         """
