@@ -318,7 +318,7 @@ def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: Datas
     A part and a part that is computed from it, such as a model and its sample tree, count as one part. If one side has
     changed the model and the other side the tree, both names are returned, because the tree of one side would not fit
     the model of the other side. All other changed parts that are computed from a returned part are also returned, since
-    they must come from the same side.
+    they must come from the same side. The names can also be `entry`, `path` and `tags` (see `MergeConflict.parts`).
     """
     if ours is None or theirs is None:
         return ("entry",)
