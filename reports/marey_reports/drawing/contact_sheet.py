@@ -126,7 +126,7 @@ class _SheetRow:
     def seen_extent_m(self) -> tuple[float, float, float]:
         """Extent of the row's figures in the picture, in metres from the point of the floor under the pelvis.
 
-        The three numbers are the lowest point, the highest point, and the greatest distance to a side. They contain
+        The three numbers are the lowest point, the highest point, and the greatest distance to a side. They cover
         bones, heads, patches of floor and arrows. The lowest point can be below the floor line, because the camera
         looks down.
         """

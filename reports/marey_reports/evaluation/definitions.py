@@ -59,7 +59,8 @@ METRICS = {
         "response, if there is one",
         "s",
         2,
-        "mean time from a switch until the response, as above; switches without response are left out",
+        "mean time from a switch until the speed is within 10 % of the new one, and stays there for half a second; "
+        "switches without response are left out",
     ),
     "response_missed": Metric(
         "speeds never reached", "", 0, "number of switches to which the character did not respond before the next one"
@@ -88,7 +89,7 @@ METRICS = {
         "change of pose in the clips",
         "m",
         3,
-        "distance over the same joints between successive frames of the clips shown",
+        "distance over hips, spine, head, hands and feet between successive frames of the clips shown",
     ),
     "transitions_per_s": Metric(
         "transitions", "1/s", 2, "number of jumps per second that a search chose although the clip could have continued"
