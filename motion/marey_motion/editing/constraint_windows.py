@@ -16,7 +16,9 @@ from marey_motion.editing.limb_smoothing import MOST_STEP
 
 @dataclass(frozen=True)
 class JoinedWindows:
-    """Two successive constraints of one joint, whose ranges of frames (windows) are too close for a smooth change.
+    """Two successive constraints of one joint, between whose ranges of frames (windows) the joint would jump.
+
+    `join_windows` has shortened both windows, as far as this was possible.
 
     Parameters
     ----------

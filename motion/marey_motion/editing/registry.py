@@ -136,7 +136,7 @@ def edit_clip(
             place = f"commands[{number}] ({command.command})"
             error.where = place if error.where is None else f"{place}, {error.where}"
             raise
-    with np.errstate(over="ignore"):  # values too large for single precision are refused later
+    with np.errstate(over="ignore"):  # values too large for single precision become infinite, which `Clip` refuses
         clips = [take.motion.as_clip(take.skeleton, take.frame_rate_hz) for take in takes]
     return tuple(EditedClip(clip, take.pieces, take.findings) for clip, take in zip(clips, takes, strict=True))
 

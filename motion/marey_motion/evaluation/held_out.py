@@ -42,7 +42,8 @@ def take_trials(database: MatchingDatabase, options: EvaluationOptions) -> tuple
 
     Raises
     ------
-    MotionError    if no clip is long enough and travels far enough, or if the set has no other clip
+    MotionError    if no clip is long enough and travels far enough (clips of walking in place do not count), or if the
+        set has no other clip
     """
     if "takes" not in options.families:
         return ()
@@ -53,7 +54,8 @@ def take_trials(database: MatchingDatabase, options: EvaluationOptions) -> tuple
     if not found or len(np.unique(equal_clips(database)[asked])) < 2:
         raise MotionError(
             f"trials along takes need two different clips, one of which lasts at least {LEAST_S + LOOK_AHEAD_S:g} s "
-            f"and travels at least {LEAST_PATH_M:g} m; add such clips, or leave out the family takes",
+            f"and travels at least {LEAST_PATH_M:g} m (not walking in place); add such clips, or leave out the family "
+            "takes",
             code="no-takes",
         )
     chosen = np.unique(np.linspace(0, len(found) - 1, min(options.most_takes, len(found))).round().astype(int))

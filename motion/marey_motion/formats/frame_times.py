@@ -14,7 +14,7 @@ KNOWN_RATES_HZ = (
 SNAP_TOLERANCE = 1e-4
 # Smaller deviations have no warning, because frame times with six decimals are not more exact.
 NOTABLE_DEVIATION = 2e-5
-# Greatest deviation from the rate of a frame time that is rounded to three decimals.
+# Greatest relative deviation of a rate that is computed from a frame time with three decimals.
 ROUNDED_DEVIATION = 0.02
 # A greater "frame time" is a rate, or is in milliseconds: no recording has fewer frames.
 LONGEST_FRAME_TIME_S = 1.0

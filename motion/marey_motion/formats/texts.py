@@ -26,7 +26,7 @@ def plain_text(text: str) -> str:
 
 
 def cut_text(text: str, longest: int) -> str:
-    """Shorten a text to a number of characters, and replace halves of surrogate pairs with question marks.
+    """Shorten a text to at most `longest` characters, and replace halves of surrogate pairs with question marks.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def cut_text(text: str, longest: int) -> str:
 
 
 def short_name(name: object) -> str:
-    """Shorten a name from a file to `LONGEST_NAME` characters, for messages.
+    """Shorten a name from a file to at most `LONGEST_NAME` characters, for messages.
 
     Parameters
     ----------

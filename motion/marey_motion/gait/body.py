@@ -59,7 +59,7 @@ class GaitMoments:
         -------
         (n,)    averages, in the same unit
         """
-        from scipy.ndimage import convolve1d  # brings much of scipy: only who needs it shall wait
+        from scipy.ndimage import convolve1d  # imported here, because this import is slow
 
         reach = _reach(window_s, self.frame_rate_hz)
         weights = np.hanning(2 * reach + 3)[1:-1]

@@ -189,7 +189,7 @@ def motion_content(file: FileToImport, imported: ImportedMotion, motion: Tree) -
     Returns
     -------
     str or None    the digest; None if the file has another format, if the import dropped frames or moved the floor, or
-        if the options set the unit, an axis or the frame rate
+        if the options set the unit, the upward axis, left-handed axes or the frame rate
     """
     options, source = file.options, imported.source
     unchanged = source.format == FORMAT and source.trimmed_frames == (0, 0) and source.floor_shift_m == 0.0

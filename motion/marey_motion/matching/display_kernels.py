@@ -93,7 +93,10 @@ def _show(pose, place, joints, moved, offsets, shown, shown_places):
 
 @compiled
 def _show_row(pose, place, joints, moved, shown, shown_places):
-    """Fill `shown` (3 + 4·K) with K joints of a row's pose, and `shown_places` (M, 3) with M of its translations."""
+    """Fill `shown` (3 + 4·K) with K joints of a row's pose, and `shown_places` (M, 3) with M of its translations.
+
+    No offsets are added.
+    """
     shown[:3] = pose[:3]
     for m in range(moved.shape[0]):
         shown_places[m] = place[moved[m]]

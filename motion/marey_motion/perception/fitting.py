@@ -213,7 +213,7 @@ def fit_quality(fitted: Floats, perceived: Floats) -> FitQuality:
     -------
     FitQuality    measures
     """
-    from scipy.stats import spearmanr  # takes a second to load, which no other job of a worker shall wait for
+    from scipy.stats import spearmanr  # imported here, because this import takes a second
 
     known = np.isfinite(perceived) & np.isfinite(fitted)
     one, other = fitted[known], perceived[known]

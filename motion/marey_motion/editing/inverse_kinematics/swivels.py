@@ -104,10 +104,10 @@ def _even_swivels(goal: Floats, jumps: Floats, clear: Floats, reach: float) -> F
 
 
 def _unwrapped(angles: Floats, clear: Floats) -> Floats:
-    """Add full turns to angles (n,), so that each angle with enough weight is within half a turn of the last such
-    angle before it.
+    """Add full turns to angles (n,) in radians, so that successive angles differ by at most half a turn.
 
-    The weights are `clear` (n,). Angles with less weight are not compared.
+    Only angles with enough weight `clear` (n,) are compared. An angle with less weight gets the full turns of the last
+    compared angle before it.
     """
     weighted = np.flatnonzero(clear >= min(0.05, float(clear.max())))
     turns = np.round(np.diff(angles[weighted]) / (2.0 * np.pi))

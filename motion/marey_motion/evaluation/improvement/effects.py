@@ -63,7 +63,7 @@ def estimation_replicates(options: ConfirmedEffects) -> range:
 def confirmation_replicates(options: ConfirmedEffects, evaluation: EvaluationOptions, turn: int = 0) -> range:
     """Return the numbers of the replicates in which effects are confirmed; no choice was based on these replicates.
 
-    All replicates of the evaluation are excluded, too, because unused clips were found by all of them.
+    All replicates of the evaluation are excluded, too, because a clip is unused only if none of them displays it.
 
     Parameters
     ----------

@@ -80,7 +80,8 @@ def layer_of_document(
     document : mapping    the document
     file : str    name of the file, for messages
     frame_count : int    frames of the clip
-    end_index : str    "inclusive" if the last frame of a section is `end_idx`; "exclusive" if it is the frame before
+    end_index : str    "inclusive" if `end_idx` is the last frame of a section; "exclusive" if it is the frame after the
+        last one
     labels : sequence of str, optional    labels to read; all labels by default
 
     Returns
@@ -119,8 +120,9 @@ def layers_of_document(
     document : mapping    the document
     file : str    name of the file, for messages
     frame_count : int    frames of the clip
-    end_index : str, optional    "inclusive" if the last frame of a section is `end_idx`; "exclusive" if it is the frame
-        before. By default, "inclusive" is tried first, and "exclusive" only if the document is not valid otherwise
+    end_index : str, optional    "inclusive" if `end_idx` is the last frame of a section; "exclusive" if it is the frame
+        after the last one. By default, "inclusive" is tried first, and "exclusive" only if the document is not valid
+        otherwise
 
     Returns
     -------
