@@ -31,7 +31,7 @@ SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOS
 
 
 class StartPlacement(Request):
-    """Position and heading at which a motion of a model starts in the world."""
+    """Position and heading of the coordinate frame of a model in the world; its motions start near the origin."""
 
     x: Coordinate = Field(0.0, description="Position along x, in metres.")
     z: Coordinate = Field(0.0, description="Position along z, in metres.")

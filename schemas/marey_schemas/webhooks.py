@@ -103,9 +103,13 @@ class Webhook(Answer):
     failures: int = Field(0, description="Number of failed attempts since the last successful delivery.")
     failing_since: datetime | None = None
     next_attempt_at: datetime | None = Field(
-        None, description="Time of the next attempt after a failure; absent: no attempt is planned."
+        None,
+        description="Time of the next attempt after a failure; absent: the last attempt did not fail, or the webhook "
+        "is paused.",
     )
-    last_status: int | None = Field(None, description="HTTP status of the last answer; absent: there was none.")
+    last_status: int | None = Field(
+        None, description="HTTP status of the answer to the last attempt; absent: no answer, or no attempt yet."
+    )
     last_error: str | None = Field(
         None, description="Reason why the last attempt has failed; absent: it succeeded, or there was none."
     )

@@ -64,9 +64,10 @@ class ControllerKeywords(TypedDict, total=False):
     """Keyword arguments, one for each field of `ControllerOptions`."""
 
     follow: Literal["time", "path", "open_loop"]
-    """Trajectory that each search asks for, from the reference (the trajectory to follow). time: where the reference is
-    at the same time; path: the reference from the point nearest to the character; open_loop: only the speed and turn
-    rate of the reference."""
+    """Points that each search asks for at the times `horizons_s` ahead, from the reference (the trajectory to follow).
+    time: where the reference is at these times; path: points of the reference, measured from the point nearest to the
+    character; open_loop: points that the character reaches from its present position with the speed and turn rate of
+    the reference."""
     search_every_s: float
     """Seconds from one search of the database to the next."""
     continuing_bias: float
@@ -185,8 +186,8 @@ class EvaluateKeywords(TypedDict, total=False):
     coverage_least_s: float
     """Seconds of data that a cell of the coverage map (a speed and a turn rate) needs to count as covered."""
     literal_formulas: bool
-    """Also compute errors by the formulas exactly as the paper prints them, to compare results with those of the
-    paper."""
+    """Also compute errors by the published formulas exactly as they are printed, only to compare results with those of
+    the publication."""
     database: DatabaseOptions | DatabaseKeywords
     """Options of the database that is built from the clips."""
     controller: ControllerOptions | ControllerKeywords

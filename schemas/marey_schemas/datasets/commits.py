@@ -103,7 +103,7 @@ class Commit(Answer):
 
 
 class Entry(Answer):
-    """Entry of a version of a dataset: a path, and the content that an item had when the version was recorded."""
+    """Entry of a version of a dataset: a path, and the content of a revision of an item, with tags."""
 
     path: str
     kind: Kind

@@ -81,7 +81,7 @@ class MotionDocument(Request):
 
 
 class Check(Request):
-    """Warning of an import about a motion: a stable code, a message, and the joints and frames concerned."""
+    """Warning about a motion, from an import, a retargeting or an edit: a stable code, a message, joints and frames."""
 
     code: Annotated[
         str, StringConstraints(pattern=form(r"^[a-z0-9-]{1,64}$", "have 1 to 64 lower-case letters, digits and -"))

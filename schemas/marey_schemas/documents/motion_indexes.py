@@ -11,7 +11,7 @@ from marey_schemas.documents.reports import StoredFile
 from marey_schemas.names import ItemId
 
 MOST_SHARDS = 2000
-"""Greatest number of shards (files with poses of many clips) of an index: about 1,200 hours of motion."""
+"""Greatest number of shards (pairs of files with the poses of many clips) of an index: about 1,200 hours of motion."""
 _MOST_NUMBER = 2**31 - 1
 _Number = Annotated[int, Field(ge=0, le=_MOST_NUMBER)]
 INDEX_VERSION = 1

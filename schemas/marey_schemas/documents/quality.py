@@ -19,7 +19,7 @@ CONTACT_LABELS: Mapping[str, tuple[bool, bool]] = MappingProxyType(
 )
 """Labels of segments in which the left and the right foot are in contact with the floor."""
 LEAST_TAKES = 3
-"""Number of takes from which a total has a confidence interval."""
+"""Least number of takes with which a total has a confidence interval."""
 SPEED_EDGES_M_S = tuple(0.25 * step for step in range(33))
 TURN_EDGES_DEG_S = tuple(-180.0 + 15.0 * step for step in range(25))
 """Edges of the bins in which windows of one second are counted; windows beyond the ends count in the outermost bins."""

@@ -253,7 +253,7 @@ class FlipAxes(NamedCommand):
 
 
 class FixDrift(NamedCommand):
-    """Correct drift: spread a shift and a turn of the body over a range of frames; later frames get all of it."""
+    """Correct drift: spread a shift and a turn of the body over a range of frames; later frames get both in full."""
 
     examples: ClassVar[Examples] = (
         {"shift_m": [0.2, 0.0, -0.1], "turn_deg": 10.0, "frames": [20, 80], "profile": "smooth"},
@@ -363,7 +363,7 @@ class Smooth(NamedCommand):
 
 
 class RotateJoint(NamedCommand):
-    """Turn a joint by the same rotation in all frames of a range, in addition to its motion."""
+    """Add a rotation to the motion of a joint in a range of frames; the rotation is blended in and out at the ends."""
 
     examples: ClassVar[Examples] = ({"joint": "LeftArm", "angle_deg": 20.0, "axis": [0.0, 1.0, 0.0], "space": "world"},)
     command: Literal["rotate_joint"] = "rotate_joint"

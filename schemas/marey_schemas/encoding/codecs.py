@@ -156,7 +156,7 @@ def _finite_array(value: NDArray[Any] | EncodedArray) -> NDArray[Any]:
 
 
 class _Count:
-    """Counter of objects and lists, which refuses a document with too many of them while it is parsed."""
+    """Counter of objects, lists and members of objects, which refuses a document with too many while it is parsed."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data

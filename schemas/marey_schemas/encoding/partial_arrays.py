@@ -38,7 +38,9 @@ def is_partial(value: Any) -> bool:
 
 
 def partial_array(array: EncodedArray, base: str, pointer: str, base_digests: Sequence[str]) -> dict[str, Any] | None:
-    """Return an array without the tiles that its base has; None if the base has no tile of the array.
+    """Return an array without the tiles that its base has.
+
+    Returns None if the base has no tile of the array, or if the array has another division into tiles.
 
     `base` and `pointer` name the base, as described above, and `base_digests` lists the digests of its tiles.
     """
@@ -62,7 +64,8 @@ def partial_array(array: EncodedArray, base: str, pointer: str, base_digests: Se
 def completed(partial: Mapping[str, Any], base_tiles: Sequence[bytes]) -> NDArray[Any] | EncodedArray:
     """Return the array that a partial array describes, checked as if it had been sent whole.
 
-    `base_tiles` contains the tiles of the base, as `blocks.split` returns them: many partial arrays can share a base.
+    `base_tiles` contains the tiles of the base, as `blocks.split` returns them, so that many partial arrays can share
+    them.
     Raises `ArrayError` if the members of the partial array do not match each other or the base.
     """
     spec = ArraySpec.parse(partial["dtype"], partial["shape"])

@@ -146,8 +146,8 @@ class EvaluationOptions(Grid):
     )
     literal_formulas: bool = Field(
         False,
-        description="Also compute errors by the formulas exactly as the paper prints them, to compare "
-        "results with those of the paper.",
+        description="Also compute errors by the published formulas exactly as they are printed, only to "
+        "compare results with those of the publication.",
     )
     database: DatabaseOptions = Field(
         DatabaseOptions(), description="Options of the database that is built from the clips."
@@ -168,8 +168,7 @@ class EvaluationOptions(Grid):
         return self
 
     def courses_deg(self, family: Family) -> tuple[float, ...]:
-        """Return the values that trials of a family combine with each speed: turn rates (degrees/s) or angles
-        (degrees).
+        """Return the values that trials of a family combine with each speed: turn rates (deg/s) or angles (deg).
 
         Trials along takes depend on the clips, so they are not listed.
         """

@@ -112,9 +112,10 @@ class ControllerOptions(Options):
 
     follow: Follow = Field(
         "time",
-        description="Trajectory that each search asks for, from the reference (the trajectory to follow). time: "
-        "where the reference is at the same time; path: the reference from the point nearest to the "
-        "character; open_loop: only the speed and turn rate of the reference.",
+        description="Points that each search asks for at the times `horizons_s` ahead, from the reference (the "
+        "trajectory to follow). time: where the reference is at these times; path: points of the reference, measured "
+        "from the point nearest to the character; open_loop: points that the character reaches from its present "
+        "position with the speed and turn rate of the reference.",
     )
     search_every_s: float = Field(
         0.1, gt=0, le=2, allow_inf_nan=False, description="Seconds from one search of the database to the next."

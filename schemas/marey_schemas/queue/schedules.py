@@ -42,7 +42,7 @@ Overlapping = Annotated[
     bool,
     Field(
         description="Whether a job is submitted even if the previous job of the schedule has not ended. False: "
-        "no job is submitted at this time."
+        "the schedule then skips this time."
     ),
 ]
 
