@@ -191,6 +191,7 @@ def evaluate(
     Raises
     ------
     EvaluationCancelled    if cancelled
+    MotionError    if two trials have the same name, or if no clip is suitable for the requested trials along takes
     """
     trials = (*suite_trials(options), *take_trials(database, options))
     index = index_of(database)

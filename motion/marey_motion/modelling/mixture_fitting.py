@@ -142,6 +142,10 @@ def fit_mixture(
     Returns
     -------
     FittedMixture    mixture and candidates
+
+    Raises
+    ------
+    ModelError    if a latent vector is not finite, or if all latent vectors are equal
     """
     examples, dimensions = latents.shape
     wanted = options or MixtureOptions()

@@ -37,8 +37,8 @@ class Judgements:
     motion_count : int    number of motions n
     participants : (T,) int64    participant of each trial, from 0
     shown : (T, 4) int64    the motions shown, by place on the screen; all different
-    chosen : (T,) int64    the chosen pair, as an index into the pairs of places (0, 1), (0, 2), (0, 3), (1, 2), (1, 3),
-        (2, 3)
+    chosen : (T,) int64    the pair that was chosen as the most similar one, as an index into the pairs of places
+        (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)
     """
 
     motion_count: int
@@ -185,7 +185,9 @@ def simulate_judgements(differences: Floats, participants: int, seed: int, noise
 
 
 def difference_table(judgements: Judgements) -> DifferenceTable:
-    """Compute the difference of each pair of motions: 1 minus the share of its showings in which it was chosen.
+    """Compute the perceived difference of each pair of motions from the choices of the most similar pairs.
+
+    The difference is 1 minus the share of the trials with both motions in which this pair was chosen.
 
     Parameters
     ----------
