@@ -63,7 +63,8 @@ class StoredUpload:
 def create_upload(tx: Transaction, length: int, *, digest: str | None = None) -> StoredUpload:
     """Create an upload of `length` bytes; if `digest` is given, the bytes must have this digest.
 
-    Raises `TooLargeProblem` if `length` is not between 1 and `MAX_UPLOAD_BYTES`.
+    Raises `TooLargeProblem` if `length` is not between 1 and `MAX_UPLOAD_BYTES`, `QuotaExceededProblem` if a quota
+    would be exceeded, and `ForbiddenProblem` if the caller may not upload data.
     """
     sender = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
@@ -88,7 +89,8 @@ def read_upload(tx: Transaction, upload_id: str) -> StoredUpload:
 def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredUpload:
     """Append a piece of at most a few MiB at `offset`, and return the state of the upload.
 
-    Raises `ConflictProblem` with the current offset in `context.offset` if the upload is at another offset.
+    Raises `ConflictProblem` with the current offset in `context.offset` if the upload is at another offset, and
+    `TooLargeProblem` if the piece goes past the announced length.
     """
     found = _find(tx, upload_id)
     if found.finished_digest is not None or found.offset != offset:

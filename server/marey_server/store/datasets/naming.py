@@ -86,7 +86,7 @@ def _shown_dataset(row: Row[Any], manifest: FolderManifest | None) -> Dataset:
 def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dataset:
     """Create a dataset with the branch `main`, which has no commits yet.
 
-    Raises `ConflictProblem` if the name is taken.
+    Raises `ConflictProblem` if the name is taken, or if the project has too many datasets.
     """
     project_row = projects.require(tx, project)
     held = tx.execute(select(func.count()).where(dataset.c.project_id == project_row.id, _ALIVE)).scalar_one()
@@ -197,7 +197,8 @@ def read_ref(tx: Transaction, project: str, name: str, ref: str) -> Ref:
 def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> Ref:
     """Create a branch or a tag at a version.
 
-    Raises `ConflictProblem` if another branch or tag has the name, or if the name is the beginning of a digest.
+    Raises `ConflictProblem` if another branch or tag has the name, if the name is the beginning of a digest, or if the
+    dataset has too many branches and tags.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)

@@ -38,7 +38,7 @@ def count_sent(tx: Transaction, size_bytes: int) -> None:
 
 
 def uncount_sent(tx: Transaction, size_bytes: int) -> None:
-    """Undo the count of bytes that the caller has announced, but never sent."""
+    """Undo the count of bytes that the caller has announced but not sent, or that the server had stored already."""
     if (limit := _part_of_day(tx, _BYTES, _caller(tx), size_bytes)) is not None:
         rate_limits.uncount(tx, limit)
 

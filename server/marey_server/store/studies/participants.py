@@ -77,7 +77,8 @@ def try_of(code: str, address: str, per_minute: int) -> SignInTry:
 def _find_link(tx: Transaction, code: str) -> Row[Any]:
     """Lock and return the row of the participant who has a link and may have begun the study already.
 
-    Raises `NotFoundProblem` if the link is wrong or expired, the participant has withdrawn, or the study was deleted.
+    Raises `NotFoundProblem` if the link is wrong or has expired before it was used, if the participant has withdrawn,
+    or if the study was deleted.
     """
     prefix, secret = split_study_link(code) or ("", "")
     locked = _rows().where(study_participant.c.link_prefix == prefix).with_for_update(of=study_participant)
