@@ -69,8 +69,7 @@ def compare(
     chart: Annotated[
         Path | None,
         typer.Option(
-            help="Draw charts to this file instead of printing a table: .html is a page with all charts and "
-            "tables, .svg or .png one chart."
+            help="Also draw charts to this file: .html is a page with all charts and tables, .svg or .png one chart."
         ),
     ] = None,
     plot: Annotated[
