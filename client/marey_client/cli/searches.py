@@ -141,8 +141,7 @@ def search(
             "--out",
             "--output",
             "-o",
-            help="File or folder to which the motion is written. Default: the motion is not written, only "
-            "described.",
+            help="File or folder to which the motion is written. Default: the motion is not written, only described.",
         ),
     ] = None,
     format: Annotated[str, typer.Option(help=f"Format of the file: {one_of(MOTION_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
@@ -276,7 +275,10 @@ def _index_of(marey: Marey, project: str, index: str) -> str:
 
 
 def _metric_of(marey: Marey, project: str, metric: str) -> str:
-    """Return the name or the id of the metric of a search. Raises `WrongUsage` if another project has the metric."""
+    """Return the name or the id of the metric of a search.
+
+    Raises `WrongUsage` if there is no such metric, or if another project has it.
+    """
     from marey_schemas.documents.metrics import is_built_in
 
     if not is_built_in(metric) and (other := Address.parse(metric).project) != project:

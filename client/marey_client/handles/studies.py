@@ -65,7 +65,7 @@ class StudyHandle(ItemHandle):
         return self.transport.get(StudyProgress, f"{self.url}/progress")
 
     def judgements(self, *, revision: int | None = None) -> Iterator[JudgingParticipant]:
-        """List the participants who saw a revision, by default that of the handle, each with all trials under a pseudonym.
+        """List participants who saw a revision (default: that of the handle), each with all trials under a pseudonym.
 
         Only maintainers and owners may do this.
         """
