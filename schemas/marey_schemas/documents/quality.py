@@ -187,7 +187,8 @@ class QualityTotal(Request):
 
     value: _Finite | None
     low: _Finite | None = Field(
-        description="Lower end of the 95 % confidence interval of the mean; null with fewer than 3 takes."
+        description="Lower end of the 95 % confidence interval of the mean; null with fewer than 3 takes, or without "
+        "bootstrap samples."
     )
     high: _Finite | None
     clips: int
