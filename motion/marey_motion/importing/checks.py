@@ -52,8 +52,8 @@ CODES = {
     "sign-flips-unrolled": "Rotations jumped between a quaternion and its negative; the signs were made continuous.",
     # Inferred properties.
     "unit-inferred": "The unit of length is unusual; it was inferred from the size of the body.",
-    "unit-doubtful": "With the unit of length that the file states, or that was given, the legs are not as long as "
-    "those of an adult.",
+    "unit-doubtful": "With the unit of length that the file states, or that was given, the legs are shorter or longer "
+    "than those of an adult.",
     "up-axis-assumed": "The file does not show which axis points up; y was assumed.",
     "up-axis-doubtful": "From feet to head, the body does not point along the upward axis that was given.",
     "up-axis-converted": "The upward axis of the file is not y; the motion was rotated.",

@@ -75,7 +75,7 @@ def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
     try:
         ModelGraph.model_validate(document)
     except ValidationError as error:
-        raise FormatError(f"The graph is not valid as {SCHEMA}: {first_reason(error)}", code="invalid") from error
+        raise FormatError(f"the graph is not valid as {SCHEMA}: {first_reason(error)}", code="invalid") from error
     return ImportedItem(graph.file, Kind.GRAPH, graph.name, graph.collection, {"graph": document}, graph.tags)
 
 

@@ -87,7 +87,10 @@ def equal_clips(database: MatchingDatabase) -> NDArray[np.int64]:
 
 
 def _same_rows(database: MatchingDatabase, first: DatabaseClip, second: DatabaseClip) -> bool:
-    """Check whether two clips have equal features, root motion, poses and contacts, and are both loops or both not."""
+    """Check whether two clips have equal rows, and are both loops or both not.
+
+    Compared are features, selectable rows, root motion, poses, contacts and translations.
+    """
     one, other = (slice(clip.start, clip.stop) for clip in (first, second))
     arrays = (
         database.features,

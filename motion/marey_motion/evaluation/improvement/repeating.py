@@ -37,7 +37,7 @@ class RepeatedChange(MetricChange):
 
 
 def repeated(change: MetricChange, before: Floats, differences: Floats) -> RepeatedChange:
-    """Add to a change the interval in which the change lies if its measurement is repeated with another seed.
+    """Add to a change the interval that contains 95 of 100 changes measured with other seeds.
 
     Parameters
     ----------
