@@ -56,7 +56,7 @@ class EntryChange(NamedTuple):
     value: Value | None
     """The entry after the commit; None if the commit removed it."""
     unchanged: Mapping[str, str]
-    """Parts whose documents the archive lacks, each with the content digest of an earlier revision that has them."""
+    """For each part whose document the archive lacks, the content digest of an earlier revision with this document."""
 
 
 class Archive:
