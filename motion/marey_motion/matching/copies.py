@@ -89,7 +89,7 @@ def equal_clips(database: MatchingDatabase) -> NDArray[np.int64]:
 def _same_rows(database: MatchingDatabase, first: DatabaseClip, second: DatabaseClip) -> bool:
     """Check whether two clips have equal rows, and are both loops or both not.
 
-    Compared are features, selectable rows, root motion, poses, contacts and translations.
+    Rows are equal if their features, selectability, root motion, poses, contacts and translations are equal.
     """
     one, other = (slice(clip.start, clip.stop) for clip in (first, second))
     arrays = (
