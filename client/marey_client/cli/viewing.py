@@ -82,7 +82,7 @@ def view(
         str | None, typer.Option(help="With --out: frames of the clip, such as 100:200. Default: all frames.")
     ] = None,
     moments: Annotated[
-        int, typer.Option(min=1, help="With --out and a picture: number of poses in a row.")
+        int, typer.Option(min=1, help="Number of poses in a row, if --out names a picture (.png or .svg).")
     ] = DEFAULT_MOMENTS,
     n: Annotated[
         int, typer.Option("-n", min=1, help="With --out: number of samples of a model, or of trials of an evaluation.")

@@ -97,7 +97,7 @@ def _export(
 
 
 def _print_notes(made: ExportedVersion) -> None:
-    """Print which files have other names than their clips, and how many entries were left out as they are no clips."""
+    """Print which files have other names than their clips, and how many entries that are not clips were left out."""
     for path, file in list(made.renamed.items())[:RENAMED_SHOWN]:
         print_message(f"{path} is in the file {file}, because not all systems accept its name")
     if len(made.renamed) > RENAMED_SHOWN:

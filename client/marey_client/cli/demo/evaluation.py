@@ -16,7 +16,7 @@ from marey_client.project import ProjectHandle
 
 NAME = "evaluation"
 TRAVEL_M = 0.5
-"""Median horizontal displacement of the root within `TRAVEL_WINDOW_S`, in metres, from which a clip is locomotion."""
+"""Least median horizontal displacement of the root of a locomotion clip within `TRAVEL_WINDOW_S`, in metres."""
 TRAVEL_WINDOW_S = 1.0
 """Time in seconds over which the displacement of the root is measured."""
 OPTIONS: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Help for commands that submit jobs: common options, the progress bar, and the output at the end of a job."""
+"""Common parts of the commands that submit jobs: options, progress bar, and the output at the end of a job."""
 
 from __future__ import annotations
 

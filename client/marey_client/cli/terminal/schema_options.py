@@ -202,7 +202,11 @@ class _Option:
 
 
 class SchemaCommand(TyperCommand):
-    """Command with options from models; a subclass sets its function, and the models by parameter of the function."""
+    """Command whose options come from models.
+
+    A subclass sets `function`, the function to run, and `groups`: for each parameter of the function that receives the
+    options of a model, the `OptionsOf` this model.
+    """
 
     function: ClassVar[Callable[..., Any]]
     groups: ClassVar[Mapping[str, OptionsOf]]
