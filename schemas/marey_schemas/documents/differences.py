@@ -80,7 +80,8 @@ class Exceeding(Answer):
     """Size of a change over the matched frames, and the times at which the change exceeds the threshold."""
 
     mean: float = Field(
-        description="Mean size of the change over all matched frames, in degrees or centimetres, as the threshold."
+        description="Mean size of the change over all matched frames, in the unit of the threshold: degrees for "
+        "rotations, centimetres for positions and translations."
     )
     largest: float
     largest_at: int = Field(description="Frame of the revision `after` with the largest change.")

@@ -136,8 +136,8 @@ class MetricFit(Request):
     )
     noise_ceiling: _Amount | None = Field(
         None,
-        description="Standard error by chance of the perceived differences. A fit with a smaller error describes "
-        "noise. Null: unknown, because too few pairs were judged repeatedly.",
+        description="Standard error of the perceived differences, which is due to chance. A fit with a smaller error "
+        "describes noise. Null: unknown, because too few pairs were judged repeatedly.",
     )
     left_out_rmse: _Amount | None = Field(
         None,

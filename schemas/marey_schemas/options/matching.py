@@ -34,7 +34,9 @@ class FeatureWeights(Options):
     trajectory_positions: _Weight = Field(1.0, description=_OF_GROUP.format("positions of the trajectory ahead"))
     trajectory_directions: _Weight = Field(1.5, description=_OF_GROUP.format("directions of the trajectory ahead"))
     extra_joints: _Weight = Field(
-        1.0, description=_OF_GROUP.format("position, and of the velocity, of each of `extra_joints`")
+        1.0,
+        description="Weight in the cost of a match of the position, and of the velocity, of each joint in the option "
+        "`extra_joints` of the database; 0 leaves these joints out.",
     )
 
 

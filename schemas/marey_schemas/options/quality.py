@@ -63,9 +63,21 @@ class QualityOptions(Options):
         description="Speed in metres per second below which a low joint counts as touching the floor, in the "
         "measure `contact_consistency`.",
     )
-    knee_least_deg: _Bend = Field(-10.0, description="Least bend of a knee in degrees; negative: bent forwards.")
-    knee_most_deg: _Bend = Field(135.0, description="Greatest bend of a knee in degrees.")
-    elbow_most_deg: _Bend = Field(150.0, description="Greatest bend of an elbow in degrees.")
+    knee_least_deg: _Bend = Field(
+        -10.0,
+        description="Smallest bend of a knee in its natural range, in degrees; negative: overextended. Smaller bends "
+        "count in the measures `limit_excess_deg` and `limit_excess_max_deg`.",
+    )
+    knee_most_deg: _Bend = Field(
+        135.0,
+        description="Greatest bend of a knee in its natural range, in degrees. Greater bends count in the measures "
+        "`limit_excess_deg` and `limit_excess_max_deg`.",
+    )
+    elbow_most_deg: _Bend = Field(
+        150.0,
+        description="Greatest bend of an elbow in its natural range, in degrees. Greater bends count in the measures "
+        "`limit_excess_deg` and `limit_excess_max_deg`.",
+    )
 
     @model_validator(mode="after")
     def _check_range(self) -> Self:

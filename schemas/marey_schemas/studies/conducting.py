@@ -88,8 +88,8 @@ class StudyDifferences(Answer):
         description="Motions along the first principal component of the differences; null: some motion is in no trial."
     )
     noise: float | None = Field(
-        description="Standard error by chance of the differences (root mean square), without the differences "
-        "between people; null: unknown, because too few pairs were judged repeatedly."
+        description="Standard error of the differences (root mean square), which is due to chance; it does not include "
+        "how much people differ from each other. Null: unknown, because too few pairs were judged repeatedly."
     )
 
 
