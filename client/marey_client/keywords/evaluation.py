@@ -43,8 +43,8 @@ class DatabaseKeywords(TypedDict, total=False):
     copies alone."""
     end_policy: Literal["clamp", "trim", "loop"]
     """Handling of the end of a clip, where its future trajectory is unknown. clamp: the last frame is repeated, and the
-    last 1/3 s is not selected; trim: the last second is not selected; loop: the beginning of the clip follows, for
-    clips marked as loops."""
+    last 1/3 s is not selected; trim: frames from which the last of `horizons_s` is beyond the end are not selected;
+    loop: the beginning of the clip follows, for clips marked as loops, and others are treated as by clamp."""
     root_mode: Literal["simulated", "bone"]
     """Source of the character's motion on the ground. simulated: the smoothed position and heading of the body; bone:
     the root joint, for data whose root joint moves as the character does."""

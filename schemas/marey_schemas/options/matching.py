@@ -50,9 +50,10 @@ class DatabaseOptions(Options):
     )
     end_policy: EndPolicy = Field(
         "clamp",
-        description="Handling of the end of a clip, where its future trajectory is unknown. clamp: the last "
-        "frame is repeated, and the last 1/3 s is not selected; trim: the last second is not "
-        "selected; loop: the beginning of the clip follows, for clips marked as loops.",
+        description="Handling of the end of a clip, where its future trajectory is unknown. clamp: the last frame is "
+        "repeated, and the last 1/3 s is not selected; trim: frames from which the last of `horizons_s` is beyond the "
+        "end are not selected; loop: the beginning of the clip follows, for clips marked as loops, and others are "
+        "treated as by clamp.",
     )
     root_mode: RootMode = Field(
         "simulated",
