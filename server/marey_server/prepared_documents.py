@@ -163,7 +163,10 @@ def _require_rotations(motion: MotionDocument) -> None:
 def _check_pointers(pointers: list[str]) -> None:
     for pointer in pointers:
         if len(pointer) > _POINTER_LENGTH:
-            detail = f"The JSON Pointer of an array or file must have at most {_POINTER_LENGTH} characters."
+            detail = (
+                f"The document has an array or file whose JSON Pointer has {len(pointer)} characters; at most "
+                f"{_POINTER_LENGTH} are allowed. Use shorter names or fewer levels."
+            )
             raise InvalidProblem(
                 detail, errors=[FieldError(pointer=pointer[:_POINTER_LENGTH], code="too-deep", detail=detail)]
             )

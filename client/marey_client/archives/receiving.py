@@ -87,8 +87,8 @@ def require_base(archive: Archive, has: Callable[[str], bool]) -> None:
     for commit in archive.manifest.base:
         if not has(commit):
             raise EarlierVersionsMissing(
-                f"the archive has only the versions after {commit}, which the dataset does not have; import an archive "
-                "with this version first"
+                f"the archive builds on the version {commit}, but the dataset does not have this version; first import "
+                "an archive that contains it"
             )
 
 

@@ -58,7 +58,10 @@ class AsyncUsers(Counterpart):
         return await self._run(self._sync.change, name, change)
 
     async def disable(self, name: str) -> None:
-        """Disable a user, whose data is kept; password and tokens of the user do not work until `enable` is called."""
+        """Disable a user: password, tokens and sign-ins do not work until `enable` is called. The data is kept.
+
+        Also pauses the user's schedules and withdraws the user's invitations; `enable` does not undo this.
+        """
         await self._run(self._sync.disable, name)
 
     def identities(self, name: str) -> AsyncIterator[Identity]:
@@ -86,7 +89,7 @@ class AsyncUsers(Counterpart):
         return await self._run(self._sync.change_quotas, name, change)
 
     async def enable(self, name: str) -> User:
-        """Enable a disabled user again, with the same password and tokens."""
+        """Enable a disabled user again, with the same password and tokens; the user's schedules stay paused."""
         return await self._run(self._sync.enable, name)
 
 
@@ -132,7 +135,7 @@ class AsyncTokens(Counterpart):
 
 @counterpart_of(Members)
 class AsyncMembers(Counterpart):
-    """Members of a project, each with a role that applies in the whole project; folders may have other roles."""
+    """Members of a project, each with a role in the project; in some folders, members may have other roles."""
 
     _sync: Members
 

@@ -47,7 +47,7 @@ class AsyncUploadReport(Counterpart):
 
     @property
     def left_out(self) -> tuple[Path, ...]:
-        """Paths in the folders that were not imported: hidden files, files without motion, and skipped folders."""
+        """Paths in the folders that were not imported: files in other formats, hidden motion files, skipped folders."""
         return self._sync.left_out
 
     def clips(self) -> AsyncIterator[AsyncClipHandle]:

@@ -341,9 +341,10 @@ def _mean_distance(a, b):
 
 @compiled
 def _cost_from_box(points, start, stop, low, high, most):
-    """Sum the mean distances of the points from their bounding boxes over the frames [start, stop).
+    """Sum, over the frames [start, stop), the mean distance of the points (N, P, 3) from given boxes.
 
-    The boxes have the corners `low` and `high` (P, 3). The sum is not continued once it exceeds `most`.
+    The box of point p has the corners low[p] and high[p] (P, 3): it bounds this point in another range of frames. The
+    sum is not continued once it exceeds `most`.
     """
     total = 0.0
     for i in range(start, stop):

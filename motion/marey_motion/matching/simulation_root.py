@@ -52,9 +52,9 @@ def simulation_root(positions: Floats, body: MatchingBody, rate_hz: float) -> Si
 
     Notes
     -----
-    Savitzky-Golay filters of third order over 0.5 s and 1 s are used, as is usual for motion matching; for short clips,
-    the filters are shorter. A loop is filtered across its seam if it has been extended by frames of the rounds before
-    and after it (`looping.continue_motion`).
+    Savitzky-Golay filters of third order smooth the position over 0.5 s and the facing direction over 1 s, as is usual
+    for motion matching; for shorter clips, the windows are shorter. To smooth a loop across its seam, extend it with
+    `looping.continue_motion` before you call this function.
     """
     raw = raw_root(positions, body)
     facing = np.stack((np.sin(raw.headings), np.cos(raw.headings)), axis=-1)

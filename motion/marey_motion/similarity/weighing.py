@@ -105,7 +105,7 @@ _Term = tuple[bool, list[int], list[float], float]
 
 
 def _terms(metric: PerceptualMetric, share: float, component: Component, known: set[str]) -> list[_Term]:
-    """List a component's terms (`rotated`, `places`, `factors`, `weight`), one per joint class with a weight above 0."""
+    """List a component's terms (`rotated`, `places`, `factors`, `weight`): one per joint class of positive weight."""
     turned = component.measurement == "angles"
     names = ROTATED_JOINTS if turned else JOINTS
     first = len(JOINTS) if component.measurement == "velocities" else 0

@@ -9,11 +9,11 @@ from marey_server.errors import UnavailableProblem
 from marey_server.store.database.lanes import RETRY_AFTER_S, Client
 
 CLIENT_SHARE = 0.75
-"""Largest fraction of the memory that one client may hold."""
+"""Largest fraction of the memory for requests (`RequestMemory.total_bytes`) that one client may hold."""
 UNKNOWN_SHARE = 0.25
-"""Largest fraction of the memory that all clients without a known token together may hold."""
+"""Largest fraction of the memory for requests that all clients without a known token together may hold."""
 UNKNOWN_SHARE_EACH = UNKNOWN_SHARE / 2
-"""Largest fraction of the memory that one client without a known token, identified by its address, may hold."""
+"""Largest fraction of the memory for requests that one address without a known token may hold."""
 RESERVED_SHARE = 0.125
 """Additional memory for reserved operations, such as heartbeats, as a fraction of the memory for other requests."""
 UNKNOWN_CLIENTS = "unknown-clients"

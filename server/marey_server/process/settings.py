@@ -329,8 +329,8 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
         lease_ttl_s = others.data.get("lease_ttl_s")  # absent where it was refused itself
         if lease_ttl_s is not None and heartbeat_s > lease_ttl_s / 2:
             raise ValueError(
-                f"the value must be at most half of lease_ttl_s, which is {lease_ttl_s:g}; otherwise workers "
-                "would lose running jobs"
+                f"the value must be at most {lease_ttl_s / 2:g}, which is half of lease_ttl_s ({lease_ttl_s:g}); "
+                "otherwise workers would lose running jobs"
             )
         return heartbeat_s
 

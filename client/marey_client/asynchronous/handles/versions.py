@@ -56,7 +56,10 @@ class AsyncDatasetHandle(Counterpart):
         return await self._run(self._sync.read)
 
     async def delete(self) -> None:
-        """Delete the dataset with its versions; the items of the project stay."""
+        """Delete the dataset; the items of the project stay, and the name can be used again.
+
+        The versions are stored until the deleted dataset is purged. Raises `Conflict` if a branch is protected.
+        """
         await self._run(self._sync.delete)
 
     @property

@@ -127,7 +127,7 @@ def across(swing: Floats | None, twist: Floats) -> Floats:
         direction = start - (start @ twist) * twist
         if np.linalg.norm(direction) > 1e-6:
             return np.asarray(direction / np.linalg.norm(direction))
-    raise AssertionError("the coordinate axis that is farthest from a direction is not parallel to it")
+    raise AssertionError(f"the twist axis must have finite coordinates, not {twist}")
 
 
 def _inner(document: Mapping[str, Any]) -> Mapping[str, Any]:

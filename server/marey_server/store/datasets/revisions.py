@@ -27,7 +27,11 @@ from marey_versions.records import RevisionKey
 MISSING_CONTENTS = "missing-contents"
 """Code of the error for revisions that the project does not have; `context.contents` lists their digests."""
 MOST_COMBINED = 10_000
-"""Greatest number of entries that one commit combines from changes of both sides, each stored as a new revision."""
+"""Greatest number of entries for which one merge combines changes of both branches.
+
+Each combined entry is stored as a new revision. The limit also holds for the outputs of a job, which are merged with
+the changes that others have made meanwhile.
+"""
 LONGEST_NAME = 200
 """Greatest number of characters that the name of a new item takes from the last component of a path."""
 

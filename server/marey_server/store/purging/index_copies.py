@@ -32,13 +32,14 @@ class IndexSearch:
         self._lists: dict[str, tuple[StoredFile, ...]] = {}
         """Lists of clips that an index document names, by the digest of the document."""
         self._found: dict[str, frozenset[str]] = {}
-        """Wanted clips in each list, by its digest."""
+        """Clips of the constructor's `clips` in each list, by the digest of the list."""
 
     def update(self, tx: Transaction) -> dict[str, frozenset[str]]:
-        """Return, by the id of each index, those of the wanted clips whose poses a revision of the index contains.
+        """Read the lists of clips that were added since the last call, and return what all lists contain.
 
-        A list of clips that cannot be read, for example in an index that somebody has written by hand, is assumed to
-        contain all wanted clips.
+        The result gives, by the id of each index, the clips, of those given to the constructor, whose poses are in any
+        revision of this index; an index without such clips is left out. If a list cannot be read, for example because
+        somebody has written the index by hand, it is assumed to contain all these clips.
         """
         if not self._clips:
             return {}

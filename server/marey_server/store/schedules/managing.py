@@ -102,7 +102,10 @@ def change_schedule(
 
 
 def delete_schedule(tx: Transaction, project: str, name: str, *, expected_rev: ExpectedRev) -> None:
-    """Delete a schedule; its jobs stay. Raises `ForbiddenProblem` as `change_schedule` does."""
+    """Delete a schedule; its jobs stay.
+
+    Raises `ForbiddenProblem` if the caller is neither the author of the schedule nor a maintainer of the project.
+    """
     row = projects.require(tx, project)
     before = _require_rights(tx, row, name)
     if not is_expected(before.rev, expected_rev):

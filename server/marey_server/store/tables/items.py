@@ -81,9 +81,10 @@ The other members have too few different values for an index to make queries fas
 
 
 def _add_index(name: str) -> None:
-    """Add the index over a member of summaries.
+    """Add an index of items by the member `name` of their summary, a JSON object.
 
-    In the index, items with the same value are sorted by creation and id, as lists show them.
+    The index contains the items that have this member and are not deleted. Items with the same value are sorted by
+    creation and id, as lists show them.
     """
     start = MemberStart(item.c.summary, name)
     stated = and_(start.is_not(None), item.c.deleted_us.is_(None))

@@ -31,7 +31,8 @@ def add_comment(tx: Transaction, project: str, name: str, number: int, request: 
     """Comment on an open proposal.
 
     Raises `NotFoundProblem` if the request names an entry that neither the proposed version nor the target has, and
-    `ConflictProblem` if the proposal has ended or has too many comments. Raises the errors of `require_room`.
+    `ConflictProblem` if the proposal has ended, has too many comments, or has no space for a comment of this length.
+    Raises `QuotaExceededProblem` if the texts of all proposals of the project would be too long.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
