@@ -31,8 +31,8 @@ class FeatureWeightsKeywords(TypedDict, total=False):
     trajectory_directions: float
     """Weight of the directions of the trajectory ahead in the cost of a match; 0 leaves it out."""
     extra_joints: float
-    """Weight of the position, and of the velocity, of each of `extra_joints` in the cost of a match; 0 leaves it
-    out."""
+    """Weight in the cost of a match of the position, and of the velocity, of each joint in the option `extra_joints` of
+    the database; 0 leaves these joints out."""
 
 
 class DatabaseKeywords(TypedDict, total=False):

@@ -137,11 +137,14 @@ class QualityKeywords(TypedDict, total=False):
     """Speed in metres per second below which a low joint counts as touching the floor, in the measure
     `contact_consistency`."""
     knee_least_deg: float
-    """Least bend of a knee in degrees; negative: bent forwards."""
+    """Smallest bend of a knee in its natural range, in degrees; negative: overextended. Smaller bends count in the
+    measures `limit_excess_deg` and `limit_excess_max_deg`."""
     knee_most_deg: float
-    """Greatest bend of a knee in degrees."""
+    """Greatest bend of a knee in its natural range, in degrees. Greater bends count in the measures `limit_excess_deg`
+    and `limit_excess_max_deg`."""
     elbow_most_deg: float
-    """Greatest bend of an elbow in degrees."""
+    """Greatest bend of an elbow in its natural range, in degrees. Greater bends count in the measures
+    `limit_excess_deg` and `limit_excess_max_deg`."""
     draws: int
     """Number of bootstrap samples of the takes, from which the confidence intervals are computed."""
     title: str

@@ -51,7 +51,7 @@ class AsyncStudyHandle(AsyncItemHandle):
         return await self._run(self._sync.progress)
 
     def judgements(self, *, revision: int | None = None) -> AsyncIterator[JudgingParticipant]:
-        """List the participants who saw a revision, by default the newest, each with all trials under a pseudonym.
+        """List participants who saw a revision (default: that of the handle), each with all trials under a pseudonym.
 
         Only maintainers and owners may do this.
         """

@@ -97,7 +97,8 @@ def read_result_file(tx: Transaction, project: str, job_id: str, name: str) -> t
         try:
             return StoredFile.model_validate(entry.get(name)), found
         except ValidationError:
-            files = ", ".join(other for other, value in entry.items() if isinstance(value, dict) and "blob" in value)
+            names = sorted(other for other, value in entry.items() if isinstance(value, dict) and "blob" in value)
+            files = ", ".join(names)  # sorted, because Postgres stores no order of members
             raise NotFoundProblem(
                 f"The result of the job has no file {name!r}; it has {files or 'none'}.", code="no-file"
             ) from None
