@@ -115,7 +115,7 @@ def test_a_set_of_mirrored_copies_alone_has_takes() -> None:
 
 def test_the_mirrored_copy_of_the_only_clip_is_no_other_clip() -> None:
     pool = with_copies([LEFT, mirrored_track(LEFT)._replace(uid="left~")], "left~")
-    with pytest.raises(MotionError, match="need another clip"):
+    with pytest.raises(MotionError, match="need two different clips"):
         take_trials(pool, TAKES)
 
 
