@@ -81,7 +81,7 @@ def test_choices_and_confirmations_have_no_replicate_in_common() -> None:
         chosen_from = {*estimation_replicates(how), *range(evaluation.replicates)}
         assert len({*used, *chosen_from}) == len(used) + len(chosen_from)
     for count in (1, 2):
-        with pytest.raises(ValidationError, match="have no interval; choose at least 3, or 0"):
+        with pytest.raises(ValidationError, match="are too few for an interval; choose at least 3, or 0"):
             SuggestionOptions(confirmation_replicates=count)
 
 
