@@ -83,7 +83,7 @@ def test_keyframes_of_an_action_are_frames_ends_or_the_middle() -> None:
     assert begin.parts["model"]["keyframes"] == {"contact": 30, "last": 47, "contact0": 20}
     assert left.parts["model"]["keyframes"] == {"end": 47, "half": 24}
     _, detail = refusal(changed(meta={"annotations": {"begin": {"contact": "soon"}}}))
-    assert "'contact' is at 'soon'" in detail
+    assert "keyframe 'contact' must be" in detail
 
 
 @pytest.mark.parametrize("colon", [False, True])
