@@ -19,6 +19,8 @@ from tests.support.patience import PATIENCE_S
 from tests.support.server_process import reserved_port
 from tests.support.tiers import SYSTEM_PATH
 
+END_S = 30.0
+"""Longest wait in seconds until cancelled jobs have ended; Slurm kills them 5 seconds after their cancellation."""
 CPUS = 4
 MEMORY_MB = 8000
 
@@ -50,7 +52,9 @@ class SlurmCluster:
         self._until(lambda: "UP" in self.ask("scontrol", "ping"))
 
     def stop(self) -> None:
-        """Stop the daemons that were started last first."""
+        """End all jobs, and then stop the daemons, beginning with the one that was started last."""
+        if self._daemons and all(daemon.poll() is None for daemon in self._daemons):
+            self._end_jobs()
         for daemon in reversed(self._daemons):
             if daemon.poll() is None:
                 daemon.terminate()
@@ -59,6 +63,13 @@ class SlurmCluster:
                 except subprocess.TimeoutExpired:
                     daemon.kill()
                     daemon.wait()
+
+    def _end_jobs(self) -> None:
+        """Cancel all jobs, and wait until they have ended: a node waits long for jobs whose controller is gone."""
+        self.ask("scancel", "--me")
+        deadline = time.monotonic() + END_S
+        while self.ask("squeue", "--noheader").strip() and time.monotonic() < deadline:
+            time.sleep(0.2)
 
     def ask(self, program: str, *arguments: str) -> str:
         """Return the output of a command of Slurm, also if the command fails."""
