@@ -21,6 +21,7 @@ from tests.support.tiers import SYSTEM_PATH
 
 END_S = 30.0
 """Longest wait in seconds until cancelled jobs have ended; Slurm kills them 5 seconds after their cancellation."""
+DAEMONS = ("munged", "slurmctld", "slurmd")
 CPUS = 4
 MEMORY_MB = 8000
 
@@ -53,7 +54,7 @@ class SlurmCluster:
 
     def stop(self) -> None:
         """End all jobs, and then stop the daemons, beginning with the one that was started last."""
-        if self._daemons and all(daemon.poll() is None for daemon in self._daemons):
+        if sum(daemon.poll() is None for daemon in self._daemons) == len(DAEMONS):
             self._end_jobs()
         for daemon in reversed(self._daemons):
             if daemon.poll() is None:
