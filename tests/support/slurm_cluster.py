@@ -17,11 +17,10 @@ from pathlib import Path
 
 from tests.support.patience import PATIENCE_S
 from tests.support.server_process import reserved_port
-from tests.support.tiers import SYSTEM_PATH
+from tests.support.tiers import SLURM_DAEMONS, SYSTEM_PATH
 
 END_S = 30.0
 """Longest wait in seconds until cancelled jobs have ended; Slurm kills them 5 seconds after their cancellation."""
-DAEMONS = ("munged", "slurmctld", "slurmd")
 CPUS = 4
 MEMORY_MB = 8000
 
@@ -54,7 +53,7 @@ class SlurmCluster:
 
     def stop(self) -> None:
         """End all jobs, and then stop the daemons, beginning with the one that was started last."""
-        if sum(daemon.poll() is None for daemon in self._daemons) == len(DAEMONS):
+        if sum(daemon.poll() is None for daemon in self._daemons) == len(SLURM_DAEMONS):
             self._end_jobs()
         for daemon in reversed(self._daemons):
             if daemon.poll() is None:

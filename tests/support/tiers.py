@@ -34,7 +34,8 @@ CLUSTER_IMAGE_VARIABLE = "MAREY_TEST_CLUSTER_IMAGE"
 CHROMIUM_VARIABLE = "MAREY_TEST_CHROMIUM"
 """Environment variable with the path of Chromium; without it, the program `chromium` is looked for."""
 NODE_PACKAGES = PAGE_SOURCES / "node_modules"
-SLURM_PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
+SLURM_DAEMONS = ("munged", "slurmctld", "slurmd")
+SLURM_PROGRAMS = (*SLURM_DAEMONS, "sbatch")
 PROGRAMS = ("kubectl", "zsh", "fish")
 """Programs that some tests need, which are marked with the name of the program."""
 SYSTEM_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
