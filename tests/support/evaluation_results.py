@@ -9,7 +9,8 @@ from numpy.random import Generator
 
 from marey_motion.arrays import Ints, Ints32
 from marey_motion.evaluation.coverage import Windows, coverage_of
-from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
+from marey_motion.evaluation.metrics import measure_trial
+from marey_motion.evaluation.pooling import pooled_metrics
 from marey_motion.evaluation.relevance import count_switches, measure_usage
 from marey_motion.evaluation.result import Coverage, EvaluationResult, Provenance
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials

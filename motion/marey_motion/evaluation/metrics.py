@@ -244,7 +244,7 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
     total = _of(np.sum, offsets)
     metrics = {
         "offset_mean": _of(np.mean, offsets),
-        "offset_rms": _of(_rms, offsets),
+        "offset_rms": _of(root_mean_square, offsets),
         "offset_max": _of(np.max, offsets),
         "offset_final": float(offsets[-1]) if len(offsets) else None,
         "offset_sum": total,
@@ -252,7 +252,7 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
     }
     for name, values in (("cross_track", series.cross_track_m[window]), ("along_track", series.along_track_m[window])):
         metrics[f"{name}_mean"] = _of(np.mean, values)
-        metrics[f"{name}_rms"] = _of(_rms, values)
+        metrics[f"{name}_rms"] = _of(root_mean_square, values)
         metrics[f"{name}_max"] = _of(np.max, np.abs(values))
     return metrics
 
@@ -264,7 +264,7 @@ def _settled_metrics(series: TrialSeries, window: Flags, speeds: Metrics) -> dic
     desired motion does not change, they are used for the settled steps, too. If its direction or turn rate changes, the
     heading and the spread of the turn rate in settled steps are added.
     """
-    heading_deg = _degrees(_of(_rms, series.heading_errors_rad[window]))
+    heading_deg = _degrees(_of(root_mean_square, series.heading_errors_rad[window]))
     if series.settled.all():
         return {"settled_se_v": speeds["se_v"], "settled_dse_v": speeds["dse_v"], "heading_rms_deg": heading_deg}
     settled = window & series.settled
@@ -275,7 +275,7 @@ def _settled_metrics(series: TrialSeries, window: Flags, speeds: Metrics) -> dic
         "heading_rms_deg": heading_deg,
     }
     if not series.changes_speed:
-        metrics["settled_heading_rms_deg"] = _degrees(_of(_rms, series.heading_errors_rad[settled]))
+        metrics["settled_heading_rms_deg"] = _degrees(_of(root_mean_square, series.heading_errors_rad[settled]))
         spread = _pooled_spread(series.turn_rates_rad_s[settled], series.regimes[settled])
         metrics["settled_dse_omega_deg"] = _degrees(spread)
     return metrics
@@ -399,71 +399,19 @@ def _of(measure: Callable[[Floats], np.float64 | float], values: Floats) -> floa
     return float(measure(values)) if len(values) else None
 
 
-def _rms(values: Floats) -> float:
+def root_mean_square(values: Floats) -> float:
+    """Compute the root mean square of values.
+
+    Parameters
+    ----------
+    values : (N,)    at least one value, in any unit
+
+    Returns
+    -------
+    float    in the same unit
+    """
     return float(np.sqrt(np.mean(values**2)))
 
 
 def _p95(values: Floats) -> float:
     return float(np.percentile(values, 95.0))
-
-
-SUMMED = ("transitions", "clip_ends", "response_missed")
-"""Metrics that are counts; the suite's value is the sum over its trials."""
-
-
-def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:
-    """Pool the metrics of several trials; metrics of a regime get the prefix `<regime>.`.
-
-    A maximum is pooled as the largest value of all trials, a root mean square as the root mean square of the trials'
-    values, and a count as the sum. Every other metric is pooled as the mean over the trials in which it is defined.
-    `dse_…_pooled` is the root mean square of the standard deviations of the trials.
-
-    Parameters
-    ----------
-    results : sequence of TrialResult    the trials
-
-    Returns
-    -------
-    dict of str to float or None    metrics by name
-    """
-    pooled = _pooled([result.metrics for result in results])
-    for regime in REGIMES:
-        several = [result.regimes[regime] for result in results if regime in result.regimes]
-        pooled |= {f"{regime}.{name}": value for name, value in _pooled(several).items()}
-    return pooled
-
-
-def _pooled(several: Sequence[Metrics]) -> dict[str, float | None]:
-    names = dict.fromkeys(name for metrics in several for name in metrics)
-    pooled: dict[str, float | None] = {}
-    for name in names:
-        values = np.array([value for metrics in several if (value := metrics.get(name)) is not None])
-        measure = np.sum if name in SUMMED else np.max if name.endswith("_max") else np.mean
-        pooled[name] = _of(_rms if name.endswith("_rms") else measure, values)
-        if name in ("dse_v", "dse_omega_deg", "dse_omega_path_deg"):
-            pooled[f"{name}_pooled"] = _of(_rms, values)
-    return pooled
-
-
-def offset_asymmetry(results: Sequence[TrialResult]) -> float | None:
-    """Compute the mean absolute difference of `offset_mean` between trials that differ only in turning left or right.
-
-    Parameters
-    ----------
-    results : sequence of TrialResult    the trials
-
-    Returns
-    -------
-    float or None    metres; None if there is no such pair of trials
-    """
-    offsets = {
-        (result.trial.family, result.trial.speed_m_s, round(result.trial.turn_rate_rad_s, 9)): offset
-        for result in results
-        if (offset := result.metrics["offset_mean"]) is not None
-    }
-    differences = [
-        abs(offset - offsets[family, speed, -turn_rate])
-        for (family, speed, turn_rate), offset in offsets.items()
-        if turn_rate > 0.0 and (family, speed, -turn_rate) in offsets
-    ]
-    return float(np.mean(differences)) if differences else None

@@ -1,8 +1,8 @@
-"""Metrics of a suite, pooled from the metrics of its trials and their replicates."""
+"""Metrics of a suite, pooled over its trials and over their replicates."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +10,14 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.judgement import judge_trial
-from marey_motion.evaluation.metrics import offset_asymmetry, pooled_metrics
+from marey_motion.evaluation.metrics import REGIMES, root_mean_square
 from marey_motion.evaluation.replicates import MeasuredReplicates
 from marey_motion.evaluation.result import Metrics, ReplicateValues, TrialResult
 from marey_schemas.options.evaluation import EvaluationOptions
 
 TREADING_SHARE = "treading_share"
+SUMMED = ("transitions", "clip_ends", "response_missed")
+"""Metrics that are counts; the suite's value is the sum over its trials."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +94,71 @@ def suite_metrics(results: Sequence[TrialResult], options: EvaluationOptions) ->
 
 def _pooled_with_asymmetry(results: Sequence[TrialResult]) -> dict[str, float | None]:
     return {**pooled_metrics(results), "offset_asymmetry": offset_asymmetry(results)}
+
+
+def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:
+    """Pool the metrics of several trials; metrics of a regime get the prefix `<regime>.`.
+
+    A maximum is pooled as the largest value of all trials, a root mean square as the root mean square of the trials'
+    values, and a count as the sum. Every other metric is pooled as the mean over the trials in which it is defined.
+    `dse_…_pooled` is the root mean square of the standard deviations of the trials.
+
+    Parameters
+    ----------
+    results : sequence of TrialResult    the trials
+
+    Returns
+    -------
+    dict of str to float or None    metrics by name
+    """
+    pooled = _pooled([result.metrics for result in results])
+    for regime in REGIMES:
+        several = [result.regimes[regime] for result in results if regime in result.regimes]
+        pooled |= {f"{regime}.{name}": value for name, value in _pooled(several).items()}
+    return pooled
+
+
+def _pooled(several: Sequence[Metrics]) -> dict[str, float | None]:
+    names = dict.fromkeys(name for metrics in several for name in metrics)
+    pooled: dict[str, float | None] = {}
+    for name in names:
+        values = np.array([value for metrics in several if (value := metrics.get(name)) is not None])
+        pooled[name] = float(_pooling_measure(name)(values)) if len(values) else None
+        if name in ("dse_v", "dse_omega_deg", "dse_omega_path_deg"):
+            pooled[f"{name}_pooled"] = root_mean_square(values) if len(values) else None
+    return pooled
+
+
+def _pooling_measure(name: str) -> Callable[[Floats], np.float64 | float]:
+    if name in SUMMED:
+        return np.sum
+    if name.endswith("_max"):
+        return np.max
+    return root_mean_square if name.endswith("_rms") else np.mean
+
+
+def offset_asymmetry(results: Sequence[TrialResult]) -> float | None:
+    """Compute the mean absolute difference of `offset_mean` between trials that differ only in turning left or right.
+
+    Parameters
+    ----------
+    results : sequence of TrialResult    the trials
+
+    Returns
+    -------
+    float or None    metres; None if there is no such pair of trials
+    """
+    offsets = {
+        (result.trial.family, result.trial.speed_m_s, round(result.trial.turn_rate_rad_s, 9)): offset
+        for result in results
+        if (offset := result.metrics["offset_mean"]) is not None
+    }
+    differences = [
+        abs(offset - offsets[family, speed, -turn_rate])
+        for (family, speed, turn_rate), offset in offsets.items()
+        if turn_rate > 0.0 and (family, speed, -turn_rate) in offsets
+    ]
+    return float(np.mean(differences)) if differences else None
 
 
 def _values(

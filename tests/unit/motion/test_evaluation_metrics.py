@@ -7,7 +7,8 @@ from tests.support.present import present
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics, trial_series
+from marey_motion.evaluation.metrics import measure_trial, trial_series
+from marey_motion.evaluation.pooling import offset_asymmetry, pooled_metrics
 from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_motion.matching.record import Status, TrialRecord

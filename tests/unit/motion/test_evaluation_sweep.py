@@ -22,7 +22,7 @@ from marey_motion.evaluation.improvement.sweep import (
     sweep_weights,
     vary_each_group,
 )
-from marey_motion.evaluation.metrics import pooled_metrics
+from marey_motion.evaluation.pooling import pooled_metrics
 from marey_motion.evaluation.running import EvaluationCancelled
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody

@@ -14,7 +14,7 @@ from marey_motion.evaluation.improvement.effects import confirmation_replicates,
 from marey_motion.evaluation.improvement.objective import headline_means, objective_value
 from marey_motion.evaluation.improvement.repeating import RepeatedChange, repeated
 from marey_motion.evaluation.improvement.resimulation import Resimulation
-from marey_motion.evaluation.metrics import pooled_metrics
+from marey_motion.evaluation.pooling import pooled_metrics
 from marey_motion.evaluation.result import Metrics
 from marey_motion.evaluation.running import CancelCallback
 from marey_motion.evaluation.scenario import Trial, suite_trials
