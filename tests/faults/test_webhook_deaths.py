@@ -50,6 +50,7 @@ def first_arrivals(receiver: Receiver) -> list[int]:
     return list(dict.fromkeys(one.message["seq"] for one in receiver.received))
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize(("place", "repeated"), [("before_record", 1), ("after_record", 0)])
 @pytest.mark.parametrize("nth", [1, 3])
 def test_a_server_killed_around_a_record_loses_no_delivery(

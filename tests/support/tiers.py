@@ -41,9 +41,9 @@ PROGRAMS = ("kubectl", "zsh", "fish")
 SYSTEM_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
 """Folders in which daemons are looked for, also by users whose `PATH` does not contain them."""
 EXAMPLES, STEPS = 100, 50
-"""Number of examples that Hypothesis draws, and of steps that a state machine takes, in the tier `test`."""
+"""Number of examples that Hypothesis draws, and of steps that a state machine takes, for an effort of 1."""
 SOAK_EFFORT = 4
-"""Factor by which the tier `soak` draws more examples than the tier `test`, unless `--effort` gives another factor."""
+"""Effort of the tier `soak`, unless `--effort` gives another one."""
 
 
 LONGEST_STEPS = 2
@@ -55,7 +55,7 @@ class Tier:
     """A tier of tests: how many examples its generated tests draw, and which tests it leaves out, by reason."""
 
     effort: float
-    """Number of examples of generated tests, divided by that of the tier `test`."""
+    """Factor by which generated tests draw more examples than the number that they name."""
     leaves_out: dict[str, Callable[[pytest.Item], bool]]
 
 
@@ -166,6 +166,15 @@ def _on_other_database(item: pytest.Item) -> bool:
     return BACKENDS[zlib.crc32(name.encode()) % len(BACKENDS)] != backend
 
 
+def _other_case(item: pytest.Item) -> bool:
+    """Return whether only the tier `soak` runs this case, because its test has the mark `every_nth` and many cases."""
+    marker = item.get_closest_marker("every_nth")
+    return (
+        marker is not None
+        and item.config.stash[CASES][function_of(item)].index(_without_backend(item)) % marker.args[0] > 0
+    )
+
+
 TIERS = {
     "check": Tier(
         0.2,
@@ -174,12 +183,14 @@ TIERS = {
             "fault cases": _fault,
             "whole ways": _whole_way,
             "slow": _slow,
+            "other cases of tests with many": _other_case,
             "for the tier soak": _soak_only,
         },
     ),
     "test": Tier(
-        1,
+        0.5,
         {
+            "other cases of tests with many": _other_case,
             "for the tier soak": _soak_only,
             "on the other database": _on_other_database,
         },
@@ -192,12 +203,14 @@ LEFT_OUT = pytest.StashKey[Counter[str]]()
 """Key of the number of tests that the tier left out, by reason."""
 ON_DATABASES = pytest.StashKey[Counter[str]]()
 """Key of the number of databases on which a test can run, by its name without the database."""
+CASES = pytest.StashKey[dict[str, list[str]]]()
+"""Key of the names of the cases of each test with the mark `every_nth`, without the database, in their order."""
 
 
 def examples(count: int, soak: int | None = None) -> int:
-    """Return how many examples a property test draws in the running tier; `count` is the number in the tier `test`.
+    """Return how many examples a property test draws in the running tier; `count` is the number for an effort of 1.
 
-    The tier `soak` multiplies `count`, or `soak` if it is given. A test that is too slow to draw enough examples in the
+    The tier `soak` multiplies `soak` instead if it is given. A test that is too slow to draw enough examples in the
     tier `test` passes `soak`.
     """
     base = soak if soak is not None and is_soak() else count
@@ -205,7 +218,7 @@ def examples(count: int, soak: int | None = None) -> int:
 
 
 def steps(count: int) -> int:
-    """Return how many steps a state machine takes in the running tier; `count` is the number in the tier `test`."""
+    """Return how many steps a state machine takes in the running tier; `count` is the number for an effort of 1."""
     return count * present(hypothesis.settings.default).stateful_step_count // STEPS
 
 
@@ -221,7 +234,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         type=int,
         choices=range(2, 1001),
         metavar="TIMES",
-        help=f"Factor by which the tier soak draws more examples than the tier test (default: {SOAK_EFFORT}).",
+        help=f"Factor by which the tier soak draws more examples than tests name (default: {SOAK_EFFORT}).",
     )
     parser.addoption(
         "--fuzz-minutes",
@@ -273,6 +286,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if unset := [name for name in (CLUSTER_VARIABLE, CLUSTER_IMAGE_VARIABLE) if name not in os.environ]:
         reasons = {f"need a Kubernetes cluster ({' and '.join(unset)} not set)": _needs_cluster, **reasons}
     config.stash[ON_DATABASES] = Counter(_without_backend(item) for item in items if backend_of(item))
+    config.stash[CASES] = _cases(items)
     kept, gone = [], []
     for item in items:
         reason = next((reason for reason, applies in reasons.items() if applies(item)), None)
@@ -285,6 +299,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             config.stash[LEFT_OUT][reason] += 1
     config.hook.pytest_deselected(items=gone)
     items[:] = _in_order(kept)
+
+
+def _cases(items: Sequence[pytest.Item]) -> dict[str, list[str]]:
+    """Return the names of the cases of each test with the mark `every_nth`, by the name of the test."""
+    cases: defaultdict[str, dict[str, None]] = defaultdict(dict)
+    for item in items:
+        if item.get_closest_marker("every_nth"):
+            cases[function_of(item)][_without_backend(item)] = None
+    return {function: list(names) for function, names in cases.items()}
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

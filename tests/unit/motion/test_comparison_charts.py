@@ -70,6 +70,7 @@ COMPARISONS: dict[str, RunComparison] = {
 }  # fmt: skip
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("name", COMPARISONS)
 def test_each_comparison_has_a_page_and_pictures_with_nothing_cut_off(
     name: str, monkeypatch: pytest.MonkeyPatch

@@ -71,6 +71,7 @@ def other() -> EvaluationResult:
     return changed()
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("name", DEFAULT_FIGURES)
 def test_a_figure_has_the_same_bytes_each_time(name: str, result: EvaluationResult) -> None:
     first, second = is_sound_svg(figure_of(name)), draw_figure(name, result)
@@ -79,6 +80,7 @@ def test_a_figure_has_the_same_bytes_each_time(name: str, result: EvaluationResu
         assert is_sound(first).files() == second.files()
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("name", DEFAULT_FIGURES)
 def test_a_figure_of_two_results_is_sound(name: str) -> None:
     is_sound_svg(drawn_both()[name])
@@ -436,6 +438,7 @@ ALONE = ("clips of one frame", "no transitions", "one trial")
 """Evaluations that are not compared with another one."""
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("name", LITTLE)
 def test_evaluations_of_little_are_drawn(name: str) -> None:
     assert drawn_of_little(name)
@@ -443,6 +446,7 @@ def test_evaluations_of_little_are_drawn(name: str) -> None:
         is_sound(figure) if is_soak() else is_sound_svg(figure)
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("name", [name for name in LITTLE if name not in ALONE])
 def test_evaluations_of_little_are_compared(name: str) -> None:
     assert drawn_beside_little(name)

@@ -344,6 +344,7 @@ ODD_SHOWS = {
 """Names of the figures that show the unusual property of each model in `ODD`."""
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("odd", ODD)
 def test_odd_models_are_drawn_and_nothing_is_cut_off(odd: str) -> None:
     subject = ODD[odd]()

@@ -53,6 +53,7 @@ def test_the_check_finds_a_legend_over_a_line() -> None:
     assert covered_by_legends(figure) == []
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("name", LITTLE)
 def test_no_legend_of_an_odd_evaluation_covers_data(name: str) -> None:
     assert_free(drawn_of_little(name))

@@ -46,6 +46,7 @@ def require_mean(means: list[float], expected: float) -> None:
     assert high - low < 0.5 * expected
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize(("workers", "load"), [(1, 0.5), (2, 0.7), (8, 0.8)])
 def test_the_mean_wait_is_that_of_erlang_c(workers: int, load: float) -> None:
     offered = workers * load
