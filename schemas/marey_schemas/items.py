@@ -9,6 +9,7 @@ from marey_schemas.access import Role
 from marey_schemas.base import Answer, Request
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MOST_TAGS, CollectionPath, Digest, ItemName, Message, Tag
+from marey_schemas.sizes import MOST_INTEGER
 
 LOOP_TAG = "loop"
 """Tag of clips that are played as loops."""
@@ -63,7 +64,7 @@ class ItemChange(Request):
 class ItemRevert(Request):
     """Request to give an item the content of an earlier revision."""
 
-    revision: int = Field(ge=1, le=(1 << 31) - 1)
+    revision: int = Field(ge=1, le=MOST_INTEGER)
     message: Message = Field(
         "", description="Message of the new revision; empty: a sentence that names the earlier revision."
     )
@@ -98,7 +99,7 @@ class PartPlace(Request):
 
     kind: Kind
     item: str = Field(max_length=64)
-    revision: int = Field(ge=1, le=(1 << 31) - 1)
+    revision: int = Field(ge=1, le=MOST_INTEGER)
     part: str = Field(max_length=64)
 
 

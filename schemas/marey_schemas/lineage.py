@@ -11,6 +11,7 @@ from pydantic import Field
 
 from marey_schemas.base import Answer, Options
 from marey_schemas.kinds import Kind
+from marey_schemas.sizes import MOST_INTEGER
 from marey_schemas.wording import counted
 
 MOST_REVISIONS = 1000
@@ -43,7 +44,7 @@ class LineageOptions(Options):
 class LineageRequest(LineageOptions):
     """Query of a lineage graph: the revision it starts from, its direction and its depth."""
 
-    revision: int | None = Field(None, ge=1, lt=2**31, description="Revision to start from; absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MOST_INTEGER, description="Revision to start from; absent: the newest.")
 
 
 class LineageRevision(Answer):

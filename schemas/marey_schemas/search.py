@@ -20,6 +20,7 @@ from marey_schemas.options.searching import (
     RefineOptions,
 )
 from marey_schemas.search_constraints import Coordinate, Degrees, Distance, SearchConstraint, Tolerance
+from marey_schemas.sizes import MOST_INTEGER, SEEDS
 
 MOST_CONSTRAINTS = 64
 MOST_STEPS = 16
@@ -78,7 +79,7 @@ class SearchRequest(RefineOptions):
     )
     transition_tolerance_cm: Tolerance | None = in_centimetres("transition_tolerance_m")
     finish: bool = Field(False, description="Remove the remaining errors of joint positions by inverse kinematics.")
-    seed: int = Field(0, ge=0, lt=2**63, description="Seed of the samples that are drawn if the model has no tree.")
+    seed: int = Field(0, ge=0, lt=SEEDS, description="Seed of the samples that are drawn if the model has no tree.")
     motion: bool = Field(True, description="Include the motion in the answer.")
 
     @model_validator(mode="after")
@@ -172,9 +173,7 @@ MOST_MOMENTS = 100
 LONGEST_EXAMPLE_S = 60.0
 """Greatest duration of the example of a search, in seconds."""
 
-_MOST_NUMBER = 2**31 - 1
-
-FrameNumber = Annotated[int, Field(ge=0, le=_MOST_NUMBER)]
+FrameNumber = Annotated[int, Field(ge=0, le=MOST_INTEGER)]
 
 
 class SimilarOptions(Request):
@@ -186,8 +185,7 @@ class SimilarOptions(Request):
     )
     leave_out: Literal["window", "clip", "nothing"] = Field(
         "window",
-        description="Which moments of the example's own clip are left out: those that overlap the example, all, or "
-        "none.",
+        description="Moments of the example's own clip to leave out: those that overlap the example, all, or none.",
     )
     metric: ItemId = Field(
         DEFAULT_METRIC,
@@ -203,7 +201,7 @@ class SimilarRequest(SimilarOptions):
     """Request for the moments that resemble an example."""
 
     clip: ItemId = Field(description="Id of the clip that contains the example.")
-    revision: int | None = Field(None, ge=1, le=_MOST_NUMBER, description="Revision of the clip; absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MOST_INTEGER, description="Revision of the clip; absent: the newest.")
     frames: tuple[FrameNumber, FrameNumber] = Field(
         description="Frames of the example: the first, and the one after the last."
     )

@@ -1,4 +1,4 @@
-"""Units of sizes in bytes and of times, durations of logins, and division of long lists into short ones."""
+"""Units of sizes and times, limits of numbers, durations of logins, and division of long lists into short ones."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ KIB = 1024
 MIB = 1024 * KIB
 GIB = 1024 * MIB
 DAY_S = 86400
+MOST_INTEGER = 2**31 - 1
+"""Greatest number of a revision or of a frame, the greatest that an INTEGER column of Postgres stores."""
+SEEDS = 2**63
+"""Number of different seeds, the integers from 0 on."""
 LOGIN_DAYS, LONGEST_LOGIN_DAYS = 7, 90
 """Default number of days, and greatest number of days, for which the token of a login is valid."""
 LONGEST_TOKEN_DAYS = 3650

@@ -123,7 +123,7 @@ class SimilarKeywords(TypedDict, total=False):
     mirrored: bool
     """Also find moments that resemble the example with left and right exchanged."""
     leave_out: Literal["window", "clip", "nothing"]
-    """Which moments of the example's own clip are left out: those that overlap the example, all, or none."""
+    """Moments of the example's own clip to leave out: those that overlap the example, all, or none."""
     index: str | None
     """Id of the index to search; absent: the index of the project that was updated last."""
 

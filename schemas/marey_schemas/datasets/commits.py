@@ -11,6 +11,7 @@ from marey_schemas.base import Answer, Request, Tagged
 from marey_schemas.datasets.naming import MAIN, RefName
 from marey_schemas.kinds import Kind
 from marey_schemas.names import Digest, ItemId, Message, form
+from marey_schemas.sizes import MOST_INTEGER
 
 MOST_CHANGES = 10_000
 """Greatest number of explicit changes in one commit."""
@@ -35,7 +36,7 @@ class PutEntry(Tagged):
     change: Literal["put"] = "put"
     path: EntryPath
     item: ItemId
-    revision: int | None = Field(None, ge=1, le=(1 << 31) - 1, description="Number of the revision; null: the newest.")
+    revision: int | None = Field(None, ge=1, le=MOST_INTEGER, description="Number of the revision; null: the newest.")
 
 
 class RemoveEntry(Tagged):

@@ -15,6 +15,7 @@ from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Ve
 from marey_schemas.datasets.protection import CheckName
 from marey_schemas.kinds import Kind
 from marey_schemas.names import LINE, ItemId, Message, form
+from marey_schemas.sizes import MOST_INTEGER
 
 MOST_TEXT = 10_000
 """Greatest length, in characters, of a description, a comment or the text of a review."""
@@ -24,7 +25,7 @@ WITH_FRAMES = (Kind.CLIP, Kind.ANNOTATION)
 _LINK = form(r"^https?://[^\s\x00-\x1f\x7f]+$", "be a web address, beginning with https:// or http://")
 Title = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=LINE)]
 Text = Annotated[str, StringConstraints(min_length=1, max_length=MOST_TEXT)]
-Frame = Annotated[int, Field(ge=0, le=(1 << 31) - 1)]
+Frame = Annotated[int, Field(ge=0, le=MOST_INTEGER)]
 
 
 class ProposalCreate(Request):

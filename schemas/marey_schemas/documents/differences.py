@@ -17,6 +17,7 @@ from marey_schemas.documents.annotations import Annotation, KeyframeDocument, Se
 from marey_schemas.documents.skeletons import Vector3
 from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.kinds import Kind
+from marey_schemas.sizes import MOST_INTEGER
 
 Range = tuple[int, int]
 Change = Literal["added", "removed", "changed"]
@@ -47,11 +48,11 @@ class DifferenceRequest(DifferenceOptions):
         None,
         alias="from",
         ge=1,
-        lt=2**31,
+        le=MOST_INTEGER,
         description="Revision before the change. Absent: the revision before `to`, or the newest revision if "
         "`to_item` is given.",
     )
-    to: int | None = Field(None, ge=1, lt=2**31, description="Revision after the change. Absent: the newest.")
+    to: int | None = Field(None, ge=1, le=MOST_INTEGER, description="Revision after the change. Absent: the newest.")
     to_item: str | None = Field(
         None,
         max_length=64,

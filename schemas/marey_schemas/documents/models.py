@@ -21,7 +21,6 @@ MOST_CANONICAL_FRAMES = 10_000
 MOST_BASIS_NUMBERS = 20_000_000
 """Greatest size of the matrix of basis functions kept in memory: canonical frames times spline coefficients."""
 MOST_SAMPLES = 1000
-MOST_SEED = 2**63 - 1
 Vector = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=1)]
 Matrix = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=2)]
 Stack = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=3)]

@@ -9,11 +9,11 @@ from pydantic import Field, model_validator
 from marey_schemas.base import Request
 from marey_schemas.documents.reports import StoredFile
 from marey_schemas.names import ItemId
+from marey_schemas.sizes import MOST_INTEGER
 
 MOST_SHARDS = 2000
 """Greatest number of shards (pairs of files with the poses of many clips) of an index: about 1,200 hours of motion."""
-_MOST_NUMBER = 2**31 - 1
-_Number = Annotated[int, Field(ge=0, le=_MOST_NUMBER)]
+_Number = Annotated[int, Field(ge=0, le=MOST_INTEGER)]
 INDEX_VERSION = 1
 """Version of the format of shards; a server searches only indexes with this version."""
 

@@ -13,6 +13,7 @@ from marey_schemas.documents.references import PartDigestRef
 from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import Digest
 from marey_schemas.options.modelling import MOST_TREE_SAMPLES, TreeOptions
+from marey_schemas.sizes import SEEDS
 
 
 class SampleTreeDocument(Request):
@@ -26,7 +27,7 @@ class SampleTreeDocument(Request):
     model_digest: Digest | PartDigestRef = Field(
         description="Digest of the part `model` that the samples were drawn from; the tree is valid for no other model."
     )
-    seed: int = Field(ge=0, lt=2**63, description="Seed that the samples were drawn with.")
+    seed: int = Field(ge=0, lt=SEEDS, description="Seed that the samples were drawn with.")
     options: TreeOptions
     samples: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)] = Field(
         description="[n, L] latent vectors of the samples."

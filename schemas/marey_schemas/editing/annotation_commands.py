@@ -10,10 +10,10 @@ from marey_schemas.base import Request
 from marey_schemas.formats import DEFAULT_END_INDEX, EndIndex
 from marey_schemas.imports import ImportFile
 from marey_schemas.names import ItemName, Label, LayerName, Message
+from marey_schemas.sizes import MOST_INTEGER
 
-MAX_FRAME = 2**31 - 1
 MAX_COMMANDS = 1000
-Frame = Annotated[int, Field(ge=0, le=MAX_FRAME)]
+Frame = Annotated[int, Field(ge=0, le=MOST_INTEGER)]
 
 
 class CreateSegment(Request):

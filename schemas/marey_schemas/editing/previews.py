@@ -14,6 +14,7 @@ from marey_schemas.editing.commands import Frames
 from marey_schemas.editing.edits import MOST_COMMANDS, EditCommand
 from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.queue.jobs import ItemInput
+from marey_schemas.sizes import MOST_INTEGER
 
 
 class EditPreviewRequest(Request):
@@ -25,7 +26,7 @@ class EditPreviewRequest(Request):
     edit: ItemInput | None = Field(
         None, description="Edit to apply if `commands` are absent; by default its newest revision."
     )
-    revision: int | None = Field(None, ge=1, lt=2**31, description="Revision of the clip; absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MOST_INTEGER, description="Revision of the clip; absent: the newest.")
     frames: Frames = Field(
         (0, None), description="Half-open range of the result's frames to return; the part beyond the end is left out."
     )

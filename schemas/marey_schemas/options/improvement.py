@@ -8,6 +8,7 @@ from pydantic import Field, field_validator
 
 from marey_schemas.base import Options
 from marey_schemas.documents.replicates import LEAST_REPLICATES
+from marey_schemas.sizes import SEEDS
 
 _Price = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 _Factor = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
@@ -62,7 +63,7 @@ class ConfirmedEffects(ObjectiveChoice):
     confirmation_seed: int = Field(
         0,
         ge=0,
-        lt=2**63,
+        lt=SEEDS,
         description="Seed of the replicates for confirmation. With another seed, the same choices are confirmed in "
         "different replicates.",
     )

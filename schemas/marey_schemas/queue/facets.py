@@ -14,6 +14,7 @@ from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Request
 from marey_schemas.names import form
+from marey_schemas.sizes import MOST_INTEGER
 
 MOST_FACETS = 16
 """Greatest number of facets that a job kind declares."""
@@ -31,7 +32,7 @@ class ItemFacets(Request):
     """Facets of one item that a job measured, by name."""
 
     item: str = Field(max_length=64)
-    revision: int = Field(ge=1, le=(1 << 31) - 1)
+    revision: int = Field(ge=1, le=MOST_INTEGER)
     values: dict[FacetName, FacetValue] = Field(min_length=1, max_length=MOST_FACETS)
 
 

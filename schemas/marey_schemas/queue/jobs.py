@@ -15,6 +15,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, Message
 from marey_schemas.queue.commits import CommitConflict, JobCommit, OutputsCommit
 from marey_schemas.queue.own_pods import GPUS_LABEL, MOST_GPUS
+from marey_schemas.sizes import SEEDS
 
 
 class JobState(StrEnum):
@@ -187,7 +188,7 @@ class JobCreate(Request):
         description="use: reuse the result of an identical job; refresh: compute the result again and store it for "
         "later jobs; off: compute the result again, for this job only.",
     )
-    seed: int = Field(0, ge=0, lt=2**63, description="Seed of all random numbers; the same seed gives the same result.")
+    seed: int = Field(0, ge=0, lt=SEEDS, description="Seed of all random numbers; the same seed gives the same result.")
     max_attempts: int = Field(3, ge=1, le=20)
     labels: dict[str, str] = Field(default_factory=dict, description="Labels that a worker must have to run the job.")
     resources: Resources = Resources()

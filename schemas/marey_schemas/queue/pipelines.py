@@ -10,6 +10,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.names import CollectionPath, Message, form
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import CacheMode, Job, JobCreate, JobInput, JobOutputsInput, Resources
+from marey_schemas.sizes import SEEDS
 
 MOST_STEPS = 32
 
@@ -47,7 +48,7 @@ class PipelineStep(Request):
     into: CollectionPath | None = None
     priority: int | None = Field(None, ge=-100, le=100)
     cache: CacheMode | None = None
-    seed: int | None = Field(None, ge=0, lt=2**63)
+    seed: int | None = Field(None, ge=0, lt=SEEDS)
     max_attempts: int | None = Field(None, ge=1, le=20)
     labels: dict[str, str] | None = None
     resources: Resources | None = None
@@ -62,7 +63,7 @@ class PipelineCreate(Request):
     into: CollectionPath = Field("", description="The collection that receives the results.")
     priority: int = Field(0, ge=-100, le=100)
     cache: CacheMode = "use"
-    seed: int = Field(0, ge=0, lt=2**63)
+    seed: int = Field(0, ge=0, lt=SEEDS)
     max_attempts: int = Field(3, ge=1, le=20)
     labels: dict[str, str] = Field(default_factory=dict, description="Labels that a worker must have to run the steps.")
     resources: Resources = Resources()

@@ -18,7 +18,7 @@ from marey_schemas.names import SLUG, CollectionPath, Message, form
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import InputSpec, JobInput, JobState, Resources
 from marey_schemas.queue.own_pods import Image
-from marey_schemas.sizes import GIB, MIB
+from marey_schemas.sizes import GIB, MIB, SEEDS
 
 SCRIPT = "script"
 """Name of the job kind that runs scripts."""
@@ -346,7 +346,7 @@ class ScriptRunCreate(ConsentOverride):
     )
     inputs: dict[FieldName, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
     into: CollectionPath = Field("", description="The collection that receives the clips.")
-    seed: int = Field(0, ge=0, lt=2**63, description="Value of the environment variable MAREY_SEED of the script.")
+    seed: int = Field(0, ge=0, lt=SEEDS, description="Value of the environment variable MAREY_SEED of the script.")
     message: Message = Field("", description="Message of the run, shown in the history of its results.")
     commit: OutputsCommit | None = Field(
         None,

@@ -16,10 +16,10 @@ from marey_schemas.formats import (
     ExportFormat,
 )
 from marey_schemas.options.exporting import MotionFileOptions
+from marey_schemas.sizes import MOST_INTEGER
 from marey_server.handlers.items import kind_of
 from marey_server.http.caching import REVALIDATED
 from marey_server.http.declarations import Access, Bytes, reads
-from marey_server.http.queries import MAX_INTEGER
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import BlobSender, attachment
@@ -61,7 +61,7 @@ class ExportQuery(MotionFileOptions, ConsentOverride):
         "canonical",
         description="For aligned clips: `canonical` time, or the time and position of the `source` clip.",
     )
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to export; absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MOST_INTEGER, description="Revision to export; absent: the newest.")
 
 
 class Export(BlobSender):

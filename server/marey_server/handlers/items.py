@@ -10,11 +10,11 @@ from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineag
 from marey_schemas.kinds import Kind
 from marey_schemas.lineage import LineageGraph, LineageRequest
 from marey_schemas.queries.grammar import MOST_CHARACTERS
-from marey_schemas.sizes import MIB
+from marey_schemas.sizes import MIB, MOST_INTEGER
 from marey_server.errors import NotFoundProblem
 from marey_server.handlers.searching.similar import IndexSearcher
 from marey_server.http.declarations import Access, RequestBody, reads, writes
-from marey_server.http.queries import MAX_INTEGER, CommaSeparated, CountedPageQuery, PageQuery
+from marey_server.http.queries import CommaSeparated, CountedPageQuery, PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import items
@@ -40,10 +40,10 @@ class ItemsQuery(CountedPageQuery):
     skeleton: str | None = Field(None, max_length=64, description="Return clips that use this skeleton.")
     clip: str | None = Field(None, max_length=64, description="Return annotations of this clip.")
     frames_gte: int | None = Field(
-        None, alias="frames.gte", ge=0, le=MAX_INTEGER, description="Return items with at least this number of frames."
+        None, alias="frames.gte", ge=0, le=MOST_INTEGER, description="Return items with at least this number of frames."
     )
     frames_lte: int | None = Field(
-        None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="Return items with at most this number of frames."
+        None, alias="frames.lte", ge=0, le=MOST_INTEGER, description="Return items with at most this number of frames."
     )
     q: str | None = Field(
         None, max_length=255, description="Return items whose name contains this text, in upper or lower case."
@@ -244,7 +244,7 @@ class LineageQuery(Request):
     """Query parameters of a lineage: the revision from which it starts."""
 
     revision: int | None = Field(
-        None, ge=1, le=MAX_INTEGER, description="Revision whose lineage is returned; absent: the newest."
+        None, ge=1, le=MOST_INTEGER, description="Revision whose lineage is returned; absent: the newest."
     )
 
 

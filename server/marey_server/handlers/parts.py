@@ -12,10 +12,11 @@ from marey_schemas.base import Request
 from marey_schemas.items import Item, PartsRequest
 from marey_schemas.kinds import Kind
 from marey_schemas.names import Message, form
+from marey_schemas.sizes import MOST_INTEGER
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.http.caching import IMMUTABLE
 from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
-from marey_server.http.queries import MAX_INTEGER, CommaSeparated
+from marey_server.http.queries import CommaSeparated
 from marey_server.http.reply import LoadedDocument, Rendered, Reply, UnchangingDocument
 from marey_server.http.resource import Resource
 from marey_server.store import items
@@ -29,7 +30,7 @@ FrameRange = Annotated[
 class PartQuery(Request):
     """Query parameters for reading a part: its revision, frames and joints."""
 
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to return; absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MOST_INTEGER, description="Revision to return; absent: the newest.")
     frames: FrameRange | None = Field(None, description="Half-open range of frames, such as 100:200, :200 or 100:.")
     joints: CommaSeparated | None = Field(None, description="Names of the joints to return, in the desired order.")
 

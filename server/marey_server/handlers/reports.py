@@ -16,13 +16,12 @@ from marey_schemas.documents.reports import REPORTS, StoredFigure, StoredFile
 from marey_schemas.documents.reports import Report as ReportDocument
 from marey_schemas.items import Revision
 from marey_schemas.kinds import Kind
-from marey_schemas.sizes import MIB
+from marey_schemas.sizes import MIB, MOST_INTEGER
 from marey_server.errors import NotFoundProblem
 from marey_server.handlers.browser.pages import PackedPlayer, packed_player
 from marey_server.handlers.items import kind_of
 from marey_server.http.caching import REVALIDATED, caching_of_revision
 from marey_server.http.declarations import Access, Bytes, reads
-from marey_server.http.queries import MAX_INTEGER
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import BlobSender, attachment
@@ -47,7 +46,7 @@ SHOWN_ONLY = "default-src 'none'; base-uri 'none'; form-action 'none'; style-src
 class ReportQuery(Request):
     """Query parameters of a report: its revision."""
 
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision of the report; absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MOST_INTEGER, description="Revision of the report; absent: the newest.")
 
 
 class FigureQuery(ReportQuery):

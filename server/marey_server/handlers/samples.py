@@ -5,12 +5,12 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.documents.models import MOST_SAMPLES, MOST_SEED
+from marey_schemas.documents.models import MOST_SAMPLES
 from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_MEDIA_TYPES, MotionFormat, WrittenUnit
+from marey_schemas.sizes import MOST_INTEGER, SEEDS
 from marey_server.handlers.items import kind_of
 from marey_server.http.caching import caching_of_revision
 from marey_server.http.declarations import Access, Bytes, Document, reads
-from marey_server.http.queries import MAX_INTEGER
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import attachment
@@ -30,9 +30,9 @@ class SampleQuery(Request):
         description="Number of samples; with a larger number, the first samples stay the same.",
     )
     seed: int = Field(
-        0, ge=0, le=MOST_SEED, description="Seed of the random numbers; the same seed gives the same samples."
+        0, ge=0, lt=SEEDS, description="Seed of the random numbers; the same seed gives the same samples."
     )
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision of the model; absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MOST_INTEGER, description="Revision of the model; absent: the newest.")
 
 
 class SampleFileQuery(SampleQuery):

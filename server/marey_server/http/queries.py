@@ -12,7 +12,6 @@ from marey_server.store.listing import DEFAULT_LIMIT, MAX_LIMIT
 
 T = TypeVar("T")
 
-MAX_INTEGER = 2**31 - 1
 MAX_VALUES = 256
 
 

@@ -21,9 +21,9 @@ from marey_motion.errors import FormatError
 from marey_motion.formats.document_fields import number_array
 from marey_motion.formats.predecessor.encoding import decode_document, encode_document
 from marey_motion.formats.predecessor.sections import SECTIONS, section_range
+from marey_schemas.sizes import MOST_INTEGER
 
 TIME_FUNCTION = "time_function"
-MOST_FRAME = 2**31 - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +78,8 @@ def alignment_of_document(document: Mapping[str, Any], file: str) -> Predecessor
     frames = number_array(_list(document, TIME_FUNCTION, file), file, TIME_FUNCTION)
     if frames.ndim != 1 or len(frames) < 2 or (frames != np.floor(frames)).any() or (frames < 0).any():
         raise FormatError(f"field {TIME_FUNCTION!r} must be a list of at least two frames", file=file)
-    if frames.max() > MOST_FRAME:
-        message = f"field {TIME_FUNCTION!r} contains frame {frames.max():g}; the limit is {MOST_FRAME:g}"
+    if frames.max() > MOST_INTEGER:
+        message = f"field {TIME_FUNCTION!r} contains frame {frames.max():g}; the limit is {MOST_INTEGER:g}"
         raise FormatError(message, code="time-function-invalid", file=file)
     if (np.diff(frames) < 0).any():
         place = int(np.argmax(np.diff(frames) < 0)) + 1

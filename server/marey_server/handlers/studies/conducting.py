@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.sizes import MOST_INTEGER
 from marey_schemas.studies.conducting import (
     MOST_JUDGES_AT_ONCE,
     JudgingParticipant,
@@ -17,7 +18,7 @@ from marey_schemas.studies.conducting import (
 from marey_server.handlers.items import kind_of
 from marey_server.http.caching import WITH_SECRET
 from marey_server.http.declarations import Access, reads, writes
-from marey_server.http.queries import MAX_INTEGER, PageQuery
+from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.motions.studies import draw_plans, find_differences
@@ -29,13 +30,13 @@ TAG = "Studies"
 class DifferencesQuery(Request):
     """Query parameters of the differences of a study: its revision."""
 
-    revision: int = Field(ge=1, le=MAX_INTEGER, description="Revision of the study that the participants saw.")
+    revision: int = Field(ge=1, le=MOST_INTEGER, description="Revision of the study that the participants saw.")
 
 
 class JudgementsQuery(PageQuery):
     """Query parameters that select one page of participants of one revision of a study."""
 
-    revision: int = Field(ge=1, le=MAX_INTEGER, description="Revision of the study that the participants saw.")
+    revision: int = Field(ge=1, le=MOST_INTEGER, description="Revision of the study that the participants saw.")
     limit: int = Field(
         MOST_JUDGES_AT_ONCE, ge=1, le=MOST_JUDGES_AT_ONCE, description="Greatest number of participants in a page."
     )
