@@ -10,7 +10,6 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.names import ProjectName, form
 from marey_schemas.sizes import DAY_S, LOGIN_DAYS
 
-VERIFIER_PATTERN = r"^[A-Za-z0-9_-]{43,128}$"
 CALLBACK_PATH = "/sign-ins/callback"
 """Path, below the root of the API, to which the identity provider sends the browser back."""
 

@@ -15,11 +15,10 @@ from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
+from marey_schemas.formats.pictures import LINEAGE_FILES
 
 if TYPE_CHECKING:
     from marey_schemas.lineage import GroupLink, LineageGraph, LineageJob
-
-PICTURES = ("svg", "png", "dot")
 
 
 def add_to(app: typer.Typer) -> None:
@@ -37,7 +36,7 @@ def lineage(
     as_json: AsJson = False,
 ) -> None:
     """Show what an item was made from and what was made from it: items, jobs and commits."""
-    if picture is not None and picture.suffix.lower().lstrip(".") not in PICTURES:
+    if picture is not None and picture.suffix.lower().lstrip(".") not in LINEAGE_FILES:
         raise WrongUsage(f"{picture} must end in .svg, .png or .dot")
     from marey_schemas.kinds import Kind
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from marey_schemas.documents.differences import ModelDifference
+from marey_schemas.documents.differences import Change, ModelDifference
 from marey_schemas.documents.models import log_likelihoods
 
 MOST_TEXT = 2000
@@ -27,7 +27,7 @@ class ChangedValue(NamedTuple):
     """
 
     pointer: str
-    change: Literal["added", "removed", "changed"]
+    change: Change
     before: Any = None
     after: Any = None
 

@@ -32,12 +32,11 @@ from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.source import SourceMotion
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.skeletons import MAX_JOINTS
-from marey_schemas.formats import MOST_UNPACKED_BYTES
+from marey_schemas.formats import MOST_UNPACKED_BYTES, ZIP_EPOCH
 
 FORMAT = "npz"
 MARK = "marey/clip-npz@1"
 _MEMBERS_SHOWN = 12
-_FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 _SKELETON_MEMBERS = (
     "joint_names",
     "display_names",
@@ -96,7 +95,7 @@ def write_npz(motion: Clip | Skeleton) -> bytes:
         for name, array in arrays.items():
             content = io.BytesIO()
             np.lib.format.write_array(content, np.ascontiguousarray(array).reshape(array.shape), allow_pickle=False)
-            members.writestr(zipfile.ZipInfo(f"{name}.npy", _FIXED_DATE), content.getvalue())
+            members.writestr(zipfile.ZipInfo(f"{name}.npy", ZIP_EPOCH), content.getvalue())
     return archive.getvalue()
 
 

@@ -15,7 +15,7 @@ from marey_motion.matching.display import pose_costs
 from marey_motion.matching.inertialisation import decay_matrix
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex
-from marey_schemas.options.matching import ControllerOptions
+from marey_schemas.options.matching import FOLLOW_MODES, ControllerOptions
 
 
 class Trajectory(Protocol):
@@ -213,7 +213,7 @@ def controller_constants(options: ControllerOptions, rate_hz: float) -> Controll
     if period < 1:
         raise MotionError("the period of searches must be at least one tick", where="search_every_s")
     return ControllerConstants(
-        follow=("time", "path", "open_loop").index(options.follow),
+        follow=FOLLOW_MODES.index(options.follow),
         by_distance=options.selection == "pose_distance",
         period=period,
         window=round(options.reselect_window_s * rate_hz),

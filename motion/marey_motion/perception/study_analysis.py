@@ -33,9 +33,8 @@ from marey_motion.perception.measuring import MeasuredClip, classes_measured
 from marey_motion.perception.metric import Component, PerceptualMetric, uniform_metric
 from marey_motion.perception.ordering import MotionOrder, order_motions
 from marey_motion.perception.registration import differences_along_curve
-from marey_schemas.documents.metrics import MetricDocument, Shaping
+from marey_schemas.documents.metrics import SHAPINGS, MetricDocument, Shaping
 
-SHAPINGS: tuple[Shaping, ...] = ("euclid", "manhattan", "sigmoid", "power")
 INTERVAL = (0.025, 0.975)
 """Quantiles of the resampled weights at the ends of their intervals."""
 FEWEST_FOR_INTERVALS = 5

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +13,7 @@ from marey_motion.rigs import by_geometry, by_names
 from marey_motion.rigs.names import parse_name
 from marey_motion.rigs.standard import ESSENTIAL_JOINTS, SIDES, STANDARD_JOINTS, mirrored
 from marey_motion.skeleton import Skeleton
-
-Method = Literal["names", "geometry", "manual"]
+from marey_schemas.documents.skeletons import MappingMethod
 
 # If the names cover a smaller share of the essential joints, they are compared with the geometry.
 TRUSTED_SHARE = 0.75
@@ -53,7 +51,7 @@ class JointMapping:
     rig: str | None
     joints: Mapping[str, str]
     confidence: float
-    method: Method
+    method: MappingMethod
     notes: tuple[str, ...] = ()
 
     @property
@@ -113,7 +111,7 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
     body = by_geometry.find_body(skeleton) if match is None or match.essential_share < trusted_share else None
     if body is not None and (match is None or len(body.joints.keys() & set(ESSENTIAL_JOINTS)) > match.essential_count):
         rig, joints, confidence, notes = None, dict(body.joints), body.confidence, list(body.notes)
-        method: Method = "geometry"
+        method: MappingMethod = "geometry"
     elif match is not None:
         rig, joints, confidence, notes = match.rig, dict(match.joints), match.essential_share, []
         method = "names"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Sequence
-from typing import Literal
 
 from marey_motion.version import code_version
 from marey_reports.comparisons.axes import axis_title
@@ -19,12 +18,9 @@ from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.paper import QUIET, SMALL, plain
 from marey_reports.drawing.tables import Cell, Number, facts, table
 from marey_schemas.documents.replicates import LEAST_REPLICATES
+from marey_schemas.formats.pictures import PLOTS, ChartFile, Plot
 from marey_schemas.queue.comparisons import MOST_DRAWN, ComparedColumn, ComparedRun, RunComparison, number_of
 from marey_schemas.wording import counted
-
-FileType = Literal["html", "svg", "png"]
-Plot = Literal["lines", "scatter", "bars"]
-PLOTS: tuple[Plot, ...] = ("lines", "scatter", "bars")
 
 _CAPTION_SIGNS, _CAPTION_LINE = 148, 0.16
 """Number of characters in a line of a caption, and height of the line in inches."""
@@ -35,7 +31,7 @@ MOST_PARAMETERS = 3
 
 def draw_comparison(
     comparison: RunComparison,
-    file_type: FileType,
+    file_type: ChartFile,
     *,
     plot: Plot | None = None,
     parameter: str | None = None,

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from marey_reports.drawing.paper import COLOURS, DPI, HAIRLINE, INK, PAPER, QUIET, SMALL, new_figure, to_png, to_svg
 from marey_reports.lineage.layers import Layout, lay_out
 from marey_reports.lineage.nodes import Arrow, Box, Sort, boxes_of
+from marey_schemas.formats.pictures import LineageFile
 from marey_schemas.lineage import CUT_OFF, LineageGraph
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-FileType = Literal["png", "svg", "dot"]
 
 GROUND = {Sort.START: "#e3eef6", Sort.ITEMS: "#f4f6f8", Sort.JOB: "#ffffff", Sort.COMMIT: "#eaf5f0"}
 """Background colours of boxes."""
@@ -39,7 +38,7 @@ class _Rectangle(NamedTuple):
     height: float
 
 
-def draw_lineage(graph: LineageGraph, file_type: FileType) -> bytes:
+def draw_lineage(graph: LineageGraph, file_type: LineageFile) -> bytes:
     """Draw a lineage graph: boxes for revisions, jobs and commits, with arrows from inputs to results.
 
     Parameters

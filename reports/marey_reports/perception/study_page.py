@@ -27,6 +27,7 @@ from marey_reports.drawing.paper import (
     plain,
 )
 from marey_reports.drawing.tables import Cell, facts, folded, number, share, table
+from marey_schemas.documents.metrics import MEASUREMENTS
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -248,7 +249,7 @@ def _shares_table(analysis: StudyAnalysis) -> Content:
     rows: list[Sequence[Cell]] = []
     for fit in analysis.fits:
         shares = dict(zip((part.component.measurement for part in fit.parts), fit.metric.shares, strict=True))
-        cells = [number(shares.get(each), 3) for each in ("angles", "positions", "velocities")]
+        cells = [number(shares.get(each), 3) for each in MEASUREMENTS]
         quality = fit.quality
         rows.append((_shaping(fit), *cells, number(quality.rmse, 3), number(quality.r2, 2),
                      number(quality.spearman, 2), number(fit.left_out_rmse, 3)))  # fmt: skip

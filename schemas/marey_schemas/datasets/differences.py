@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field
 
@@ -12,6 +12,7 @@ from marey_schemas.kinds import Kind
 
 ChangeKind = Literal["added", "removed", "moved", "changed"]
 """Kind of change of an entry, or of a part of an entry, between two versions; parts are never moved by themselves."""
+CHANGE_KINDS: tuple[ChangeKind, ...] = get_args(ChangeKind)
 
 
 class ListedCommit(Commit):

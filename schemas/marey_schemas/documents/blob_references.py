@@ -8,16 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from marey_schemas.encoding.canonical import REFERENCE_KEYS, SCALARS
 from marey_schemas.names import is_digest
 
-_REFERENCE_KEYS = {"dtype", "shape", "content"}
 _FILE_POINTERS = {"marey/clip-info@1": ("/source/file", "/source/companion")}
-_LEAVES = (str, float, int, bool, type(None))
 
 
 def is_array_reference(value: Any) -> bool:
     """Return whether a value is a reference that replaces an array."""
-    return type(value) not in _LEAVES and isinstance(value, Mapping) and value.keys() == _REFERENCE_KEYS
+    return type(value) not in SCALARS and isinstance(value, Mapping) and value.keys() == REFERENCE_KEYS
 
 
 def pointer_to(pointer: str, key: object) -> str:
@@ -38,13 +37,13 @@ def members_of(tree: Any) -> list[tuple[str, Any]]:
         if type(value) is dict or isinstance(value, Mapping):  # nearly all are; asking for mappings takes far longer
             for key, member in value.items():
                 at = pointer_to(pointer, key)
-                if type(member) in _LEAVES:
+                if type(member) in SCALARS:
                     found.append((at, member))
                 else:
                     visit(at, member)
         elif isinstance(value, (list, tuple)):
             for index, member in enumerate(value):
-                if type(member) not in _LEAVES:
+                if type(member) not in SCALARS:
                     visit(f"{pointer}/{index}", member)
 
     visit("", tree)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, StringConstraints, model_validator
 
@@ -12,7 +12,9 @@ from marey_schemas.documents.originals import StoredOriginal
 from marey_schemas.documents.references import OutputRef, RevisionRef
 
 MOST_PRIMITIVES = 10_000
-TYPES_TO_END_IN = ("end", "idle", "single")
+NodeType = Literal["start", "standard", "end", "idle", "single", "cycle_end"]
+NODE_TYPES: tuple[NodeType, ...] = get_args(NodeType)
+TYPES_TO_END_IN: tuple[NodeType, ...] = ("end", "idle", "single")
 
 NodeName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 
@@ -31,7 +33,7 @@ class GraphPrimitive(Request):
     """A node of the graph, the motion primitive: its model, its type, and the primitives that may follow it."""
 
     model: RevisionRef | OutputRef
-    type: Literal["start", "standard", "end", "idle", "single", "cycle_end"] = "standard"
+    type: NodeType = "standard"
     transitions: tuple[GraphPlace, ...] = Field((), max_length=MOST_PRIMITIVES)
     source_id: str | None = Field(
         None, max_length=255, description="Id of the model in the imported file; absent: the graph was not imported."

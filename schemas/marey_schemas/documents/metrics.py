@@ -23,6 +23,7 @@ AngleMeasure = Literal["half_angle", "angle", "one_minus_dot", "log_norm"]
 JointClass = Literal["head", "clavicle", "upper_arm", "forearm", "hand", "thigh", "calf", "toe"]
 
 MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)
+SHAPINGS: tuple[Shaping, ...] = get_args(Shaping)
 JOINT_CLASS_NAMES: tuple[JointClass, ...] = get_args(JointClass)
 WITHOUT_ANGLES: tuple[JointClass, ...] = ("hand", "toe")
 """Joint classes for which Pražák et al. (2009) give no weights of angles."""

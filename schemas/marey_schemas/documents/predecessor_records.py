@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
 
@@ -11,7 +11,6 @@ from marey_schemas.documents.originals import StoredOriginal
 from marey_schemas.names import form
 
 RecordForm = Literal["job", "transform run", "edit history", "synthesis input"]
-RECORD_FORMS: tuple[RecordForm, ...] = get_args(RecordForm)
 MOST_SHOWN = 1000
 """Greatest number of fields of a record that are shown."""
 LONGEST_TEXT = 1000

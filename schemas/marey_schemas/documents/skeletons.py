@@ -18,6 +18,7 @@ from marey_schemas.names import JointName
 MAX_JOINTS = 4096
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+MappingMethod = Literal["names", "geometry", "manual"]
 
 
 class Joint(Request):
@@ -93,7 +94,7 @@ class SkeletonMapping(Request):
     rig: str | None = Field(
         None, description="Name of the known rig whose joint names were recognised; absent: none was."
     )
-    method: Literal["names", "geometry", "manual"] = "manual"
+    method: MappingMethod = "manual"
     confidence: float = Field(1.0, ge=0.0, le=1.0)
     joints: dict[str, JointName] = Field(
         default_factory=dict, description="Name of the skeleton's joint, by the name of the standard joint."

@@ -25,7 +25,10 @@ def array_digest(array: NDArray[Any] | EncodedArray) -> str:
     return _name(head.encode(), plain.reshape(-1).view(np.uint8).data)
 
 
-_LEAVES = (str, float, int, bool, type(None))
+SCALARS = (str, float, int, bool, type(None))
+"""Types of the values of a document that are no arrays, objects or lists."""
+REFERENCE_KEYS = {"dtype", "shape", "content"}
+"""Names of the members of a reference that replaces an array."""
 
 
 def canonical_json(tree: Any) -> bytes:
@@ -50,7 +53,7 @@ def detach_arrays(tree: Any, keep: Callable[[str, NDArray[Any] | EncodedArray], 
 
     `keep(digest, array)` is called once per array, in document order.
     """
-    if type(tree) in _LEAVES:  # most members; asking whether they are mappings takes far longer
+    if type(tree) in SCALARS:  # most members; asking whether they are mappings takes far longer
         return tree
     if isinstance(tree, Mapping):
         return {key: detach_arrays(member, keep) for key, member in tree.items()}
@@ -67,7 +70,7 @@ def detach_arrays(tree: Any, keep: Callable[[str, NDArray[Any] | EncodedArray], 
 def attach_arrays(tree: Any, load: Callable[[str], Any]) -> Any:
     """Return the tree with each reference replaced by `load(digest)`, the inverse of `detach_arrays`."""
     if isinstance(tree, Mapping):
-        if tree.keys() == {"dtype", "shape", "content"}:
+        if tree.keys() == REFERENCE_KEYS:
             return load(tree["content"])
         return {key: attach_arrays(member, load) for key, member in tree.items()}
     if isinstance(tree, (list, tuple)):

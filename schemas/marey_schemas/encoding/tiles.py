@@ -22,7 +22,7 @@ HARDLY_SMALLER = 7 / 8
 To try `RAW` for every tile would save only 0.15 % of the size of real motion.
 """
 MAX_ORDER = 3
-_UNIT_TOLERANCE = 1e-3  # of the squared norm: what is further from one is not a rotation
+_SQUARE_TOLERANCE = 1e-3  # of the squared norm: what is further from one is not a rotation
 
 
 class TileError(ValueError):
@@ -222,7 +222,7 @@ def _holds_rotations(tile: NDArray[np.float32], lead: int) -> bool:
         return False
     quaternions = tile[:, lead : lead + 4 * count].reshape(len(tile), count, 4)
     squared = np.einsum("fjc,fjc->fj", quaternions, quaternions)
-    return bool((np.abs(squared - 1) < _UNIT_TOLERANCE).all())
+    return bool((np.abs(squared - 1) < _SQUARE_TOLERANCE).all())
 
 
 def _predict_quaternions(channels: Integers, lead: int) -> list[Bytes]:

@@ -8,8 +8,9 @@ from pydantic import Field, model_validator
 
 from marey_schemas.base import Options
 from marey_schemas.documents.evaluations import ANGLED_FAMILIES
-from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
+from marey_schemas.options.matching import FOLLOW_MODES, ControllerOptions, DatabaseOptions
 from marey_schemas.options.verdict import VerdictLimits
+from marey_schemas.sizes import SEEDS
 
 Family = Literal["circle", "switching", "stopping", "corners", "eights", "strafing", "takes"]
 """Families (kinds) of trials, which differ in the path and the speeds that the character has to follow."""
@@ -129,7 +130,7 @@ class EvaluationOptions(Grid):
         "method, without intervals.",
     )
     seed: int = Field(
-        0, ge=0, lt=2**63, description="Seed of the random differences between the replicates of a trial."
+        0, ge=0, lt=SEEDS, description="Seed of the random differences between the replicates of a trial."
     )
     window: Literal["circle", "all"] = Field(
         "circle",
@@ -161,7 +162,7 @@ class EvaluationOptions(Grid):
             _require_different(name, getattr(self, name))
         for family in self.families:
             if self.controller.follow in (modes := _IMPOSSIBLE.get(family, ())):
-                possible = " or ".join(mode for mode in ("time", "path", "open_loop") if mode not in modes)
+                possible = " or ".join(mode for mode in FOLLOW_MODES if mode not in modes)
                 raise ValueError(
                     f"{family} trials cannot be followed in the mode {self.controller.follow}; choose {possible}"
                 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from itertools import pairwise
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
@@ -15,6 +15,7 @@ Mirroring = Literal["none", "add", "only"]
 RootMode = Literal["simulated", "bone"]
 Selection = Literal["features", "pose_distance"]
 Follow = Literal["time", "path", "open_loop"]
+FOLLOW_MODES: tuple[Follow, ...] = get_args(Follow)
 
 TICK_RATE_HZ = 60.0
 """Default rate of the features and of the simulation, in hertz."""

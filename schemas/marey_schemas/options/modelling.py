@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
@@ -13,6 +13,7 @@ InnerProduct = Literal["coefficients", "l2"]
 DEFAULT_INNER_PRODUCT: InnerProduct = "coefficients"
 Criterion = Literal["held_out", "bic", "aic"]
 CovarianceKind = Literal["full", "tied", "diagonal"]
+COVARIANCE_KINDS: tuple[CovarianceKind, ...] = get_args(CovarianceKind)
 FeatureKind = Literal["end_effectors", "latent"]
 
 MOST_TREE_SAMPLES = 100_000

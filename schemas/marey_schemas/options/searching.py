@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Options
+from marey_schemas.documents.standard_joints import LIMB_ENDS
 from marey_schemas.names import JointName
 
 CANDIDATES = 8
@@ -45,7 +46,7 @@ class TransitionOptions(Options):
     """Options for the continuity between two motions of a sequence."""
 
     joints: tuple[JointName, ...] = Field(
-        ("left_wrist", "right_wrist", "left_ankle", "right_ankle"),
+        LIMB_ENDS,
         max_length=256,
         description="Standard names of the joints that should not jump between motions; joints that the skeleton of "
         "one of the motions lacks are ignored.",

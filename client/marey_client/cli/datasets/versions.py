@@ -278,13 +278,15 @@ def checkout(
     With --query or --path, only a part of the version is checked out. Marey stores which part: later commits of the
     folder keep all entries that were not checked out. To check out all entries, repeat the command without the option.
     """
+    from marey_schemas.datasets.differences import CHANGE_KINDS
+
     at = parse(place, version=True)
     with connect(context) as marey:
         paths = [one.strip("/") for one in path or ()]
         found = at.on(marey).check_out(at.version, query=query, paths=paths, discard=discard)
     if as_json:
         return print_json(found)
-    named = {name: getattr(found, name) for name in ("added", "removed", "moved", "changed")}
+    named = {name: getattr(found, name) for name in CHANGE_KINDS}
     counts = ", ".join(f"{count:,} {name}" for name, count in named.items() if count)
     content = short(found.commit)
     if found.taken is not None and found.entries is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,13 +19,13 @@ from marey_client.cli.queue.compared_tables import (
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
+from marey_schemas.formats.pictures import CHART_FILES, Plot
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
     from marey_schemas.documents.report_pages import ReportOrigin
     from marey_schemas.queue.comparisons import ComparedColumn, RunComparison
 
-CHARTS = ("html", "svg", "png")
 MOST_COLUMNS = 16
 """Greatest number of columns of a table for people."""
 
@@ -73,7 +73,7 @@ def compare(
         ),
     ] = None,
     plot: Annotated[
-        Literal["lines", "scatter", "bars"] | None,
+        Plot | None,
         typer.Option(
             help="With --chart: kind of chart. lines: fields over steps; scatter: a field over a parameter; "
             "bars: a bar for each setting. Default: in a .html page all kinds, in a .svg or .png the first "
@@ -122,7 +122,7 @@ def compare(
 
 def _ending_of(chart: Path | None) -> str:
     ending = "" if chart is None else chart.suffix.lower().lstrip(".")
-    if chart is not None and ending not in CHARTS:
+    if chart is not None and ending not in CHART_FILES:
         raise WrongUsage(f"{chart} must end in .html, .svg or .png")
     return ending
 

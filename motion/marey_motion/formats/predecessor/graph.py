@@ -15,9 +15,8 @@ from typing import Any
 from marey_motion.errors import FormatError
 from marey_motion.formats.document_fields import field_of
 from marey_motion.formats.predecessor.encoding import Encoding, encode_document
-from marey_schemas.documents.graphs import MOST_PRIMITIVES
+from marey_schemas.documents.graphs import MOST_PRIMITIVES, NODE_TYPES
 
-TYPES = ("start", "standard", "end", "idle", "single", "cycle_end")
 START_FIELDS = ("start_node", "startNode")
 
 Place = tuple[str, str]
@@ -31,7 +30,7 @@ class GraphNode:
     Parameters
     ----------
     model_id : id of the model in the database of Marey's predecessor
-    type : type of the node, one of `TYPES`
+    type : type of the node, one of `NODE_TYPES`
     transitions : nodes that may follow
     """
 
@@ -134,9 +133,9 @@ def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "js
 
 def _type(node: Mapping[str, Any], place: Place, file: str) -> str:
     kind = node.get("type", "standard")
-    if kind not in TYPES:
+    if kind not in NODE_TYPES:
         raise FormatError(
-            f"{'/'.join(place)}: {kind!r} is not a type of node; the types are {', '.join(TYPES)}", file=file
+            f"{'/'.join(place)}: {kind!r} is not a type of node; the types are {', '.join(NODE_TYPES)}", file=file
         )
     return str(kind)
 

@@ -28,9 +28,9 @@ from typing import Any
 from marey_motion.errors import FormatError, FormatLimit
 from marey_motion.formats.document_fields import field_of
 from marey_motion.formats.predecessor.encoding import decode_document
-from marey_motion.formats.predecessor.graph import TYPES, GraphNode, Place, PredecessorGraph
+from marey_motion.formats.predecessor.graph import GraphNode, Place, PredecessorGraph
 from marey_motion.formats.texts import short_name
-from marey_schemas.documents.graphs import MOST_PRIMITIVES
+from marey_schemas.documents.graphs import MOST_PRIMITIVES, NODE_TYPES
 from marey_schemas.formats import MOST_UNPACKED_BYTES
 from marey_schemas.formats.companions import TREE_ENDINGS, model_name
 
@@ -272,7 +272,7 @@ class _Nodes:
         for entry in sequence if isinstance(sequence, list) else []:
             if isinstance(entry, list) and len(entry) == 2 and all(isinstance(one, str) for one in entry):
                 kind = entry[1].removesuffix("_primitive")
-                if kind in TYPES:
+                if kind in NODE_TYPES:
                     found.setdefault(entry[0], kind)
         return found
 

@@ -16,11 +16,9 @@ from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
 from marey_motion.modelling.search.tree import build_tree
 from marey_motion.modelling.training import train_primitive
+from marey_schemas.documents.standard_joints import LIMB_ENDS
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
 from marey_schemas.search_constraints import JointPositionConstraint
-
-REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
-"""Standard joints for which the check sets target positions."""
 
 HELD_OUT_EVERY = 5
 LEAST_EXAMPLES = 10
@@ -70,7 +68,7 @@ def check_search(
     SearchCheck or None    None if there are fewer than ten examples or three takes, if hands and feet are not known, or
         if fewer than five examples remain without the left-out ones
     """
-    joints = {name: standard_joints[name] for name in REACHING if name in standard_joints}
+    joints = {name: standard_joints[name] for name in LIMB_ENDS if name in standard_joints}
     groups = ExampleGroups.of(aligned)
     known = {clip.uid: number for clip, number in zip(aligned.clips, groups.takes.tolist(), strict=True)}
     takes = [number for number in range(groups.take_count) if number != known.get(aligned.reference)]

@@ -20,9 +20,10 @@ from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search import objective_kernels
 from marey_motion.modelling.search import tree_kernels as kernels
 from marey_motion.modelling.search.tracking import Tracked, track_points
+from marey_schemas.documents.standard_joints import LIMB_ENDS
 from marey_schemas.options.modelling import TreeOptions
 
-END_EFFECTORS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle", "head")
+END_EFFECTORS = (*LIMB_ENDS, "head")
 """Standard joints whose positions can be features of samples."""
 
 

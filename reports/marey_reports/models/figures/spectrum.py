@@ -22,6 +22,7 @@ from marey_reports.drawing.paper import (
     write,
 )
 from marey_reports.models.figures.subjects import ModelSubject
+from marey_schemas.options.modelling import COVARIANCE_KINDS
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
     drawn = []
     for place, (name, label) in enumerate(panels):
         panel = add_panel(figure, Place(0.95 + 3.9 * place, 0.65, 2.9, 2.3), x="normal distributions", y=label)
-        for kind, colour, marker in zip(("full", "tied", "diagonal"), COLOURS, "os^", strict=False):
+        for kind, colour, marker in zip(COVARIANCE_KINDS, COLOURS, "os^", strict=False):
             some = [each for each in candidates if each.covariance == kind and getattr(each, name) is not None]
             counts, values = [each.components for each in some], [getattr(each, name) for each in some]
             panel.plot(counts, values, color=colour, marker=marker, ms=4.5, lw=1.3, label=kind)
