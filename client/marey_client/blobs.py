@@ -18,9 +18,8 @@ from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.encoding.digests import digest_of, digest_of_file, digest_of_hash
 from marey_schemas.formats import OCTETS
 from marey_schemas.items import BlobsMissing, BlobsQuery, Upload, UploadCreate
-from marey_schemas.sizes import batched
+from marey_schemas.sizes import MIB, batched
 
-CHUNK_BYTES = 1 << 20
 DIGESTS_PER_QUESTION = 10_000
 RESUMABLE_FROM_BYTES = 64 << 20
 PIECE_BYTES = 16 << 20
@@ -121,7 +120,7 @@ class Blobs:
 def _chunks(path: Path, size_bytes: int) -> Iterator[bytes]:
     left = size_bytes
     with path.open("rb") as file:
-        while chunk := file.read(CHUNK_BYTES):
+        while chunk := file.read(MIB):
             left -= len(chunk)
             if left < 0:
                 raise FileChanged(f"the file {path} grew while it was being uploaded; upload it again")

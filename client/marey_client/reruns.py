@@ -17,7 +17,7 @@ RERUNS = "reruns"
 """Folder for the results of repeated jobs; each job has a subfolder, whose name is the job's id."""
 
 Agreement = Literal["identical", "other bytes", "missing", "deleted"]
-"""How an output of a job compares with the same output of its repetition.
+"""Result of the comparison of an output of a job with the same output of its repetition.
 
 identical: both have the same bytes; other bytes: the bytes differ; missing: only one of the two jobs has this output;
 deleted: one of the two items was deleted, so the outputs cannot be compared. An output that refers to another output of

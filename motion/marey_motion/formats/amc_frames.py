@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.formats.asf import AsfSkeleton, Bone
-from marey_motion.formats.numeric_text import EXACT, LONG, ending_in_a_line, excerpt, parse_number
+from marey_motion.formats.numeric_text import EXACT, LONG, LONG_TOKENS_PER_CALL, ending_in_a_line, excerpt, parse_number
 from marey_motion.formats.text_lines import TextLines, number_problem
 from marey_motion.kernels import compiled
 
@@ -21,7 +21,6 @@ from marey_motion.kernels import compiled
 _END, _BUFFER_FULL, _BAD_NUMBER, _UNKNOWN_BONE, _WRONG_WIDTH, _REPEATED_BONE, _MISSING_BONE = range(7)
 # Slots of its state, which survives between calls; _BONE and _FOUND describe the line it stopped at.
 _POSITION, _LINE, _FRAME, _SEEN, _NUMBER, _GAPS, _BONE, _FOUND, _LONG_TOKENS = range(9)
-_LONG_TOKENS_PER_CALL = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
     called = table.names, table.name_ends, table.by_name
     values = np.zeros(((len(lines.data) - lines.position) // shortest + 1, int(table.first_columns[-1])))
     seen = np.full(len(skeleton.bones), -1, np.int64)
-    long_tokens = np.empty((_LONG_TOKENS_PER_CALL, 5), np.int64)
+    long_tokens = np.empty((LONG_TOKENS_PER_CALL, 5), np.int64)
     state = np.zeros(9, np.int64)
     state[_POSITION], state[_LINE], state[_FRAME] = lines.position, lines.number + 1, -1
     stopped = _BUFFER_FULL

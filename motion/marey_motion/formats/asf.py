@@ -22,7 +22,7 @@ from marey_motion import quaternions
 from marey_motion.errors import FormatLimit
 from marey_motion.formats.joint_names import MAX_JOINT_NAME_LENGTH
 from marey_motion.formats.numeric_text import excerpt
-from marey_motion.formats.text_lines import TextLines, decode_name
+from marey_motion.formats.text_lines import MOST_CACHED_BYTES, TextLines, decode_name
 from marey_motion.importing.source import SourceMotion
 from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.formats import UNITS_M
@@ -154,7 +154,6 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
     )
 
 
-_LONGEST_KEPT = 1 << 18
 _KNOWN: LruCache[bytes, AsfSkeleton] = LruCache(max_entries=32)
 """Cache of the skeletons parsed last, by the digest of the ASF file, since many AMC files share one ASF.
 
@@ -178,7 +177,7 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
     ------
     FormatError    if the file is invalid; the error names the line, and the bone if there is one
     """
-    if len(data) > _LONGEST_KEPT:
+    if len(data) > MOST_CACHED_BYTES:
         return _AsfReader(TextLines(data, file)).read()
     return _KNOWN.get_or_make(hashlib.sha256(data).digest(), lambda: _AsfReader(TextLines(data, file)).read())
 

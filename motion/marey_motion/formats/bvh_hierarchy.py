@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from marey_motion.errors import FormatLimit
 from marey_motion.formats.joint_names import MAX_JOINT_NAME_LENGTH
 from marey_motion.formats.numeric_text import excerpt
-from marey_motion.formats.text_lines import TextLines, decode_name, read_number
+from marey_motion.formats.text_lines import MOST_CACHED_BYTES, TextLines, decode_name, read_number
 from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.lru import LruCache
 
@@ -25,7 +25,6 @@ _FRAME_TIME = re.compile(rb"frame\s*time\s*(?::\s*)?(\S+)", re.IGNORECASE)
 _BRACES = re.compile(rb"([{}])")
 _END_SITE = -1
 _MOTION_LINE = re.compile(rb"[\r\n][ \t]*motion[ \t]*(?:\r\n|\n|\r)", re.IGNORECASE)
-_LONGEST_KEPT = 1 << 18
 
 
 @dataclass
@@ -85,7 +84,7 @@ def read_header(lines: TextLines) -> BvhHeader:
 
 def _read_hierarchy(lines: TextLines) -> BvhHeader:
     """Read the hierarchy, up to the line MOTION; files with equal hierarchies share one parsed hierarchy."""
-    motion = _MOTION_LINE.search(lines.data, 0, _LONGEST_KEPT)
+    motion = _MOTION_LINE.search(lines.data, 0, MOST_CACHED_BYTES)
     key = None if motion is None else hashlib.sha256(lines.data[: motion.end()]).digest()
     kept = None if key is None else _KNOWN.get(key)
     if kept is not None:

@@ -21,7 +21,7 @@ _EXACT_POWERS = np.array([float(f"1e{k}") for k in range(23)])
 _LARGEST_EXACT = 1 << 53
 _ONE = np.uint64(1)
 _LINE_FEED = np.uint8(10)
-_LONG_TOKENS_PER_CALL = 1 << 14
+LONG_TOKENS_PER_CALL = 1 << 14
 
 # Slots of the scanner's state, which survives between calls of the kernel.
 _POSITION, _LINE, _VALUES, _IN_LINE, _ROWS, _RAGGED_LINE, _RAGGED_COUNT, _LONG_TOKENS = range(8)
@@ -202,7 +202,7 @@ def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> Number
     text = ending_in_a_line(text)
     # Sized by what the text can hold, never by what a header declares; untouched pages cost nothing.
     values = np.empty((text.size + 1) // 2, np.float64)
-    long_tokens = np.empty((_LONG_TOKENS_PER_CALL, 5), np.int64)
+    long_tokens = np.empty((LONG_TOKENS_PER_CALL, 5), np.int64)
     state = np.zeros(8, np.int64)
     state[_LINE] = first_line
     while state[_POSITION] < text.size:

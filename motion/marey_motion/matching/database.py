@@ -15,17 +15,6 @@ from marey_motion.matching.features import FeatureLayout, feature_layout
 from marey_motion.matching.normaliser import Normaliser
 from marey_schemas.options.matching import DatabaseOptions
 
-NOTES = {
-    "rest-pose-dropped": "The clip begins or ends with a rest pose, which was left out.",
-    "only-a-rest-pose": "The clip is a rest pose from beginning to end; it was kept.",
-    "in-place-gait": "The clip walks without travelling; leave it out of speed coverage.",
-    "too-short": "The clip is too short to be chosen: it has only frames near its end, which searches may not choose.",
-    "loop-end-repeated": "The loop's last frame repeats its first one and was left out.",
-    "loop-does-not-close": "The loop's last frame is far from its first one: the motion will jump between them.",
-    "many-joints": "Many joints are matched, so the trajectory has little influence on searches.",
-    "scale-floored": "A group of features hardly varies; its scale was raised to the least allowed one.",
-}
-
 
 class RootMotion(NamedTuple):
     """Steps of the root from each row of a database to the next row, as arrays that compiled code can take.
@@ -127,7 +116,7 @@ class DatabaseClip:
 
 @dataclass(frozen=True)
 class DatabaseNote:
-    """Remark about a database; `NOTES` explains every code. `clip` is the uid of the clip concerned."""
+    """Remark about a database: its code, its text, and the uid of the clip concerned, if it concerns one."""
 
     code: str
     message: str

@@ -21,7 +21,7 @@ from marey_motion.perception.metric import PerceptualMetric
 NEIGHBOURHOOD_S = 1.0 / 3.0
 SLOPE_LIMIT = 3
 KNOT_SPACING_S = 0.1
-_DEGREE = 3
+_CUBIC = 3
 _MOST_CYCLE_FRAMES = 600
 
 
@@ -142,12 +142,12 @@ def increasing_spline(times: Floats, rate_hz: float) -> Floats:
 
     last = len(times) - 1
     spans = max(1, round(last / (KNOT_SPACING_S * rate_hz)))
-    knots = np.concatenate((np.zeros(_DEGREE), np.linspace(0.0, last, spans + 1), np.full(_DEGREE, float(last))))
+    knots = np.concatenate((np.zeros(_CUBIC), np.linspace(0.0, last, spans + 1), np.full(_CUBIC, float(last))))
     frames = np.arange(len(times), dtype=np.float64)
-    design = BSpline.design_matrix(frames, knots, _DEGREE).toarray()
+    design = BSpline.design_matrix(frames, knots, _CUBIC).toarray()
     # The value is the first coefficient plus the steps; the last step follows from the fixed end.
     steps = np.cumsum(design[:, ::-1], axis=1)[:, ::-1][:, 1:]
-    widths = np.diff(np.convolve(knots[1:-1], np.full(_DEGREE, 1.0 / _DEGREE), mode="valid"))
+    widths = np.diff(np.convolve(knots[1:-1], np.full(_CUBIC, 1.0 / _CUBIC), mode="valid"))
     least = LEAST_SLOPE * widths
     rise = times[-1] - times[0]
     free, end = steps[:, :-1] - steps[:, -1:], steps[:, -1]

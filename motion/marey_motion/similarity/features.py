@@ -33,11 +33,6 @@ VECTORS = 2 * len(JOINTS)
 ROTATIONS_AT = 3 * VECTORS
 WIDTH = ROTATIONS_AT + 4 * len(ROTATED_JOINTS)
 """Numbers in a row of features: positions (m), velocities (m/s), rotations (unit quaternions)."""
-CONTEXT_S = 1.0
-"""Seconds of motion before and after a range of frames that are needed to compute the features of this range.
-
-The heading is smoothed over time, and velocities are differences of frames.
-"""
 _ROUNDED_FRAMES = 1e-6
 
 Rows = NDArray[np.float32]
@@ -83,7 +78,8 @@ def features_at(motion: Motion, body: MatchingBody, rate_hz: float, times: AnyFl
 
     Parameters
     ----------
-    motion : Motion    F frames, with `CONTEXT_S` seconds around the times as far as the clip has them
+    motion : Motion    F frames, with a second before and after the times as far as the clip has it: headings are
+        smoothed over time, and velocities are differences of frames
     body : MatchingBody    body of its skeleton
     rate_hz : float    frames per second
     times : (n,) float64    fractional frames of the motion

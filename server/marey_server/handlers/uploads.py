@@ -21,7 +21,7 @@ from marey_server.http.resource import Resource
 from marey_server.store import blobs, uploads
 from marey_server.store.blob_backings import Spool
 
-PIECE_BYTES = MIB
+STORED_BYTES = MIB
 """Number of bytes written at a time; an interrupted request loses at most this number."""
 LONGEST_PAUSE_S = 0.2
 """Longest time in seconds that a piece waits for the database to process earlier writes.
@@ -117,14 +117,14 @@ class UploadResource(Resource):
                 "The header Upload-Offset must be the offset of this piece in the file, in bytes.",
                 code="bad-offset",
             )
-        self.hold_body(PIECE_BYTES)
+        self.hold_body(STORED_BYTES)
         self.upload_id, self.offset, self.piece = upload, int(text), bytearray()
         await self._append()
 
     async def receive(self, chunk: bytes) -> None:
-        """Receive the next bytes; pieces of `PIECE_BYTES` are stored, and kept if the connection breaks."""
+        """Receive the next bytes; pieces of `STORED_BYTES` are stored, and kept if the connection breaks."""
         self.piece += chunk
-        if len(self.piece) >= PIECE_BYTES:
+        if len(self.piece) >= STORED_BYTES:
             await self._append()
 
     async def _append(self) -> None:

@@ -10,18 +10,16 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from urllib.parse import quote
 
-from marey_schemas.sizes import MIB
 from marey_server.errors import DamagedProblem, RangeNotSatisfiableProblem
 from marey_server.http.caching import IMMUTABLE, NOT_STORED
 from marey_server.http.etags import entity_tag, matches
-from marey_server.http.exchange import JOINED_BYTES
+from marey_server.http.exchange import JOINED_BYTES, PIECE_BYTES
 from marey_server.http.reply import Rendered
 from marey_server.http.resource import Resource
 from marey_server.store import blobs
 from marey_server.store.transaction import Transaction
 
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
-PIECE_BYTES = MIB
 SIGNED_FOR_S = 60
 """Seconds for which anybody who has a signed URL can read the blob; a download that has begun may take longer."""
 _REDIRECTED = {"Cache-Control": NOT_STORED, "Vary": "*"}

@@ -14,6 +14,7 @@ from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.names import is_digest
 from marey_schemas.queue.facets import is_facet_name
+from marey_schemas.sizes import MIB
 from marey_versions.archive.members import (
     MANIFEST,
     MOST_BYTES,
@@ -34,8 +35,6 @@ from marey_versions.tree.building import build
 from marey_versions.tree.chunks import ChunksInMemory, DamagedChunk, Value
 from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
-
-_PIECE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ class Archive:
         hashed = hashlib.sha256()
         while left:
             self._file.seek(position)
-            piece = self._file.read(min(left, _PIECE_BYTES))
+            piece = self._file.read(min(left, MIB))
             if not piece:
                 raise BadArchive(f"{member.name}: the archive was cut off; copy or export it again")
             hashed.update(piece)

@@ -25,7 +25,7 @@ Layout = Literal["1", "2", "3", "static"]
 Document = Mapping[str, Any]
 
 DEFAULT_FRAME_TIME_S = 1.0 / 30.0
-LARGEST = 1e12
+MOST_NUMBER = 1e12
 """Greatest absolute value that a number in a model may have."""
 
 
@@ -202,8 +202,8 @@ def model_numbers(values: Any, file: str, name: str) -> Floats:
     FormatError    if the field is no array of numbers, or contains a number whose absolute value is greater than 1e12
     """
     numbers = number_array(values, file, name)
-    if np.abs(numbers).max(initial=0.0) > LARGEST:
+    if np.abs(numbers).max(initial=0.0) > MOST_NUMBER:
         raise FormatError(
-            f"field {name!r} contains numbers that are larger than {LARGEST:g}", code="bad-number", file=file
+            f"field {name!r} contains numbers that are larger than {MOST_NUMBER:g}", code="bad-number", file=file
         )
     return numbers
