@@ -9,14 +9,12 @@ from lint.sources import House, Offence
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Yield one circular chain of imports for each package that contains such a chain."""
-    for package in sorted({name.partition(".")[0] for name in house.modules}):
-        names = sorted(name for name in house.modules if name.partition(".")[0] == package)
-        try:
-            TopologicalSorter({name: sorted(house.imports[name]) for name in names}).prepare()
-        except CycleError as error:
-            circle = list(reversed(error.args[1][1:]))
-            first = circle.index(min(circle))
-            circle = [*circle[first:], *circle[:first], circle[first]]
-            message = f"modules import each other: {' -> '.join(circle)}"
-            yield Offence(house.modules[circle[0]].path, 1, circle[0], message)
+    """Yield one circular chain of imports, within a package or through several, if there is any."""
+    try:
+        TopologicalSorter({name: sorted(house.imports[name]) for name in sorted(house.modules)}).prepare()
+    except CycleError as error:
+        circle = list(reversed(error.args[1][1:]))
+        first = circle.index(min(circle))
+        circle = [*circle[first:], *circle[:first], circle[first]]
+        message = f"modules import each other: {' -> '.join(circle)}"
+        yield Offence(house.modules[circle[0]].path, 1, circle[0], message)

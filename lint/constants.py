@@ -1,12 +1,24 @@
-"""Rule: a constant is declared once, so no two modules give the same name the same value."""
+"""Rule: a constant is declared once, so no two modules give the same name the same value.
+
+Leading underscores of names do not count, and `1 << 20` and `1048576` are the same value.
+"""
 
 from __future__ import annotations
 
 import ast
+import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from operator import add, floordiv, lshift, mul, sub, truediv
+from typing import Any
 
 from lint.sources import House, Module, Offence
+
+_CALCULATIONS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: add, ast.Sub: sub, ast.Mult: mul, ast.Div: truediv, ast.FloorDiv: floordiv, ast.Pow: pow,
+    ast.LShift: lshift,
+}  # fmt: skip
+_NUMBER = re.compile(r"-?[\d.]+(?:e[-+]?\d+)?")
 
 
 def find(house: House) -> Iterator[Offence]:
@@ -14,7 +26,7 @@ def find(house: House) -> Iterator[Offence]:
     found: dict[tuple[str, str], list[tuple[Module, int]]] = defaultdict(list)
     for module in house.modules.values():
         for name, value, line in _constants(module.tree):
-            found[name, value].append((module, line))
+            found[name.strip("_"), value].append((module, line))
     for (name, value), places in sorted(found.items()):
         for module, line in places[1:]:
             first, first_line = places[0]
@@ -23,14 +35,14 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def _constants(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """Yield name, value and line of each constant: a name in capitals to which the module assigns a literal value."""
+    """Yield name, value and line of each constant: a name in capitals with a value that needs no other name."""
     for node in tree.body:
-        if not isinstance(node, ast.Assign):
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
             continue
-        for target in node.targets:
+        for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
             for name, value in _pairs(target, node.value):
-                if isinstance(name, ast.Name) and name.id.isupper() and _is_literal(value):
-                    yield name.id, ast.unparse(value), node.lineno
+                if isinstance(name, ast.Name) and name.id.isupper() and (known := _value(value)):
+                    yield name.id, known, node.lineno
 
 
 def _pairs(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.expr, ast.expr]]:
@@ -40,9 +52,18 @@ def _pairs(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.expr, ast.ex
         yield target, value
 
 
-def _is_literal(node: ast.expr) -> bool:
+def _value(node: ast.expr) -> str:
+    """Return the value of a literal, or of a calculation with numbers; empty if it is something else."""
+    match node:
+        case ast.Name(id=name) if name.isupper():
+            return name
+        case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _CALCULATIONS:
+            a, b = _value(left), _value(right)
+            is_known = _NUMBER.fullmatch(a) and _NUMBER.fullmatch(b)
+            return repr(_CALCULATIONS[type(operator)](ast.literal_eval(a), ast.literal_eval(b))) if is_known else ""
+        case ast.Call(func=ast.Name(id="frozenset"), args=[elements]):
+            return f"frozenset({known})" if (known := _value(elements)) else ""
     try:
-        ast.literal_eval(node)
+        return repr(ast.literal_eval(node))
     except (ValueError, TypeError):  # TypeError: a list as a key
-        return False
-    return True
+        return ""

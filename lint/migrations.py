@@ -60,10 +60,28 @@ def _faults(tree: ast.Module) -> Iterator[Fault]:
     for node in operations:
         if _operation(node) not in ADDING:
             yield node, f"`op.{_operation(node)}` does more than add"
+    yield from _hidden_operations(nodes)
     texts = _texts(tree)
     for call in calls:
         if reason := _fault_of(call, created, texts):
             yield call, reason
+
+
+def _hidden_operations(nodes: list[ast.AST]) -> Iterator[Fault]:
+    """Yield the places where operations may have other names than `op.NAME`, or where SQL is executed without them."""
+    seen = {id(node.value) for node in nodes if isinstance(node, ast.Attribute)}
+    dialects = {id(node.value) for node in nodes if isinstance(node, ast.Attribute) and node.attr == "dialect"}
+    for node in nodes:
+        match node:
+            case ast.Import(names=names) if any(name.name.startswith("alembic") for name in names):
+                yield node, "Alembic is not imported as `from alembic import op`"
+            case ast.ImportFrom(module=str(module), names=names) if module.startswith("alembic"):
+                if [(name.name, name.asname) for name in names] != [("op", None)]:
+                    yield node, "Alembic is not imported as `from alembic import op`"
+            case ast.Name(id="op") if id(node) not in seen:
+                yield node, "`op` is used without naming the operation"
+            case ast.Call(func=func) if _operation(func) == "get_context" and id(node) not in dialects:
+                yield node, "`op.get_context()` is used for more than its dialect"
 
 
 def _fault_of(call: ast.Call, created: Container[str], texts: Mapping[str, str]) -> str:

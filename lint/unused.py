@@ -1,8 +1,9 @@
-"""Rule: tests are not the only users of any code: other code of the product names every function, class and method.
+"""Rule: tests are not the only users of any code: other code of the product names all that a module defines.
 
-The rule compares only names: a method counts as used if any code names an attribute like this method. Names in
-benchmarks and in code blocks of the docs count, too. A local function counts as used only if its name occurs in the
-function that contains it. Generated modules do not count: they name every method of the SDK.
+The rule covers functions, classes, methods and the variables of modules. It compares only names: a method counts as
+used if any code names an attribute like this method. Names in benchmarks and in code of the docs count, too; words in
+the text of the docs do not. A local function counts as used only if its name occurs in the function that contains it.
+Generated modules do not count: they name every method of the SDK.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from lint.sources import Definition, House, Module, Offence
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 _WORD = re.compile(r"[A-Za-z_]\w*")
+_CODE = re.compile(r"^\s*```.*?^\s*```|`[^`]+`", re.MULTILINE | re.DOTALL)
 # Called by a framework: Tornado, pydantic, logging, SQLAlchemy, httpx.
 _CALLED_BY_NAME = {
     "get", "head", "post", "put", "patch", "delete", "options", "initialize", "prepare", "data_received", "on_finish",
@@ -33,14 +35,31 @@ def find(house: House) -> Iterator[Offence]:
     named = _named(house)
     for module in _written_by_hand(house):
         for name, node in module.definitions:
-            if named[node.name] or _is_entry(node) or _is_of_format(module, node):
-                continue
-            yield Offence(
-                module.path, node.lineno, f"{module.name}.{name}", f"{name} is used by tests only, or by nothing"
-            )
-        for name, node in module.definitions:
+            if not (named[node.name] or _is_entry(node) or _is_of_format(module, node)):
+                yield Offence(
+                    module.path, node.lineno, f"{module.name}.{name}", f"{name} is used by tests only, or by nothing"
+                )
             if not isinstance(node, ast.ClassDef):
                 yield from _unused_locals(module, name, node)
+        for variables in _variables(module.tree):
+            if not any(named[variable.id] for variable in variables):
+                variable = variables[0]
+                subject = f"{module.name}.{variable.id}"
+                yield Offence(
+                    module.path, variable.lineno, subject, f"{variable.id} is used by tests only, or by nothing"
+                )
+
+
+def _variables(tree: ast.Module) -> Iterator[list[ast.Name]]:
+    """Yield the names of each assignment of a module; `A, B = 0, 1` numbers things, and uses both or none.
+
+    Names such as `__all__` are left out.
+    """
+    for statement in tree.body:
+        if isinstance(statement, ast.Assign | ast.AnnAssign):
+            names = [node for node in ast.walk(statement) if isinstance(node, ast.Name)]
+            if assigned := [one for one in names if isinstance(one.ctx, ast.Store) and not one.id.startswith("__")]:
+                yield assigned
 
 
 def _unused_locals(module: Module, name: str, outer: Function) -> Iterator[Offence]:
@@ -86,7 +105,8 @@ def _named(house: House) -> Counter[str]:
     named: Counter[str] = Counter()
     for module in _written_by_hand(house):
         named.update(_mentions(module))
-    for text in (*house.pages.values(), *house.users.values()):
+    code = [block for text in house.pages.values() for block in _CODE.findall(text)]
+    for text in (*code, *house.users.values()):
         named.update(_WORD.findall(text))
     return named
 
@@ -94,7 +114,8 @@ def _named(house: House) -> Counter[str]:
 def _mentions(module: Module) -> Iterator[str]:
     for node in ast.walk(module.tree):
         if isinstance(node, ast.Name | ast.Attribute):
-            yield _last_name(node)
+            if not isinstance(node.ctx, ast.Store):
+                yield _last_name(node)
         elif isinstance(node, ast.keyword) and node.arg:
             yield node.arg
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.isidentifier():

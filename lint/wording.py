@@ -51,7 +51,8 @@ OLD_NAMES = {
 """Names of modules, classes and functions that are no longer used, and the names that replace them."""
 
 _CLAUSE = re.compile(r"(?:What|How|Where|Which)\b(?!.*\?)")
-_PHRASES = [(re.compile(phrase, re.IGNORECASE), instead) for phrase, instead in PHRASES.items()]
+# A phrase may be divided between two lines.
+_PHRASES = [(re.compile(phrase.replace(" ", r"\s+"), re.I), instead) for phrase, instead in PHRASES.items()]
 _CODE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 
 
@@ -69,14 +70,12 @@ def _in_module(module: Module) -> Iterator[Offence]:
     for name, node in module.definitions:
         if node.name in OLD_NAMES:
             yield Offence(module.path, node.lineno, name, f"{name} is called {OLD_NAMES[node.name]} now")
-    for documented in (module.tree, *(definition for _, definition in module.definitions)):
-        text = ast.get_docstring(documented)
-        if text and _CLAUSE.match(text):
-            line = documented.body[0].lineno
-            first = text.splitlines()[0]
-            message = f"a docstring opens with a verb or a noun, not with a clause: {first!r}"
-            yield Offence(module.path, line, first, message)
     for part in ast.walk(module.tree):
+        match part:
+            case ast.Expr(value=ast.Constant(value=str(text))) if _CLAUSE.match(text.lstrip()):
+                first = text.lstrip().splitlines()[0]
+                message = f"a docstring opens with a verb or a noun, not with a clause: {first!r}"
+                yield Offence(module.path, part.lineno, first, message)
         if isinstance(part, ast.Constant) and isinstance(part.value, str) and " " in part.value:
             yield from _phrases(module.path, part.lineno, part.value)
 

@@ -52,6 +52,12 @@ def test_modules_that_import_each_other_are_found(back: str) -> None:
     assert offence.message.endswith("marey_x.a -> marey_x.b -> marey_x.c -> marey_x.a")
 
 
+def test_a_circle_through_two_packages_is_found() -> None:
+    circle = house({"marey_x.a": "import marey_y.b\n", "marey_y.b": "def f():\n    from marey_x import a\n"})
+    (offence,) = circles.find(circle)
+    assert offence.message.endswith("marey_x.a -> marey_y.b -> marey_x.a")
+
+
 def test_modules_that_import_downwards_are_no_circle() -> None:
     assert not list(circles.find(house({"marey_x.a": "from marey_x import b\n", "marey_x.b": ""})))
 
@@ -127,9 +133,21 @@ def g(body):
     assert found == ["marey_x.a.f.body"]
 
 
-def test_names_in_the_docs_are_used() -> None:
-    modules = {"marey_x.a": "def of_the_sdk(): ...\n"}
-    assert not list(unused.find(house(modules, {"docs/use.md": "`project.of_the_sdk()`"})))
+@pytest.mark.parametrize("code", ["`project.merge()`", "```py\nproject.merge()\n```"])
+def test_names_in_code_of_the_docs_are_used(code: str) -> None:
+    modules = {"marey_x.a": "def merge(): ...\n"}
+    assert not list(unused.find(house(modules, {"docs/use.md": f"Words.\n\n{code}\n"})))
+
+
+def test_words_in_the_text_of_the_docs_are_no_use_of_a_name() -> None:
+    modules = {"marey_x.a": "def merge(): ...\n"}
+    assert messages(unused.find(house(modules, {"docs/use.md": "How to merge two clips: use `cut`.\n"})))
+
+
+def test_a_variable_of_a_module_that_nothing_reads_is_unused() -> None:
+    text = "__all__ = []\nMOST = 3\nLEAST: int = 1\nZERO, ONE = 0, 1\nTWO, THREE = 2, 3\nLEAST = ONE\nprint(MOST)\n"
+    found = [offence.subject for offence in unused.find(house({"marey_x.a": text}))]
+    assert found == ["marey_x.a.LEAST", "marey_x.a.TWO", "marey_x.a.LEAST"]
 
 
 def test_names_in_generated_modules_are_not_used() -> None:
@@ -155,9 +173,10 @@ def test_long_functions_and_modules_are_found_and_docstrings_do_not_count() -> N
 
 def test_a_long_line_of_text_in_a_page_is_found() -> None:
     long = "word " * 30
-    page = f"| {long} |\n```\n{long}\n```\n[1]: {long}\nshort\n{long}\n"
-    (offence,) = lengths.find(house({}, {"docs/page.md": page}))
+    page = f"| {long} |\n```\n{long}\n```\n[1]: {long}\nshort\n{long}\n[A link](a.md): {long}\n"
+    (offence, after_link) = lengths.find(house({}, {"docs/page.md": page}))
     assert (offence.line, offence.message) == (7, "the line has 150 characters, more than 120; wrap it")
+    assert after_link.line == 8
 
 
 def test_a_list_that_repeats_words_of_a_vocabulary_is_found() -> None:
@@ -169,11 +188,45 @@ def test_a_list_that_repeats_words_of_a_vocabulary_is_found() -> None:
     assert not list(lists.find(house({"marey_schemas.queue.jobs": home, "marey_x.a": other})))
 
 
-def test_a_constant_that_two_modules_declare_is_found() -> None:
-    twice = house({"marey_x.a": "LONGEST_S = 20.0\n", "marey_y.b": "MOST, LONGEST_S = 3, 20.0\n"})
-    (offence,) = constants.find(twice)
-    assert offence.subject == "marey_y.b.LONGEST_S"
-    assert offence.message.startswith("LONGEST_S = 20.0 is also in marey_x.a, line 1")
+@pytest.mark.parametrize(
+    ("home", "copy"),
+    [
+        ('MODES = ("loop", "trim", "clamp")\n', "ENDS = ['clamp', 'loop', 'trim']\n"),
+        ('Mode = Literal["loop", "trim", "clamp"]\n', "def f(end: Literal['clamp', 'loop', 'trim']): ...\n"),
+        ('MODES: set[str] = frozenset({"loop", "trim", "clamp"})\n', "for x in ('clamp', 'loop', 'trim'): ...\n"),
+    ],
+)
+def test_a_list_that_repeats_all_words_of_a_list_with_a_name_is_found(home: str, copy: str) -> None:
+    found = lists.find(house({"marey_x.a": home, "marey_y.b": copy}))
+    assert any(offence.path == ROOT / "marey_y/b.py" for offence in found)
+    assert not list(lists.find(house({"marey_x.a": home, "marey_y.b": copy.replace("clamp", "hold")})))
+    assert not list(lists.find(house({"marey_x.a": home, "marey_y.b": f'"""Written by `make docs`."""\n{copy}'})))
+
+
+def test_letters_are_no_words() -> None:
+    assert not list(lists.find(house(dict.fromkeys(("marey_x.a", "marey_y.b"), "AXES = ('x', 'y', 'z')\n"))))
+
+
+@pytest.mark.parametrize(
+    "copy",
+    [
+        "MOST, LONGEST_BYTES = 3, 1048576\n",
+        "LONGEST_BYTES: Final = 1048576\n",
+        "_LONGEST_BYTES = 1 << 20\n",
+        "LONGEST_BYTES = 1024 * 1024\n",
+    ],
+    ids=["one of several", "with a type", "private", "calculated"],
+)
+def test_a_constant_that_two_modules_declare_is_found(copy: str) -> None:
+    (offence,) = constants.find(house({"marey_x.a": "LONGEST_BYTES = 1_048_576\n", "marey_y.b": copy}))
+    assert offence.subject == "marey_y.b.LONGEST_BYTES"
+    assert offence.message.startswith("LONGEST_BYTES = 1048576 is also in marey_x.a, line 1")
+
+
+@pytest.mark.parametrize("value", ["MIB", "frozenset({'a'})", "(1, 2)"])
+def test_a_constant_is_found_whatever_its_value_is(value: str) -> None:
+    (offence,) = constants.find(house(dict.fromkeys(("marey_x.a", "marey_y.b"), f"PIECE = {value}\n")))
+    assert offence.subject == "marey_y.b.PIECE"
 
 
 def test_constants_of_other_names_values_or_made_by_calls_are_no_offence() -> None:
@@ -191,6 +244,8 @@ def test_a_constant_that_cannot_be_evaluated_is_no_offence() -> None:
         '"""What is left of it."""\n',
         'def f():\n    """How often it was tried."""\n',
         'class A:\n    """Where it lies."""\n',
+        'MOST = 3\n"""How many there are."""\n',
+        'x = "it is read when the\\nlast\\n    word of an attempt arrives"\n',
         'x = "this tells the caller"\n',
         'x = "the caller is told"\n',
         'x = "the name stands in the file"\n',
@@ -261,6 +316,11 @@ def migration_offences(step: str, phase: str = "before") -> list[str]:
         ('op.add_column("job", sa.Column("note", sa.Text, unique=True))', "narrows the table"),
         ('op.add_column("job", NOTE)', "cannot be checked"),
         ('op.create_index("uq_job_note", "job", ["note"], unique=True)', "a unique index narrows"),
+        ("from alembic import op as o", "not imported as"),
+        ("from alembic.op import drop_table", "not imported as"),
+        ("import alembic.op", "not imported as"),
+        ('getattr(op, "drop_table")("job")', "without naming the operation"),
+        ('op.get_context().connection.execute(sa.text("DELETE FROM job"))', "more than its dialect"),
         ('op.execute("ALTER TABLE job ALTER COLUMN note SET NOT NULL")', "does more than set storage parameters"),
         ('op.execute("ALTER TABLE job SET (fillfactor = 70); DROP TABLE note")', "does more than set"),
         ("op.execute(FILL)", "does more than set"),
@@ -276,6 +336,7 @@ def test_a_migration_before_the_new_servers_that_does_more_than_add_is_found(ste
     "step",
     [
         'op.add_column("job", sa.Column("note", sa.Text))',
+        "op.get_context().dialect.name",
         'op.add_column("job", sa.Column("note", sa.Text, nullable=False, server_default=sa.text("0")))',
         'op.create_index("ix_job_note", "job", ["note"])',
         'op.create_index("uq_note_id", "note", ["id"], unique=True)',
