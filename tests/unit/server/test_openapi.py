@@ -82,6 +82,14 @@ def test_preconditions_and_keys_are_parameters(document: dict[str, Any]) -> None
     assert [parameter["name"] for parameter in post] == ["Idempotency-Key"]
 
 
+def test_operations_describe_the_refusals_of_missing_and_of_wrong_preconditions(document: dict[str, Any]) -> None:
+    for route in api_routes():
+        operation, at = route.operation, f"{route.operation.method} {route.template}"
+        statuses = document["paths"][route.template][operation.method.lower()]["responses"].keys()
+        assert ("428" in statuses) == (operation.precondition in ("required", "create")), at
+        assert ("412" in statuses) == (operation.precondition != "none"), at
+
+
 def test_every_reference_leads_somewhere(document: dict[str, Any]) -> None:
     references = set(re.findall(r'"#/components/(\w+)/([^"]+)"', json.dumps(document)))
     assert references
