@@ -352,6 +352,15 @@ def test_an_output_that_is_not_as_declared_fails_the_job(repository: Repository,
     assert refused.value.code == code, refused.value.detail
 
 
+def test_a_folder_of_the_run_that_cannot_be_opened_fails_the_job(repository: Repository, tmp_path: Path) -> None:
+    declared = repository.declare("c" * 40, outputs={"fields": {"kind": "fields"}})
+    run = tmp_path / "run"
+    run.write_text("a file in place of the folder")
+    with pytest.raises(JobRefused, match="unreadable") as refused:
+        collect(declared, run, tmp_path / "collected")
+    assert refused.value.code == "unsafe-output"
+
+
 def test_a_link_as_output_fails_the_job(repository: Repository) -> None:
     assert refusal(repository, "import os, sys; os.symlink('/etc/passwd', sys.argv[-1])").code == "unsafe-output"
 
@@ -429,6 +438,16 @@ def test_a_program_of_the_commit_runs_without_a_shell(repository: Repository) ->
     result = repository.run("", values, argv=argv, parameters={"text": {"type": "text"}})
     assert result["fields"] == {"answer": 42, "name": "x", "good": True}
     assert result["values"] == values
+
+
+def test_an_open_file_counts_as_soon_as_it_has_no_name(tmp_path: Path) -> None:
+    this, size = [psutil.Process()], 8 * 2**20
+    with (tmp_path / "scratch").open("wb") as file:
+        file.write(bytes(size))
+        file.flush()
+        named = nameless_bytes(this)
+        (tmp_path / "scratch").unlink()
+        assert size <= nameless_bytes(this) - named < 2 * size
 
 
 @pytest.mark.parametrize("by_root", [True, False])
