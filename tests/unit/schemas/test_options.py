@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 import marey_schemas.options as room
 from marey_schemas.base import Options
 from marey_schemas.options.annotations import StepsProposal, VelocityMinimaProposal, WristContactProposal
+from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.job_kinds import BUILT_IN
 from marey_schemas.queue.job_params import AnnotateParams
 from marey_schemas.queue.kind_declaration import KindDeclaration
@@ -69,3 +70,10 @@ def test_every_parameter_of_a_job_has_a_description(kind: KindDeclaration) -> No
 def test_a_proposal_that_was_made_in_python_is_understood_by_the_server(proposal: Any) -> None:
     params = AnnotateParams(proposal=proposal)
     assert AnnotateParams.model_validate(params.model_dump(mode="json", exclude_unset=True)) == params
+
+
+@pytest.mark.parametrize("path", [".", "..", "../raw", "raw/./day1", "raw/.."])
+def test_imports_refuse_relative_folders_but_not_names_with_dots(path: str) -> None:
+    with pytest.raises(ValidationError, match=r"must not contain \. or \.\."):
+        ImportOptions(collection=path)
+    assert ImportOptions(collection="raw/.day1/take..2").collection == "raw/.day1/take..2"
