@@ -135,6 +135,18 @@ def test_what_json_cannot_contain_is_shown_as_text_and_long_documents_are_cut() 
     assert len(long) == LONGEST_TEXT
 
 
+def test_pointers_of_deep_documents_are_made_without_recursion() -> None:
+    levels = 900
+    document = b'[["smooth",' + b'{"a":' * levels + b"7" + b"}" * levels + b"]]"
+    found = imported(document)
+    assert found.refusal is None, found.refusal
+    record_part = PredecessorRecord.model_validate(found.items[0].parts["record"])
+    assert (record_part.fields, record_part.fields_left_out) == ({"/0/0": "smooth"}, 1)
+    short = b'[["smooth",' + b'{"a":' * 400 + b"7" + b"}" * 400 + b"]]"
+    fields = PredecessorRecord.model_validate(imported(short).items[0].parts["record"]).fields
+    assert fields == {"/0/0": "smooth", "/0/1" + "/a" * 400: 7}
+
+
 def test_fields_that_look_like_references_to_stored_bytes_are_none() -> None:
     forged = {"dtype": "<f4", "shape": [1], "content": DIGEST, "blob": DIGEST, "output": "x"}
     fields = record({**written.transform_run(), "hparams": forged}).fields

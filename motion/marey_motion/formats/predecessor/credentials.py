@@ -101,10 +101,9 @@ def is_secret_list(values: Sequence[Any]) -> bool:
     bool    True for lists such as `["set_token", "abc"]` and `["run", "--password", "abc"]`
     """
     for index, (name, value) in enumerate(pairwise(values)):
-        if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        if not isinstance(name, str) or not (index == 0 or name.startswith("-")) or _NAME.fullmatch(name) is None:
             continue
-        is_name = (index == 0 or name.startswith("-")) and is_secret_name(name)
-        if is_name and has_text(list(values[1:]) if index == 0 else value):
+        if is_secret_name(name) and has_text(list(values[1:]) if index == 0 else value):
             return True
     return False
 

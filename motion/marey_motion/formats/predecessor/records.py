@@ -15,7 +15,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from marey_motion.formats.predecessor.credentials import contains_credential, has_text, is_secret_list, is_secret_name
 from marey_motion.formats.texts import cut_text, plain_text
@@ -78,37 +78,85 @@ def fields_of_record(content: Any) -> RecordFields:
     shown: dict[str, FieldValue] = {}
     credentials: list[str] = []
     left_out = 0
-    for pointer, value, is_secret in _values(content):
-        if is_secret:
-            credentials.append(pointer)
-        if len(shown) == MOST_SHOWN or len(pointer) > LONGEST_TEXT:
+    for field in _fields(content):
+        if field.is_secret and len(credentials) < MOST_SHOWN:
+            credentials.append(field.pointer)
+        if len(shown) == MOST_SHOWN or len(field.pointer) > LONGEST_TEXT:
             left_out += 1
         else:
-            shown[pointer] = HIDDEN if is_secret else _shown(value)
-    return RecordFields(shown, left_out, tuple(credentials[:MOST_SHOWN]))
+            shown[field.pointer] = HIDDEN if field.is_secret else _shown(field.value)
+    return RecordFields(shown, left_out, tuple(credentials))
 
 
 def _is_command(entry: Any) -> bool:
     return isinstance(entry, list) and len(entry) == 2 and isinstance(entry[0], str)
 
 
-def _values(content: Any) -> Iterator[tuple[str, Any, bool]]:
-    """Yield, in the order of the document, each field's pointer, its value, and whether the value is a credential."""
-    waiting: list[tuple[str, Any, bool | None]] = [("", content, False)]
-    while waiting:
-        pointer, value, is_named = waiting.pop()
-        if is_named and not has_text(value):
-            is_named = None  # nor has what is in it, which is not searched again
-        is_secret = is_named or (is_named is False and _is_secret(value))
-        if not value or is_secret or not isinstance(value, (Mapping, list)) or _is_row(value):
-            yield pointer, value, is_secret
-            continue
-        members = value.items() if isinstance(value, Mapping) else enumerate(value)
-        secrets = _secrets_of(value) if isinstance(value, Mapping) else ()
-        below = [
-            (_pointer_to(pointer, key), member, None if is_named is None else key in secrets) for key, member in members
-        ]
-        waiting.extend(reversed(below))
+class _Container:
+    """Object or list of a document, whose members are searched one after another.
+
+    `above` is the container that contains it, as its member `key`; None for the whole document. `searched` states
+    whether its members are searched for credentials.
+    """
+
+    __slots__ = ("_above", "_key", "_pointer", "members", "searched", "secrets")
+
+    def __init__(self, above: _Container | None, key: object, value: Any, *, searched: bool) -> None:
+        self._above, self._key = above, key
+        self._pointer: str | None = "" if above is None else None
+        members = value.items() if isinstance(value, dict) else enumerate(value)
+        self.members: Iterator[tuple[object, Any]] = iter(members)
+        self.searched = searched
+        self.secrets = _secrets_of(value) if isinstance(value, dict) and searched else frozenset[str]()
+
+    @property
+    def pointer(self) -> str:
+        """The JSON Pointer of the container. It is made when it is needed: a file may contain a million containers."""
+        unnamed, one = [], self
+        while (pointer := one._pointer) is None:
+            unnamed.append(one)
+            assert one._above is not None, "the whole document has the empty pointer"
+            one = one._above
+        for one in reversed(unnamed):  # without recursion: a document may be nested a thousand times
+            pointer = one._pointer = _pointer_to(pointer, one._key)
+        return pointer
+
+
+class _Field(NamedTuple):
+    """Value of a document that is shown as one field, and whether it contains a credential."""
+
+    container: _Container | None
+    key: object
+    value: Any
+    is_secret: bool
+
+    @property
+    def pointer(self) -> str:
+        """The JSON Pointer of the value."""
+        return "" if self.container is None else _pointer_to(self.container.pointer, self.key)
+
+
+def _fields(content: Any) -> Iterator[_Field]:
+    """Yield the fields of a document in its order."""
+    if not _is_divided(content) or _is_secret(content):
+        yield _Field(None, "", content, _is_secret(content))
+        return
+    open_: list[_Container] = [_Container(None, "", content, searched=True)]
+    while open_:
+        container = open_[-1]
+        for key, value in container.members:
+            if not value or isinstance(value, (int, float)):  # no credential; a file may contain a million of these
+                yield _Field(container, key, value, is_secret=False)
+                continue
+            is_named = key in container.secrets
+            is_secret = container.searched and (has_text(value) if is_named else _is_secret(value))
+            if not is_secret and _is_divided(value):
+                # below the name of a credential, what has no text contains none
+                open_.append(_Container(container, key, value, searched=container.searched and not is_named))
+                break
+            yield _Field(container, key, value, is_secret)
+        else:
+            open_.pop()
 
 
 def _secrets_of(value: Mapping[str, Any]) -> set[str]:
@@ -122,15 +170,29 @@ def _is_secret(value: Any) -> bool:
     """Return whether a text contains a credential, or a list contains one, either in a text or after its name."""
     if isinstance(value, str):
         return contains_credential(value)
-    if not isinstance(value, list):
+    if not isinstance(value, list) or not _has_member_of(value, str):
         return False
     return is_secret_list(value) or (
-        _is_row(value) and any(isinstance(one, str) and contains_credential(one) for one in value)
+        not _is_divided(value) and any(isinstance(one, str) and contains_credential(one) for one in value)
     )
 
 
-def _is_row(value: Any) -> bool:
-    return isinstance(value, list) and not any(isinstance(one, (Mapping, list)) for one in value)
+def _is_divided(value: Any) -> bool:
+    """Return whether the members of a value are fields of their own.
+
+    This is the case for an object with members, and for a list that contains an object or a list.
+    """
+    if isinstance(value, dict):
+        return bool(value)
+    return isinstance(value, list) and _has_member_of(value, dict, list)
+
+
+def _has_member_of(value: list[Any], *kinds: type) -> bool:
+    """Return whether a list contains a value of one of the types, without a look at each number of a long list."""
+    for found in set(map(type, value)):  # noqa: SIM110 - `any` makes a generator for each of a million lists
+        if issubclass(found, kinds):
+            return True
+    return False
 
 
 def _pointer_to(pointer: str, key: object) -> str:
