@@ -11,7 +11,10 @@ from docs.generate import declared_metrics
 
 ROOT = Path(__file__).parents[3]
 FILES = ROOT / "deploy" / "monitoring"
-ALERTS = [rule for group in yaml.safe_load((FILES / "alerts.yml").read_text())["groups"] for rule in group["rules"]]
+GROUPS = {group["name"]: group["rules"] for group in yaml.safe_load((FILES / "alerts.yml").read_text())["groups"]}
+ALERTS = [rule for rules in GROUPS.values() for rule in rules]
+RUNBOOKS = {"marey": "answer-an-alert.md", "marey-attacks": "see-attacks.md"}
+"""The page that describes the alerts of each group."""
 PANELS = json.loads((FILES / "dashboard.json").read_text())["panels"]
 OF_PROMETHEUS = {"instance", "job", "le"}
 """Labels that Prometheus adds, and the label of the buckets of histograms."""
@@ -66,12 +69,35 @@ def test_texts_of_alerts_and_legends_use_labels_of_their_queries() -> None:
         assert set(used) <= allowed, text
 
 
-def test_the_runbook_describes_each_alert_once_and_no_other() -> None:
-    runbook = (ROOT / "docs" / "how-to" / "answer-an-alert.md").read_text()
+@pytest.mark.parametrize("group", GROUPS)
+def test_the_runbook_describes_each_alert_of_a_group_once_and_no_other(group: str) -> None:
+    runbook = (ROOT / "docs" / "how-to" / RUNBOOKS[group]).read_text()
     sections = re.findall(r"^## (\w+)\n\n(.*?)(?=^## |\Z)", runbook, re.MULTILINE | re.DOTALL)
-    assert [name for name, _ in sections] == [alert["alert"] for alert in ALERTS]
+    assert [name for name, _ in sections] == [alert["alert"] for alert in GROUPS[group]]
     for name, text in sections:
         assert all(part in text for part in ("**Meaning.**", "```sh", "**Expect**")), name
+
+
+def watched() -> set[tuple[str, str, str, str]]:
+    """Return (alert, metric, label, value) for each value of a label that an alert about attacks selects."""
+    return {
+        (alert["alert"], metric, label, value)
+        for alert in ALERTS
+        for metric, inner in re.findall(r"(marey_\w+)(?:\{([^}]*)\})?", alert["expr"])
+        for label, values in re.findall(r'(\w+)=~?"([^"]*)"', inner) or [("", "")]
+        for value in values.split("|")
+    }
+
+
+def test_each_sign_of_an_attack_has_an_alert_and_each_alert_is_in_the_table() -> None:
+    page = (ROOT / "docs" / "how-to" / "see-attacks.md").read_text()
+    described = set()
+    for signs, alert in re.findall(r"^\| (`marey_.*?) \|.*\| \[?(\w+)\]?[^|]*\|$", page, re.MULTILINE):
+        (metric,) = set(re.findall(r"marey_\w+", signs))
+        pairs = re.findall(r'(\w+)="([^"]*)"', signs) or [("", "")]
+        described |= {(alert, metric, label, value) for label, value in pairs}
+    of_attacks = {alert["alert"] for alert in GROUPS["marey-attacks"]} | {"MareyCallsWait"}
+    assert described == {one for one in watched() if one[0] in of_attacks}
 
 
 def test_names_of_metrics_end_in_their_unit() -> None:
