@@ -14,6 +14,9 @@ import sys
 import psutil
 
 PR_SET_PDEATHSIG = 1
+OUT_OF_MEMORY = 86
+"""Exit status of a child that could not allocate the memory for a message; no other end has this status."""
+_COUNTERS = "/proc/vmstat"
 
 
 def die_with_parent() -> None:
@@ -49,6 +52,18 @@ def allow_processor_time(seconds: float) -> None:
     used = resource.getrusage(resource.RUSAGE_SELF)
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)
     resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used.ru_utime + used.ru_stime + seconds), hard))
+
+
+def count_memory_kills() -> int:
+    """Return how many processes the kernel has killed since the machine started, because memory was used up.
+
+    Return 0 on systems other than Linux.
+    """
+    try:
+        with open(_COUNTERS, encoding="ascii") as counters:
+            return next((int(line.split()[1]) for line in counters if line.startswith("oom_kill ")), 0)
+    except FileNotFoundError:
+        return 0
 
 
 def resident_bytes(pid: int) -> int:

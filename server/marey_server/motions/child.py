@@ -13,6 +13,7 @@ a child if an order takes too long, or if the client that waits for its result h
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -28,7 +29,7 @@ from marey_schemas.encoding.codecs import MSGPACK, ArrayForm, CodecError, decode
 from marey_schemas.problems import FieldError
 from marey_schemas.processes.child_process import READY, BadMessage, connect_to_parent
 from marey_schemas.processes.forking import fork_children
-from marey_schemas.processes.limits import allow_memory, allow_processor_time
+from marey_schemas.processes.limits import OUT_OF_MEMORY, allow_memory, allow_processor_time
 from marey_schemas.processes.memory import keep_freed_memory, loading_modules
 from marey_server.errors import ApiProblem, TooLargeProblem
 
@@ -151,16 +152,19 @@ def main() -> None:
 def carry_out_orders(pipe: Connection, *, memory_bytes: int) -> None:
     """For each received `ChildOrder`, call the function and send the result or the error, until the pipe closes.
 
-    The functions may use `memory_bytes` more than this process uses now.
+    The functions may use `memory_bytes` more than this process uses now. If even a message needs more, this process
+    ends with the status `OUT_OF_MEMORY`.
     """
     allow_memory(memory_bytes)
-    while True:
-        try:
+    try:
+        while True:
             order = ChildOrder.unpack(pipe.recv_bytes())
-        except EOFError:
-            return
-        allow_processor_time(order.processor_s)
-        pipe.send_bytes(run(order))
+            allow_processor_time(order.processor_s)
+            pipe.send_bytes(run(order))
+    except EOFError:
+        return
+    except MemoryError:
+        os._exit(OUT_OF_MEMORY)
 
 
 def run(order: ChildOrder) -> bytes:

@@ -19,6 +19,7 @@ from typing import Any, Generic, TypeVar
 
 from marey_schemas.processes.child_process import BadMessage, ChildBroken, ConnectedChild
 from marey_schemas.processes.forking import FORKS, LOST
+from marey_schemas.processes.limits import OUT_OF_MEMORY, count_memory_kills
 from marey_schemas.sizes import MIB
 from marey_server.errors import ApiProblem, InvalidProblem, NotFoundProblem, TooLargeProblem, UnavailableProblem
 from marey_server.motions.child import ChildAnswer, ChildOrder, ChildRefusal
@@ -161,6 +162,7 @@ class Children:
         self._idle: set[int] = set()
         """Numbers of the children that wait for a task."""
         self._closed = False
+        self._memory_kills = count_memory_kills()
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -354,6 +356,15 @@ class Children:
         if status == LOST:
             task.count_end("died")
             return UnavailableProblem("The child process of this request ended unexpectedly; try again.")
+        if status == OUT_OF_MEMORY:
+            task.count_end("memory")
+            return self._too_much_memory()
+        if status == -signal.SIGKILL and not task.stopped and self._kernel_lacked_memory():
+            task.count_end("memory")
+            return TooLargeProblem(
+                f"The machine ran out of memory, so the system killed the child process of this request; {JOB_ADVICE}.",
+                code="memory-limit",
+            )
         out_of_time = status == -signal.SIGXCPU
         task.count_end(task.stopped or ("time" if out_of_time else "died"))
         if task.stopped == "time":
@@ -365,6 +376,11 @@ class Children:
             f"The child process of this request {ended}; the data may be damaged, or need too much memory.",
             code="child-died",
         )
+
+    def _kernel_lacked_memory(self) -> bool:
+        """Return whether the kernel has killed a process for lack of memory since this was last asked."""
+        before, self._memory_kills = self._memory_kills, count_memory_kills()
+        return self._memory_kills > before
 
     def _too_much_memory(self) -> ApiProblem:
         return TooLargeProblem(

@@ -11,7 +11,9 @@ import pytest
 from tests.support.patience import PATIENCE_S, wait_until
 
 from marey_schemas.processes.forking import FORKS
+from marey_schemas.sizes import MIB
 from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem, UnavailableProblem
+from marey_server.process import children as child_pool
 from marey_server.process.children import ChildLimits, Children, ChildTask
 
 FUNCTIONS = "tests.support.child_functions"
@@ -126,6 +128,36 @@ def test_what_somebody_kills_fails_and_the_next_order_is_carried_out(children: C
     with pytest.raises(InvalidProblem, match="SIGKILL"):
         task.future.result(PATIENCE_S)
     assert run(children, "echo", b"next").startswith(b"next ")
+
+
+def test_a_message_that_needs_too_much_memory_is_refused_as_such() -> None:
+    pool = Children(ChildLimits(2, 4, 32, 60, wall_s=PATIENCE_S), ())
+    try:
+        with pytest.raises(TooLargeProblem, match="32 MiB of memory") as caught:
+            run(pool, "echo", bytes(64 * MIB))
+        assert caught.value.error_code == "memory-limit"
+        assert run(pool, "echo", b"next").startswith(b"next ")
+    finally:
+        pool.close()
+
+
+@pytest.mark.parametrize(
+    ("kills", "code"), [(1, "memory-limit"), (0, "child-died")], ids=["by the kernel", "by somebody"]
+)
+def test_a_child_that_the_kernel_killed_says_that_the_machine_ran_out_of_memory(
+    children: Children, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kills: int, code: str
+) -> None:
+    monkeypatch.setattr(children, "_memory_kills", 7)
+    monkeypatch.setattr(child_pool, "count_memory_kills", lambda: 7 + kills)
+    ended: list[tuple[str, str]] = []
+    task = wait_for(children, tmp_path, "walk", caller="rita")
+    task.count_stop = lambda reason, work: ended.append((reason, work))
+    os.kill(int((tmp_path / "walk").read_text()), signal.SIGKILL)
+    with pytest.raises(ApiProblem) as caught:
+        task.future.result(PATIENCE_S)
+    assert caught.value.error_code == code
+    assert ("machine ran out of memory" in caught.value.detail) is bool(kills)
+    assert ended == [("memory" if kills else "died", "wait_for")]
 
 
 def test_one_caller_never_uses_all_children(children: Children, tmp_path: Path) -> None:
