@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import re
 import shutil
 import tempfile
 import threading
@@ -22,6 +23,9 @@ from tests.support.queue_desk import KINDS
 from tests.support.rest_server import Server, running
 from tests.support.store_fixtures import Lab
 
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.queue import job_kinds
 from marey_server import commands
 from marey_server.access.principal import SYSTEM
@@ -30,6 +34,7 @@ from marey_server.handlers.queue import leases
 from marey_server.process import feed
 from marey_server.store import events
 from marey_server.store.database.connections import Database
+from marey_server.store.fsck import check_store
 from marey_server.store.monitoring import workers
 
 FOLLOWERS = 4
@@ -94,6 +99,58 @@ def test_a_follower_continues_on_a_copy_of_the_database_elsewhere(lab: Lab, tmp_
     assert [one.seq for one in following] == sorted({one.seq for one in following})
 
 
+def test_a_server_on_a_copy_serves_everything_and_its_followers_continue(
+    server: Server, database: Database, tmp_path: Path
+) -> None:
+    use_transaction_ids(database)
+    token = server.make_project()
+    owner = server.client(token)
+    walk = write_bvh(generate_gait(1.3, 0.0, 1.0))
+    clip = import_clip(owner, "walk.bvh", walk)
+    ended = owner.post("/tokens", json={"name": "ended", "scopes": ["read"]}).raise_for_status().json()
+    owner.delete(f"/tokens/{ended['id']}", headers={"If-Match": "*"}).raise_for_status()
+    followers = Followers(server, token, 1)
+    followers.until(lambda received: any(one["kind"] == "item.created" for one in received))
+    before, contents = events_of(owner), contents_of(owner, clip)
+    assert digest_of(walk) in contents
+    with copy_elsewhere(database, tmp_path) as copy:
+        (tmp_path / "elsewhere").mkdir(exist_ok=True)
+        with running(copy, tmp_path / "elsewhere") as restored:
+            again = restored.client(token)
+            assert contents_of(again, clip) == contents
+            assert restored.client(ended["secret"]).get("/me").status_code == 401
+            assert events_of(again)[: len(before)] == before
+            reconnected = Followers(restored, token, 1, after=before[-1]["seq"])
+            added = import_clip(again, "turn.bvh", write_bvh(generate_gait(1.1, 0.4, 1.0)))
+            reconnected.until(lambda received: any(one["subject"] == added for one in received))
+            assert [one["seq"] for one in reconnected.received[0]] == [
+                one["seq"] for one in events_of(again) if one["seq"] > before[-1]["seq"]
+            ][: len(reconnected.received[0])]
+        assert [str(one) for one in check_store(copy)] == []
+
+
+def import_clip(client: httpx.Client, name: str, content: bytes) -> str:
+    """Import a file and return the id of its clip."""
+    answer = client.post("/projects/lab/imports", files={"files": (name, content)}).raise_for_status()
+    (entry,) = answer.json()["entries"]
+    return str(entry["item"])
+
+
+def contents_of(client: httpx.Client, clip: str) -> dict[str, bytes]:
+    """Return the parts of a clip by name, and the files to which they refer by digest."""
+    found = client.get(f"/projects/lab/clips/{clip}").raise_for_status().json()
+    parts = {part: client.get(f"/projects/lab/clips/{clip}/parts/{part}").raise_for_status() for part in found["parts"]}
+    digests = {digest for part in parts.values() for digest in re.findall(r"sha256:[0-9a-f]{64}", part.text)}
+    blobs = {digest: client.get(f"/blobs/{digest}") for digest in digests}
+    return {name: one.content for name, one in {**parts, **blobs}.items()}
+
+
+def events_of(client: httpx.Client) -> list[dict[str, Any]]:
+    """Return all events of the project."""
+    found: list[dict[str, Any]] = client.get("/projects/lab/events?limit=1000").raise_for_status().json()["items"]
+    return found
+
+
 # -- wake-ups ----------------------------------------------------------------------------------------------------------
 
 
@@ -132,9 +189,11 @@ def server(database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 class Followers:
     """Clients that follow the events of the project `lab`, each in a thread."""
 
-    def __init__(self, server: Server, token: str, count: int) -> None:
+    def __init__(self, server: Server, token: str, count: int, *, after: int | None = None) -> None:
+        """Begin to follow, `after` an event with this number as a client does that lost its connection."""
         self.server = server
         self.token = token
+        self.after = after
         self.received: list[list[dict[str, Any]]] = [[] for _ in range(count)]
         self.changed = threading.Condition()
         self._threads = [threading.Thread(target=self._follow, args=(one,), daemon=True) for one in self.received]
@@ -143,6 +202,8 @@ class Followers:
 
     def _follow(self, received: list[dict[str, Any]]) -> None:
         headers = {"Authorization": f"Bearer {self.token}", "Accept": "text/event-stream"}
+        if self.after is not None:
+            headers["Last-Event-ID"] = str(self.after)
         address = f"{self.server.api}/projects/lab/events"
         with httpx.stream("GET", address, headers=headers, timeout=PATIENCE_S) as stream:
             for line in stream.iter_lines():
