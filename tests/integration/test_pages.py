@@ -123,11 +123,28 @@ def test_a_link_is_refused_to_pages_of_other_sites_and_ends_with_the_token_that_
     assert "Secure" in secure.headers["Set-Cookie"]
     session = cookie_of(secure)
     assert httpx.get(f"{server.api}/projects/lab", headers=session).status_code == 200
+    for ends in ("/logout", "/tokens/{id}"):
+        ended = dies_with_its_maker(server, owner, ends)
+        assert httpx.get(f"{server.api}/projects/lab", headers=ended).status_code == 401
+        assert httpx.get(f"{server.api}/projects/lab", headers=session).status_code == 200, "of another token"
     later = owner.post("/projects/lab/browser-links").json()["code"]
     (own,) = (one for one in owner.get("/tokens").json()["items"] if one["name"] == "test")
     assert owner.delete(f"/tokens/{own['id']}?with_created=true").is_success
     assert httpx.get(f"{server.api}/projects/lab", headers=session).status_code == 401
     assert exchange(server, later).status_code == 404
+
+
+def dies_with_its_maker(server: Server, owner: httpx.Client, ends: str) -> dict[str, str]:
+    """Begin a session with a token of its own, end this token by the route `ends`, and return the cookie."""
+    made = owner.post("/tokens", json={"name": "mine", "scopes": ["read", "write"]}).raise_for_status().json()
+    maker = server.client(made["secret"])
+    session = cookie_of(exchange(server, maker.post("/projects/lab/browser-links").json()["code"]))
+    assert httpx.get(f"{server.api}/projects/lab", headers=session).is_success
+    if ends == "/logout":
+        maker.post(ends).raise_for_status()
+    else:
+        owner.delete(ends.format(**made)).raise_for_status()
+    return session
 
 
 def test_without_built_pages_a_page_names_the_command_that_builds_them(

@@ -293,9 +293,10 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     With `with_created`, also revoke the successors and predecessors of this token, all tokens that were created with
     any of these, and so on.
 
-    Without `with_created`, only this token is revoked, and the tokens connected by it are connected directly. For
-    example, if A created the revoked token B, and B created C, then C is recorded as created by A. The successor of B
-    is recorded as the successor of B's predecessor. A token may always revoke itself.
+    Without `with_created`, only this token and the sessions of browsers that it began are revoked, and the tokens
+    connected by it are connected directly. For example, if A created the revoked token B, and B created C, then C is
+    recorded as created by A. The successor of B is recorded as the successor of B's predecessor. A token may always
+    revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:
@@ -312,7 +313,8 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     if with_created:
         _revoke(tx, token.c.id.in_(_connected_with(which)))
         return
-    tx.execute(update(token).where(token.c.created_by == token_id).values(created_by=found.created_by))
+    lasting = and_(token.c.created_by == token_id, token.c.session.is_(False))
+    tx.execute(update(token).where(lasting).values(created_by=found.created_by))
     _revoke(tx, which)
     tx.execute(update(token).where(token.c.successor_of == token_id).values(successor_of=found.successor_of))
 
@@ -367,7 +369,10 @@ def end_tokens(tx: Transaction, user_id: str, which: EndTokens) -> None:
 
 
 def _revoke(tx: Transaction, which: ColumnElement[bool]) -> None:
-    gone = tx.execute(delete(token).where(which).returning(token.c.id, token.c.name, token.c.user_id)).all()
+    """Revoke the selected tokens, and the links and sessions of browsers that were made with them."""
+    of_browsers = token.c.created_by.in_(select(token.c.id).where(which).correlate(None)), token.c.session.is_(True)
+    ended = delete(token).where(or_(which, and_(*of_browsers)))
+    gone = tx.execute(ended.returning(token.c.id, token.c.name, token.c.user_id)).all()
     owners = select(user.c.id, user.c.name).where(user.c.id.in_({row.user_id for row in gone}))
     names = {row.id: row.name for row in tx.execute(owners)} if gone else {}
     for row in gone:
