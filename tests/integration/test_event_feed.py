@@ -308,10 +308,11 @@ def test_servers_of_one_postgres_notify_each_other(database: Database) -> None:
 
     async def listen() -> None:
         notifications = database.notifications(events.CHANNEL)
-        await anext(notifications)
-        database.write(SYSTEM, lambda tx: tx.emit("tag.created", "s"))
-        database.write(SYSTEM, events.number_events)
-        await anext(notifications)
-        await notifications.aclose()
+        async with asyncio.timeout(PATIENCE_S):
+            await anext(notifications)
+            database.write(SYSTEM, lambda tx: tx.emit("tag.created", "s"))
+            database.write(SYSTEM, events.number_events)
+            await anext(notifications)
+            await notifications.aclose()
 
-    asyncio.run(asyncio.wait_for(listen(), PATIENCE_S))
+    asyncio.run(listen())

@@ -95,7 +95,8 @@ def serve(
             return client
 
         try:
-            await asyncio.wait_for(work(connections, server, connect), PATIENCE_S)
+            async with asyncio.timeout(PATIENCE_S):
+                await work(connections, server, connect)
         finally:
             connections.stop()
             connections.close()

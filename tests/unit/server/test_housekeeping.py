@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from tests.support.patience import PATIENCE_S
 
 from marey_server.app import create_app
 from marey_server.process import housekeeping
@@ -34,8 +35,8 @@ def test_garbage_is_collected_soon_after_the_start_and_again_later(
                 both_done.set()
 
         monkeypatch.setattr(housekeeping, "_collect_garbage", noted)
-        async with housekeeping.running_housekeeping(app.services):
-            await asyncio.wait_for(both_done.wait(), 30)
+        async with housekeeping.running_housekeeping(app.services), asyncio.timeout(PATIENCE_S):
+            await both_done.wait()
         return rounds
 
     assert len(asyncio.run(two_rounds())) >= 2
@@ -87,7 +88,8 @@ def test_housekeeping_leaves_the_compute_threads_to_requests(
             try:
                 assert await asyncio.to_thread(lambda: all(begun.acquire(timeout=20) for _ in range(3)))
                 future = app.services.compute_threads.submit_for(Client("anna"), sum, (1, 2))
-                return await asyncio.wait_for(asyncio.wrap_future(future), 30)
+                async with asyncio.timeout(PATIENCE_S):
+                    return await asyncio.wrap_future(future)
             finally:
                 may_end.set()
 
@@ -131,8 +133,8 @@ def test_copies_of_index_files_that_the_store_has_deleted_are_removed(
     copy.write_bytes(b"poses")
 
     async def until_removed() -> None:
-        async with housekeeping.running_housekeeping(app.services):
+        async with housekeeping.running_housekeeping(app.services), asyncio.timeout(PATIENCE_S):
             while copy.exists():
                 await asyncio.sleep(0.01)
 
-    asyncio.run(asyncio.wait_for(until_removed(), 30))
+    asyncio.run(until_removed())

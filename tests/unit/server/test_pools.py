@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.fake_launcher import FakeLauncher
+from tests.support.patience import PATIENCE_S
 
 from marey_server.access.principal import SYSTEM
 from marey_server.app import create_app
@@ -61,11 +62,11 @@ def test_each_pool_gets_a_launcher_with_its_own_token_and_options(database: Data
     app = create_app(settings, database)
 
     async def run_until_started() -> None:
-        async with keeping_workers(app.services, "http://127.0.0.1:1"):
+        async with asyncio.timeout(PATIENCE_S), keeping_workers(app.services, "http://127.0.0.1:1"):
             while not made[0][1].keys:
                 await asyncio.sleep(0.01)
 
-    asyncio.run(asyncio.wait_for(run_until_started(), 60))
+    asyncio.run(run_until_started())
     ((context, launcher),) = made
     assert (context.pool, context.url, context.options) == (
         "gpu", "https://marey.internal", {"queue": "long", "zone": "b"},
