@@ -140,9 +140,11 @@ class ConflictProblem(ApiProblem):
 
 
 class LeaseLostProblem(ConflictProblem):
-    """The lease of the job has ended, or another worker has it now; stop working on the job."""
+    """The attempt no longer holds the job, or the author of the job may not run it any more; stop working on it."""
 
     code = "lease-lost"
+    attempt_to_end: tuple[str, int] | None = None
+    """Id of the job, and fence of an attempt that still holds it but must end, because the author lost access."""
 
 
 class QuotaExceededProblem(ConflictProblem):
@@ -156,18 +158,6 @@ class GoneProblem(ApiProblem):
 
     status = 410
     code = "gone"
-
-
-class AuthorLostProblem(LeaseLostProblem):
-    """The user who submitted the job may no longer run jobs in the project; stop working on the job."""
-
-    def __init__(self, job_id: str, fence: int) -> None:
-        super().__init__(
-            f"The author of {job_id} is disabled or no longer has the role that the job needs. Stop working on it.",
-            context={"reason": AUTHOR_LOST},
-        )
-        self.job_id = job_id
-        self.fence = fence
 
 
 AUTHOR_LOST = "author-lost-access"

@@ -34,8 +34,8 @@ from marey_schemas.sizes import KIB
 from marey_server.access.principal import ANONYMOUS
 from marey_server.errors import (
     ApiProblem,
-    AuthorLostProblem,
     BadRequestProblem,
+    LeaseLostProblem,
     TooLargeProblem,
 )
 from marey_server.http import negotiation
@@ -157,8 +157,8 @@ class Resource(CallingExchange):
 
     def _write_problem(self, error: BaseException) -> None:
         super()._write_problem(error)
-        if isinstance(error, AuthorLostProblem):
-            self.services.end_attempt(error)
+        if isinstance(error, LeaseLostProblem) and error.attempt_to_end is not None:
+            self.services.end_attempt(*error.attempt_to_end)
 
     def on_finish(self) -> None:
         """Record the use of the caller's token after the answer was written."""

@@ -17,7 +17,7 @@ from marey_schemas.tracing.export import Tracer
 from marey_server.access import scopes
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.secret_tokens import is_sealed, token_hash
-from marey_server.errors import ApiProblem, AuthorLostProblem, UnavailableProblem
+from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.motions.child import Message
 from marey_server.motions.searching import SearchableKey
 from marey_server.process.child_starting import LOADED_FIRST, MODULES_FIRST
@@ -213,10 +213,10 @@ class Services:
         while numbered == events.NUMBERED_AT_ONCE:
             numbered = await asyncio.wrap_future(self.database.submit_write(SYSTEM, events.number_events))
 
-    def end_attempt(self, lost: AuthorLostProblem) -> None:
+    def end_attempt(self, job_id: str, fence: int) -> None:
         """End the job of an attempt whose author may no longer run jobs; if this fails, the job ends with its lease."""
         with suppress(UnavailableProblem):
-            self.database.submit_write(SYSTEM, end_for_lost_author, lost.job_id, lost.fence)
+            self.database.submit_write(SYSTEM, end_for_lost_author, job_id, fence)
 
     def close(self) -> None:
         """Stop child processes and threads, wait for running transactions, and close the database."""

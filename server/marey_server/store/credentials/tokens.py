@@ -24,7 +24,6 @@ from marey_server.access.secret_tokens import (
     split_user_token,
 )
 from marey_server.errors import (
-    AuthorLostProblem,
     ForbiddenProblem,
     InvalidProblem,
     NotFoundProblem,
@@ -35,7 +34,7 @@ from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
 from marey_server.store.jobs.claiming.rights import resolve_pod_token
-from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, lease_lost
+from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, author_lost, lease_lost
 from marey_server.store.quotas.counting import require_room
 from marey_server.store.studies.participants import resolve_participant
 from marey_server.store.tables import attempt, job, token, user
@@ -131,7 +130,7 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     if row is None:
         raise unknown_token()
     if row.holds and not row.author_may_run:
-        raise AuthorLostProblem(row.id, row.fence)
+        raise author_lost(row.id, row.fence)
     if row.holds:
         return Principal("attempt", scopes=_ATTEMPT_SCOPES, job_id=row.id, fence=row.fence, project_id=row.project_id)
     if row.write_id is None:  # it sent no last request that could be repeated

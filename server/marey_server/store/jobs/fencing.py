@@ -26,7 +26,7 @@ from sqlalchemy import (
 
 from marey_schemas.access import Role
 from marey_server.access.principal import Principal
-from marey_server.errors import LeaseLostProblem, NotFoundProblem
+from marey_server.errors import AUTHOR_LOST, LeaseLostProblem, NotFoundProblem
 from marey_server.store.projects import WRITERS, has_role_in_folders
 from marey_server.store.tables import attempt, job, member, user
 from marey_server.store.transaction import Transaction
@@ -126,6 +126,19 @@ def lease_lost(job_id: str, fence: int) -> LeaseLostProblem:
     The error makes the worker stop the attempt.
     """
     return LeaseLostProblem(f"Attempt {fence} has lost its lease of {job_id}. Stop working on it.")
+
+
+def author_lost(job_id: str, fence: int) -> LeaseLostProblem:
+    """Return the error for an attempt that holds a job whose author may no longer run jobs in the project.
+
+    The error makes the worker stop the attempt, and the server end the job.
+    """
+    lost = LeaseLostProblem(
+        f"The author of {job_id} is disabled or no longer has the role that the job needs. Stop working on it.",
+        context={"reason": AUTHOR_LOST},
+    )
+    lost.attempt_to_end = job_id, fence
+    return lost
 
 
 def stored_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> dict[str, Any] | None:
