@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import EntryPoint, entry_points
@@ -35,8 +36,8 @@ BUILT_IN = {
 """Launchers of this package, which are imported only if the settings name them."""
 DISPATCHER = "marey_server.launchers.kubernetes.dispatcher:Dispatcher"
 """Class that starts a pod for each job that needs one; imported only if the settings need it."""
-FIXED_POOL, FIXED_KEY = "local", "fixed"
-"""Parts of the names of the workers that the setting `local_workers` starts."""
+FIXED_POOL = "local"
+"""First part of the names of the workers that the setting `local_workers` starts; machine and port follow."""
 
 
 @asynccontextmanager
@@ -47,10 +48,11 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     server finds them. Raises `LauncherUnusable` if the launcher does not exist, or its options are invalid.
     """
     settings = services.settings
+    port = urlsplit(address).port or settings.port  # the setting is 0 for any free port
     controllers: list[WorkerController] = [
         PoolKeeper(
             pool,
-            _launcher_of(pool, services, address),
+            _launcher_of(pool, services, address, port),
             services.database,
             [other for other in settings.pools if other.name != pool.name],
         )
@@ -58,14 +60,13 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     ]
     fixed = None
     if settings.local_workers:
-        port = urlsplit(address).port or settings.port  # the setting is 0 for any free port
         token = make_worker_token(services.database, settings, port)
         data = settings.data.absolute()
         variables = settings.worker_trace_variables
         fixed = LocalLauncher(
             LaunchContext(FIXED_POOL, address, token, data, settings.log_form, settings.log_level, variables=variables)
         )
-        await fixed.start(WorkerRequest(), settings.local_workers, key=FIXED_KEY)
+        await fixed.start(WorkerRequest(), settings.local_workers, key=f"{socket.gethostname()}-{port}")
     if settings.own_pods is not None:
         controllers.append(_dispatcher(services, address))
     if (settings.pools or settings.own_pods) and settings.worker_url is None and settings.launcher != "local":
@@ -125,11 +126,11 @@ def _load(found: EntryPoint) -> Any:
         raise LauncherUnusable(f"launcher: the launcher {found.name!r} cannot be loaded: {error}") from error
 
 
-def _launcher_of(pool: WorkerPool, services: Services, address: str) -> Launcher:
+def _launcher_of(pool: WorkerPool, services: Services, address: str, port: int) -> Launcher:
     settings = services.settings
     make = find_launcher(settings.launcher)
     file = worker_token_file(settings.data, pool.name)
-    token = keep_pool_token(services.database, settings, pool.name, pool.labels, file)
+    token = keep_pool_token(services.database, settings, port, pool.name, pool.labels, file)
     return make(
         LaunchContext(
             pool.name,

@@ -28,8 +28,10 @@ def make_worker_token(database: Database, settings: Settings, port: int) -> str:
     return database.write(SYSTEM, _replace_token, name, {})
 
 
-def keep_pool_token(database: Database, settings: Settings, pool: str, labels: Mapping[str, str], file: Path) -> str:
-    """Return the token for the workers of a pool, which may announce `labels` and no other labels.
+def keep_pool_token(
+    database: Database, settings: Settings, port: int, pool: str, labels: Mapping[str, str], file: Path
+) -> str:
+    """Return the token for the workers of a pool of the server at `port`, which may announce only `labels`.
 
     The token in `file` stays in use if it is valid and has these labels, because workers that an earlier server started
     use it. Otherwise, a new token is created and written to `file`, which workers read again.
@@ -37,7 +39,7 @@ def keep_pool_token(database: Database, settings: Settings, pool: str, labels: M
     kept = _read_token(file)
     if kept is not None and _is_usable(database, kept, labels):
         return kept
-    name = f"workers of the pool {pool} of the server at {_place(settings.host, settings.port)}"
+    name = f"workers of the pool {pool} of the server at {_place(settings.host, port)}"
     return database.write(SYSTEM, _replace_token, name, labels, file)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import subprocess
 import sys
 from importlib.metadata import EntryPoint
@@ -106,3 +107,22 @@ def test_a_launcher_that_does_not_exist_is_an_error_in_one_line(tmp_path: Path) 
     assert done.returncode == 1
     assert "invalid setting: launcher: there is no launcher 'slrum'; choose one of" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
+
+
+def test_workers_beside_the_server_are_named_after_its_machine_and_port(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Several servers may use one database, and their workers appear in one list."""
+    database.write(SYSTEM, users.ensure_first_administrator)
+    monkeypatch.setattr(pools, "LocalLauncher", make_launcher)
+    app = create_app(Settings(data=tmp_path, port=0, local_workers=2), database)
+
+    async def start_at(port: int) -> tuple[str, ...]:
+        made.clear()
+        async with keeping_workers(app.services, f"http://127.0.0.1:{port}"):
+            ((context, launcher),) = made
+            return tuple(f"{context.pool}-{key}" for key in launcher.keys)
+
+    machine = socket.gethostname()
+    assert asyncio.run(start_at(8460)) == (f"local-{machine}-8460",)
+    assert asyncio.run(start_at(8461)) == (f"local-{machine}-8461",)

@@ -23,8 +23,8 @@ def file(database: Database, tmp_path: Path) -> Path:
     return tmp_path / "worker-tokens" / "gpu"
 
 
-def keep(database: Database, file: Path, labels: dict[str, str] = LABELS) -> str:
-    return keep_pool_token(database, Settings(), "gpu", labels, file)
+def keep(database: Database, file: Path, labels: dict[str, str] = LABELS, *, port: int = 8460) -> str:
+    return keep_pool_token(database, Settings(port=0), port, "gpu", labels, file)
 
 
 def holder(database: Database, token: str) -> Principal:
@@ -41,6 +41,12 @@ def test_a_token_can_only_claim_jobs_and_is_in_a_private_file(database: Database
 
 def test_the_next_server_keeps_the_token(database: Database, file: Path) -> None:
     assert keep(database, file) == keep(database, file)
+
+
+def test_servers_at_other_ports_with_other_folders_keep_their_tokens(database: Database, file: Path) -> None:
+    first = keep(database, file)
+    second = keep(database, file.parent.parent / "other" / "gpu", port=8461)
+    assert holder(database, first).token_id != holder(database, second).token_id
 
 
 def test_other_labels_or_an_unusable_file_lead_to_a_new_token(database: Database, file: Path) -> None:
