@@ -10,9 +10,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 from tests.support.attached_worker import python_path
 from tests.support.launcher_contract import REQUEST, Engine, LauncherContract, processes_of
+from tests.support.patience import PATIENCE_S, wait_until
 from tests.support.present import present
 from tests.support.server_process import ServerProcess
 from tests.support.slurm_cluster import CPUS, SlurmCluster, running_cluster
@@ -150,6 +152,20 @@ class TestSlurmLauncher(LauncherContract):
         finally:
             server.kill()
             cluster.ask("scancel", "--me")
+
+
+@pytest.mark.slurm
+def test_a_stopped_cluster_leaves_no_process_though_its_controller_was_killed(tmp_path: Path) -> None:
+    (script := tmp_path / "script").write_text("#!/bin/sh\nexec sleep 300\n")
+    with running_cluster(tmp_path) as cluster:
+        cluster.ask("sbatch", "--output=/dev/null", str(script))
+        wait_until(lambda: any(step.children() for step in cluster.steps()))
+        left = [process for step in cluster.steps() for process in (step, *step.children())]
+        cluster.controller.kill()
+        cluster.controller.wait()
+    assert len(left) == 2
+    _, alive = psutil.wait_procs(left, timeout=PATIENCE_S)
+    assert not alive
 
 
 def test_an_option_that_slurm_does_not_have_is_refused(tmp_path: Path) -> None:

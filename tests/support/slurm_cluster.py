@@ -12,9 +12,10 @@ import socket
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import psutil
 from tests.support.patience import PATIENCE_S
 from tests.support.server_process import reserved_port
 from tests.support.tiers import SLURM_DAEMONS, SYSTEM_PATH
@@ -52,7 +53,7 @@ class SlurmCluster:
         self._until(lambda: "UP" in self.ask("scontrol", "ping"))
 
     def stop(self) -> None:
-        """End all jobs, and then stop the daemons, beginning with the one that was started last."""
+        """End all jobs, then the daemons, beginning with the one that was started last, and at last the job steps."""
         if sum(daemon.poll() is None for daemon in self._daemons) == len(SLURM_DAEMONS):
             self._end_jobs()
         for daemon in reversed(self._daemons):
@@ -63,6 +64,19 @@ class SlurmCluster:
                 except subprocess.TimeoutExpired:
                     daemon.kill()
                     daemon.wait()
+        for step in self.steps():
+            for process in (step, *step.children(recursive=True)):
+                with suppress(psutil.NoSuchProcess):
+                    process.kill()
+
+    def steps(self) -> list[psutil.Process]:
+        """Return the running processes `slurmstepd` of this cluster; each has a socket in the folder of its node.
+
+        They outlive the daemons, and wait until the controller has received how their jobs ended.
+        """
+        spool = f"{self.folder / 'spool'}/"
+        sockets = [one for one in psutil.net_connections("unix") if str(one.laddr).startswith(spool)]
+        return [psutil.Process(pid) for pid in {one.pid for one in sockets if one.pid is not None}]
 
     def _end_jobs(self) -> None:
         """Cancel all jobs, and wait until they have ended: a node waits long for jobs whose controller is gone."""
