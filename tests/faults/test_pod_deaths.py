@@ -33,7 +33,7 @@ parser.add_argument("--server")
 parser.add_argument("--token-file", type=argparse.FileType())
 parser.add_argument("--name")
 given, _ = parser.parse_known_args()
-headers = {"Authorization": f"Bearer {given.token_file.read()}"}
+headers = {"Authorization": f"Bearer {given.token_file.read().strip()}"}
 claim = {"worker": given.name, "kinds": ["misbehave"], "wait_s": 20}
 leases = httpx.post(f"{given.server}/api/v1/leases", json=claim, headers=headers, timeout=60).json()["leases"]
 (lease,) = leases

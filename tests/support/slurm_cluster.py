@@ -44,8 +44,12 @@ class SlurmCluster:
         self._spawn("munged", *self._munge_options(), "--foreground", "--force")
         self._until((self.folder / "munge.socket").exists)
         self.start_controller()
-        self._spawn("slurmd", "-D", "-f", str(self.configuration))
+        self.start_node()
         self._until(lambda: "idle" in self.ask("sinfo", "--noheader", "--format=%T"))
+
+    def start_node(self) -> None:
+        """Start the node daemon, which finds the job steps that it left behind."""
+        self.node = self._spawn("slurmd", "-D", "-f", str(self.configuration))
 
     def start_controller(self) -> None:
         """Start the controller, which continues with the state that it stored."""
