@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 import pytest
+from tests.support.patience import wait_until
 from tests.support.present import present
 from tests.support.queue_desk import Desk
 
@@ -59,6 +60,28 @@ def test_a_server_restarted_with_an_earlier_clock_does_not_go_back_in_time(
     restarted.clock = DatabaseClock()
     assert restarted.write(SYSTEM, _now_us) >= before_us - 2_000_000
     assert restarted.write(SYSTEM, reap_page).taken == 0
+
+
+def test_servers_of_one_database_follow_the_one_whose_clock_is_ahead(
+    desk: Desk, open_database: Callable[[], Database], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second server starts after the clock of the machine was set forward, or after the machine slept."""
+    desk.database.clock = DatabaseClock()
+    desk.submit()
+    lease = desk.claim()
+    jump_of_wall_clock(monkeypatch, HOUR_S)
+    later = open_database()
+    later.clock = DatabaseClock()
+
+    def apart_s() -> float:
+        return (later.write(SYSTEM, _now_us) - desk.database.write(SYSTEM, _now_us)) / 1e6
+
+    if later.is_sqlite:
+        assert apart_s() > HOUR_S / 2
+    wait_until(lambda: abs(apart_s()) < 5)
+    assert desk.heartbeat(lease).lease_ttl_s == pytest.approx(60, abs=5)
+    assert later.write(SYSTEM, reap_page).taken == 0
+    desk.complete(lease)
 
 
 def test_leases_and_rests_end_soon_although_the_databases_clock_was_set_back(desk: Desk) -> None:

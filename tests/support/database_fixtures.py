@@ -47,6 +47,9 @@ class AdjustableClock:
     def now_us(self, connection: Connection) -> int:
         return time.time_ns() // 1000 + self._ahead_us
 
+    def catch_up(self, stored_us: int) -> None:
+        """Do nothing: the processes of a test share this clock."""
+
     def advance(self, seconds: float) -> None:
         """Set the clock forward by this number of seconds."""
         self._ahead_us += round(seconds * 1_000_000)

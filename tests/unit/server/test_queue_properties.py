@@ -37,6 +37,9 @@ class StillClock:
     def now_us(self, _connection: Connection) -> int:
         return self.us
 
+    def catch_up(self, stored_us: int) -> None:
+        """Do nothing: there is one process."""
+
 
 def _forget_jobs(tx: Transaction) -> None:
     for table in (

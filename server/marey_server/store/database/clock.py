@@ -39,14 +39,19 @@ class Clock(Protocol):
         """Return the time in microseconds since the epoch; it never decreases."""
         ...
 
+    def catch_up(self, stored_us: int) -> None:
+        """Move forward if the high-water mark that another process has stored shows that its clock is ahead."""
+        ...
+
 
 class DatabaseClock:
     """Clock of the database: on Postgres the time of the Postgres server, on SQLite a clock that never goes back.
 
     On SQLite, the clock starts at the wall clock or at the stored high-water mark, whichever is later. The high-water
     mark is the latest time that earlier processes may have used. Then the clock follows the monotonic clock, so that a
-    jump of the wall clock neither extends nor ends a lease. If the wall clock is far ahead of the stored time, the
-    server does not start, because the stored time could not go back afterwards.
+    jump of the wall clock neither extends nor ends a lease. Processes that use one database may have started before and
+    after such a jump, so each of them catches up with the one whose clock is ahead. If the wall clock is far ahead of
+    the stored time, the server does not start, because the stored time could not go back afterwards.
     """
 
     def __init__(self) -> None:
@@ -78,7 +83,23 @@ class DatabaseClock:
                     )  # fmt: skip
                 self._start_us = max(wall_us, stored_us)
                 self._start_monotonic_ns = time.monotonic_ns()
-            return self._start_us + (time.monotonic_ns() - self._start_monotonic_ns) // 1000
+            return self._current_us(self._start_us)
+
+    def catch_up(self, stored_us: int) -> None:
+        """Move to the time of the process that stored this high-water mark, if that process is notably ahead.
+
+        Otherwise, each process would take jobs from live workers whose leases another process has extended.
+        """
+        with self._lock:
+            if self._start_us is None:
+                return
+            behind_us = stored_us - _SAVE_EVERY_US - self._current_us(self._start_us)
+            if behind_us > _SAVE_EVERY_US:
+                log.warning("another process at this database is ahead by %.0f s; following its clock", behind_us / 1e6)
+                self._start_us += behind_us
+
+    def _current_us(self, start_us: int) -> int:
+        return start_us + (time.monotonic_ns() - self._start_monotonic_ns) // 1000
 
 
 def wall_clock_us() -> int:

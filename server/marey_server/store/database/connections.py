@@ -222,6 +222,7 @@ class Database:
             high_water_us = self._high_water_us
             if self.is_sqlite and tx.now_us >= high_water_us:
                 high_water_us = save_high_water(tx.connection, tx.now_us)
+                self.clock.catch_up(high_water_us)
             try:
                 transaction.commit()
             except exc.DBAPIError as error:
