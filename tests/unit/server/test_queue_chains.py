@@ -4,7 +4,8 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from sqlalchemy import select, update
+from sqlalchemy import event, select, update
+from tests.support.present import present
 from tests.support.queue_desk import SUM, Desk, document
 from tests.support.store_fixtures import declared, requiring
 
@@ -55,6 +56,23 @@ def test_a_job_after_one_that_has_succeeded_need_not_wait(desk: Desk) -> None:
     first = desk.submit()
     desk.complete(desk.claim())
     assert desk.state(desk.submit(after=[first, first])) == "queued"
+
+
+def test_all_jobs_that_depend_on_one_end_in_few_statements(desk: Desk) -> None:
+    """Other writes wait meanwhile, and thousands of jobs may depend on one."""
+    first = desk.submit()
+    failing = [desk.submit(after=[first]) for _ in range(30)]
+    skipped = [desk.submit(after=[first], on_failure="skip") for _ in range(30)]
+    after_both = desk.submit(after=[failing[0], skipped[0]])
+    lease = desk.claim()
+    statements: list[str] = []
+    event.listen(desk.database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
+    desk.fail(lease, retryable=False, detail="no")
+    assert len(statements) < 40, "\n".join(statements)
+    assert {desk.state(one) for one in failing} == {"failed"}
+    assert {(desk.state(one), desk.job(one).failure) for one in skipped} == {("cancelled", None)}
+    assert present(desk.job(failing[-1]).failure).detail == f"This job needs {first} to succeed, but {first} is failed."
+    assert present(desk.job(after_both).failure).reason == "dependency_failed"
 
 
 def test_what_depends_on_a_failed_job_fails_down_the_chain(desk: Desk) -> None:

@@ -112,7 +112,7 @@ def _move_dependants(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
-    columns = (*READY_COLUMNS, job.c.dependencies_left, job.c.on_failure)
+    columns = (*READY_COLUMNS, job.c.parent_id, job.c.dependencies_left, job.c.on_failure)
     statement = select(*columns).where(job.c.id.in_(ids), job.c.state == WAITING).order_by(job.c.id).with_for_update()
     return tx.execute(statement).all()
 
@@ -125,8 +125,8 @@ def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[En
     or, if the other job did not succeed, wait for another identical job or are queued. If the result must not be
     shared, all jobs that waited for it are queued, because their own results can probably not be shared either.
     """
-    following: list[Ended] = []
     left: dict[str, int] = {}
+    unrunnable: list[tuple[Row[Any], Ended]] = []
     shared: list[Row[Any]] = []
     orphans: list[Row[Any]] = []
     alone: list[Row[Any]] = []
@@ -135,9 +135,10 @@ def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[En
         if row.cached_from is not None:
             (orphans if missed else shared if upstream[row.id][0].shareable else alone).append(row)
         elif missed:
-            following += _end_unrunnable(tx, row, missed[0])
+            unrunnable.append((row, missed[0]))
         else:
             left[row.id] = row.dependencies_left - len(upstream[row.id])
+    following = _end_unrunnable(tx, unrunnable)
     _store_counts(tx, left)
     following += make_ready(tx, [row for row in rows if left.get(row.id) == 0])
     following += result_cache.share(tx, shared)
@@ -152,16 +153,37 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
         tx.execute(statement, [{"of_job": job_id, "left": count} for job_id, count in left.items()])
 
 
-def _end_unrunnable(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
-    """End a waiting job because the job `cause`, on which it depends, did not succeed; return the ended jobs.
+_END_UNRUNNABLE = Prepared(
+    update(job)
+    .where(job.c.id == bindparam("of_job"), job.c.state == WAITING)
+    .values(
+        state=bindparam("its_state"),
+        failure=bindparam("its_failure"),
+        finished_us=bindparam("now"),
+        rev=job.c.rev + 1,
+    )
+)
 
-    The waiting job fails, or is cancelled if its `on_failure` is `skip`. Its tasks are cancelled.
+
+def _end_unrunnable(tx: Transaction, unrunnable: Sequence[tuple[Row[Any], Ended]]) -> list[Ended]:
+    """End locked waiting jobs, each because a job on which it depends did not succeed; return the ended jobs.
+
+    `unrunnable` holds each waiting job with this other job. The waiting job fails, or is cancelled if its `on_failure`
+    is `skip`. Its tasks are cancelled. All jobs end in one statement, because other writes wait while thousands end.
     """
-    waits = and_(job.c.id == row.id, job.c.state == WAITING)
-    tasks = end_jobs(tx, and_(job.c.parent_id == row.id, job.c.state == WAITING), "cancelled")
-    if row.on_failure == "skip":
-        return [*tasks, *end_jobs(tx, waits, "cancelled")]
-    return [*tasks, *end_jobs(tx, waits, "failed", failure=dependency_failure(cause.id, cause.state))]
+    parents = [row.id for row, _ in unrunnable if row.size is not None]
+    tasks = end_jobs(tx, and_(job.c.parent_id.in_(parents), job.c.state == WAITING), "cancelled") if parents else []
+    ended = [
+        Ended(row.id, row.project_id, "cancelled", row.parent_id)
+        if row.on_failure == "skip"
+        else Ended(row.id, row.project_id, "failed", row.parent_id, dependency_failure(cause.id, cause.state))
+        for row, cause in unrunnable
+    ]
+    tx.run_each(
+        _END_UNRUNNABLE,
+        [{"of_job": one.id, "its_state": one.state, "its_failure": one.failure, "now": tx.now_us} for one in ended],
+    )
+    return [*tasks, *ended]
 
 
 # -- fan-out ----------------------------------------------------------------------------------------------------------
