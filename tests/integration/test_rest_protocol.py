@@ -378,6 +378,25 @@ def test_every_error_is_a_problem_document_with_the_request_id(owner: httpx.Clie
     assert "Bearer" in answers[5].headers["WWW-Authenticate"]
 
 
+def test_a_mistyped_address_is_a_page_in_a_browser_and_a_problem_document_elsewhere(server: Server) -> None:
+    browser = "text/html,application/xhtml+xml,application/xml;q=0.9,image/avif,image/webp,*/*;q=0.8"
+    for path in ("/veiw?clip=lab/clip_a", "/nothing", "/api/v1/nothing", "/%00"):
+        url = f"{server.address}{path}"
+        shown = httpx.get(url, headers={"Accept": browser})
+        assert shown.status_code == 404
+        assert shown.headers["Content-Type"] == "text/html; charset=utf-8"
+        assert "default-src 'none'" in shown.headers["Content-Security-Policy"]
+        assert "<h1>No page at this address</h1>" in shown.text
+        for accept in ("*/*", "application/json", "application/json, text/html;q=0.5", "image/png", "text/html;q=0"):
+            refused = httpx.get(url, headers={"Accept": accept})
+            assert refused.status_code == 404
+            assert refused.headers["Content-Type"] == "application/problem+json"
+            assert refused.json()["code"] == "not-found"
+    assert httpx.post(f"{server.address}/nothing", headers={"Accept": browser}, content=b"x").status_code == 404
+    missing = httpx.get(f"{server.api}/projects/nothing", headers={"Accept": browser})
+    assert missing.headers["Content-Type"] == "application/problem+json", "a resource has one form of errors"
+
+
 def test_what_is_wrong_with_a_body_is_pointed_at(owner: httpx.Client) -> None:
     body = {"name": "UPPER", "visibility": "secret", "colour": "red", "title": 5}
     refused = owner.post("/projects", json=body)

@@ -12,7 +12,6 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 from urllib.parse import urlencode, urlsplit
 
-from markupsafe import Markup
 from pydantic import ConfigDict, Field
 
 from marey_schemas.access import NewToken
@@ -34,6 +33,7 @@ from marey_server.http.declarations import Access, Bytes, RequestBody, reads, wr
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
+from marey_server.http.short_pages import BROWSER, STYLED, page
 from marey_server.process.identity_provider import IdentityProvider
 from marey_server.process.password_lanes import limited_address
 from marey_server.store.credentials import browser_sign_ins, identities, sign_ins
@@ -42,24 +42,7 @@ from marey_server.store.credentials.sign_ins import SignInTry
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.transaction import Transaction
 
-BROWSER = "text/html; charset=utf-8"
-_PAGE = Markup(
-    """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Marey: {title}</title>
-<style>:root {{ color-scheme: light dark }}
-body {{ font: 1rem/1.5 system-ui, sans-serif; margin: 4rem auto; max-width: 40rem; padding: 0 1rem }}
-code {{ display: block; background: #eee; color: #000; padding: .5rem; overflow-wrap: anywhere }}</style></head>
-<body><main><h1>{title}</h1><p>{text}</p>{code}</main></body></html>
-"""
-)
 log = logging.getLogger(__name__)
-
-
-def page(title: str, text: str, code: str = "") -> bytes:
-    """Return an HTML page with a title and a text, and with `code`, which the person copies, if it is given."""
-    shown = Markup("<p><code>{}</code></p>").format(code) if code else ""
-    return _PAGE.format(title=title, text=text, code=shown).encode()
 
 
 class ProviderResource(PasswordResource):
@@ -104,8 +87,7 @@ class BrowserResource(ProviderResource):
     @property
     def page_headers(self) -> dict[str, str]:
         """The headers of a page: browsers run no scripts in the page, and do not store it."""
-        policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'"
-        return {**WITH_SECRET, "Content-Security-Policy": policy}
+        return {**WITH_SECRET, "Content-Security-Policy": STYLED}
 
     def send_browser_to(self, url: str) -> Reply:
         """Return an answer that sends the browser to another address."""

@@ -239,7 +239,11 @@ class Exchange(RequestHandler):
 
     def _write_problem(self, error: BaseException) -> None:
         self.problem_code = problem_code(error)
-        self.send(render_problem(error, self.request_id, names=self.sees_names))
+        self.send(self.problem_answer(error))
+
+    def problem_answer(self, error: BaseException) -> Rendered:
+        """Return the answer to a request that failed with `error`."""
+        return render_problem(error, self.request_id, names=self.sees_names)
 
     @property
     def sees_names(self) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
+from marey_schemas import problems
 from marey_schemas.encoding import codecs
 from marey_server.errors import NotAcceptableProblem, UnauthenticatedProblem, UnsupportedMediaTypeProblem
 from marey_server.motions.child import AnswerEncoding
@@ -37,6 +38,8 @@ MSGPACK_BLOCKS = MediaType(codecs.MSGPACK, "msgpack-blocks", "blocks")
 BSON_BLOCKS = MediaType(codecs.BSON, "bson-blocks", "blocks")
 
 EVENT_STREAM = MediaType("text/event-stream", "events")
+
+_PROBLEM, _PAGE = MediaType(problems.MEDIA_TYPE, "problem"), MediaType("text/html", "page")
 
 MODEL_FORMS = (JSON, MSGPACK, BSON)
 """Media types of answers without arrays."""
@@ -80,6 +83,11 @@ def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
             context={"offered": [str(offer) for offer in offers]},
         )
     return chosen
+
+
+def prefers_page(accept: str | None) -> bool:
+    """Return whether a client prefers an HTML page to a problem document, as browsers do."""
+    return accept is not None and _best(accept, (_PROBLEM, JSON, _PAGE)) is _PAGE
 
 
 @lru_cache(maxsize=512)

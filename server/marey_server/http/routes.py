@@ -13,12 +13,21 @@ from tornado.routing import Router
 from tornado.web import Application
 
 from marey_server.errors import NotFoundProblem
+from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Operation
+from marey_server.http.negotiation import prefers_page
+from marey_server.http.reply import Rendered
 from marey_server.http.resource import Resource
+from marey_server.http.short_pages import BROWSER, STYLED, page
 
 _VARIABLE = re.compile(r"\{(\w+)(?::int)?\}")
 _NUMBER = re.compile(rb"\d{1,9}")
 _CONTROL = re.compile(rb"[\x00-\x1f\x7f]")
+
+_NO_PAGE = page(
+    "No page at this address",
+    "A link from a message may have been copied only in part: open the whole link, or ask for a new one.",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +54,7 @@ class _Node:
 
 
 class UnknownPath(Resource):
-    """Answer to a request for an unknown path."""
+    """Answer to a request for an unknown path: a page for browsers, a problem document for other clients."""
 
     root = ""
     path = "(unknown)"
@@ -53,6 +62,13 @@ class UnknownPath(Resource):
 
     def _check_head(self) -> None:
         raise NotFoundProblem("No resource has this address.")
+
+    def problem_answer(self, error: BaseException) -> Rendered:
+        """Return a short page if the client prefers HTML, and otherwise the problem document."""
+        if isinstance(error, NotFoundProblem) and prefers_page(self.request.headers.get("Accept")):
+            headers = {"Content-Type": BROWSER, "Cache-Control": NOT_STORED, "Content-Security-Policy": STYLED}
+            return Rendered(error.status, headers, _NO_PAGE)
+        return super().problem_answer(error)
 
 
 def routes_of(resources: Iterable[type[Resource]]) -> Iterator[Route]:

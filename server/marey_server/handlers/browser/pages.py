@@ -22,11 +22,11 @@ from pydantic import ConfigDict, Field
 from marey_schemas.base import Request
 from marey_schemas.sign_ins import PLAYER_PATH
 from marey_server.errors import NotFoundProblem
-from marey_server.handlers.identities import BROWSER, page
 from marey_server.http.caching import IMMUTABLE, NOT_STORED
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
+from marey_server.http.short_pages import BROWSER, STYLED, page
 
 FOLDER = Path(__file__).parents[2] / "webui"
 """Folder that the build of `web/` writes."""
@@ -113,7 +113,7 @@ class WebPage(Resource):
         """Return the document, or a page that names the command that builds the pages."""
         found = (await self.compute(built_files)).get("index.html")
         if found is None:
-            headers = {"Cache-Control": NOT_STORED, "Content-Security-Policy": "style-src 'unsafe-inline'"}
+            headers = {"Cache-Control": NOT_STORED, "Content-Security-Policy": STYLED}
             return Reply(page("No pages", _MISSING), status=404, media_type=BROWSER, headers=headers)
         content = found.content.replace(_BASE, b'<base href="' + self.to_root + b'" />')
         rev = hashlib.sha256(content).hexdigest()[:16]
