@@ -42,11 +42,22 @@ MARKERS = "os^DvPX*"
 # Lightness runs one way in each, so that they read in grey, too.
 MORE_IS_WORSE = "magma_r"
 MORE_IS_DENSER = "viridis"
-CHANGE = "RdBu_r"
 
 TEXT, SMALL, HEADING = 9.0, 8.0, 10.5
 DPI = 144
 LONGEST_NAME = 30
+
+# Björn Ottosson (2020), "A perceptual color space for image processing"; the second matrix gives linear sRGB.
+_OKLAB_TO_LMS = np.array(
+    ((1.0, 0.3963377774, 0.2158037573), (1.0, -0.1055613458, -0.0638541728), (1.0, -0.0894841775, -1.2914855480))
+)
+_LMS_TO_RGB = np.array(
+    (
+        (4.0767416621, -3.3077115913, 0.2309699292),
+        (-1.2684380046, 2.6097574011, -0.3413193965),
+        (-0.0041960863, -0.7034186147, 1.7076147010),
+    )
+)
 
 _SVG_SETTINGS = {"svg.hashsalt": "marey", "svg.fonttype": "none", "svg.image_inline": True, "svg.id": None}
 _svg_writer = threading.Lock()
@@ -110,6 +121,7 @@ def add_colour_bar(
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height))
     upright = up > across
     bar = figure.colorbar(mappable, cax=axes, orientation="vertical" if upright else "horizontal")
+    axes.set_facecolor("none")
     bar.outline.set_visible(False)
     axes.tick_params(colors=QUIET, labelsize=SMALL, length=3, width=0.6)
     bar.set_label(label, fontsize=TEXT, color=INK)
@@ -223,6 +235,36 @@ def warm_colours() -> Colormap:
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(colormaps["YlOrBr"](np.linspace(0.12, 1.0, 256)))
+
+
+def colours_of_change(less: str, more: str) -> Colormap:
+    """Make a colour map for changes: `less` at its lower end, `more` at its upper end, transparent at no change.
+
+    The ground of the page shows through where nothing has changed, whether the page is light or dark.
+    """
+    from matplotlib.colors import ListedColormap, to_rgb
+
+    shares = np.linspace(-1.0, 1.0, 257)
+    ends = np.where((shares < 0.0)[:, None], to_rgb(less), to_rgb(more))
+    return ListedColormap(np.column_stack((ends, np.abs(shares))))
+
+
+def distinct_colours(count: int) -> list[str]:
+    """Choose colours that differ from each other: `COLOURS`, or equally spaced hues if there are not enough of these.
+
+    Neighbouring hues alternate between two lightnesses, both visible on light and on dark pages. Successive colours of
+    the list are about a golden angle apart.
+    """
+    from matplotlib.colors import to_hex
+
+    if count <= len(COLOURS):
+        return list(COLOURS[:count])
+    place = np.argsort(np.argsort(np.arange(count) * 0.5 * (3.0 - np.sqrt(5.0)) % 1.0))
+    hue = 2.0 * np.pi * place / count
+    oklab = np.stack((np.where(place % 2, 0.74, 0.54), 0.13 * np.cos(hue), 0.13 * np.sin(hue)), axis=1)
+    linear = np.clip((oklab @ _OKLAB_TO_LMS.T) ** 3 @ _LMS_TO_RGB.T, 0.0, 1.0)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return [to_hex(colour) for colour in srgb]
 
 
 def square_root_ticks(ceiling: float) -> NDArray[np.float64]:

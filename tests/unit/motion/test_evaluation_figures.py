@@ -11,6 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.collections import PathCollection
+from matplotlib.colors import to_rgb
 from matplotlib.text import Text
 from tests.support.drawn_evaluations import (
     DEFAULT_FIGURES,
@@ -38,7 +40,15 @@ from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.scenario import demand
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status
-from marey_reports.drawing.paper import labels_of, nice_levels, shortened, without_shared_folder
+from marey_reports.drawing.paper import (
+    COLOURS,
+    distinct_colours,
+    labels_of,
+    luminance,
+    nice_levels,
+    shortened,
+    without_shared_folder,
+)
 from marey_reports.evaluation.figures import (
     FIGURES,
     USE_FIGURES,
@@ -355,6 +365,32 @@ def test_lines_of_many_clips_are_joined_rather_than_left_out() -> None:
     assert len(shown) == 20
     assert len(figure.data["tables"]["transitions"]["count"]) <= 400
     assert sum(figure.data["tables"]["transitions"]["count"]) == sum(inside)
+    lines = next(one for one in figure.sketch.figure.axes[0].collections if isinstance(one, PathCollection))
+    colours = {tuple(colour) for colour in np.round(np.asarray(lines.get_edgecolor())[:, :3], 6)}
+    assert len(colours) == len(set(figure.data["tables"]["transitions"]["from_clip"])) > len(COLOURS)
+
+
+@pytest.mark.parametrize("count", [2, 6, 7, 24])
+def test_colours_of_clips_differ_and_are_visible_on_light_and_dark_pages(count: int) -> None:
+    colours = np.array([to_rgb(colour) for colour in distinct_colours(count)])
+    apart = np.linalg.norm(colours[:, None] - colours, axis=-1) + np.eye(count)
+    assert apart.min() > 0.1
+    light = luminance(colours)
+    assert ((1.05 / (light + 0.05) > 1.6) & ((light + 0.05) / 0.06 > 2.4)).all(), "contrast to #ffffff and #161a21"
+
+
+def test_where_nothing_changes_a_map_of_changes_shows_the_page() -> None:
+    both = drawn_both()
+    for name in ("density", "directions", "offsets"):
+        figure = both[name].sketch.figure
+        panels = [axes for axes in figure.axes if axes.get_title(loc="left") == "change"]
+        assert panels, name
+        assert np.asarray(panels[0].get_facecolor())[-1] == 0.0, "the panel itself has no ground"
+        maps = [one.get_cmap() for one in panels[0].collections if one.get_array() is not None]
+        assert maps
+        for colours in maps:
+            low, middle, high = np.asarray(colours((0.0, 0.5, 1.0)))
+            assert (low[3], middle[3], high[3]) == (1.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 24])

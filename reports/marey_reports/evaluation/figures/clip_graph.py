@@ -14,12 +14,12 @@ from marey_motion.arrays import Ints
 from marey_motion.evaluation.relevance import clips_of_rows
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
-    COLOURS,
     HEADING,
     QUIET,
     REFERENCE,
     Place,
     add_panel,
+    distinct_colours,
     labels_of,
     new_figure,
     write,
@@ -223,7 +223,7 @@ def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) 
 
 
 def _colours(circles: dict[str, Circle]) -> dict[str, str]:
-    return {uid: COLOURS[number % len(COLOURS)] for number, uid in enumerate(circles)}
+    return dict(zip(circles, distinct_colours(len(circles)), strict=True))
 
 
 def _frame_table(

@@ -16,6 +16,7 @@ from marey_reports.drawing.paper import (
     Place,
     add_colour_bar,
     add_panel,
+    colours_of_change,
     new_figure,
     nice_ceiling,
     reach,
@@ -225,7 +226,8 @@ def _draw_change(
     panel = add_panel(figure, place, title="change", x=plane.labels[0], grid=False)
     panel.tick_params(labelleft=False)
     norm = SymLogNorm(linthresh=0.1 * largest, linscale=1.0, vmin=-largest, vmax=largest)
-    drawn = panel.pcolormesh(*edges, change, cmap="PuOr", norm=norm, rasterized=True, shading="flat")
+    colours = colours_of_change("#d9820f", "#8f6fd0")  # orange and violet
+    drawn = panel.pcolormesh(*edges, change, cmap=colours, norm=norm, rasterized=True, shading="flat")
     bar = add_colour_bar(figure, drawn, Place(place.left, 0.52, place.width, 0.12), "seconds more (violet) or fewer")
     bar.set_xticks([-largest, -0.1 * largest, 0.1 * largest, largest])
     bar.set_xticklabels([f"{value:+g}" for value in (-largest, -0.1 * largest, 0.1 * largest, largest)])

@@ -11,14 +11,15 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
-    CHANGE,
     DARK,
+    INK,
     LIGHT,
     MORE_IS_WORSE,
     SMALL,
     Place,
     add_colour_bar,
     add_panel,
+    colours_of_change,
     luminance,
     new_figure,
     nice_levels,
@@ -30,6 +31,7 @@ from marey_schemas.options.evaluation import Family
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
 
@@ -40,6 +42,8 @@ FAMILY_TITLES: dict[Family, str] = {
     "eights": "Figures of eight",
 }
 """Titles of the families whose trials are a grid of speeds and turn rates."""
+ENDS = ("#2c7fc4", "#d1495b")
+"""Colours of the greatest decrease (blue) and of the greatest increase (red) of the mean offset."""
 
 
 class _Field(NamedTuple):
@@ -126,7 +130,7 @@ def _draw_two(
         place = Place(0.85 + 2 * (width + gap), bottom, width, height)
         labels = {"x": TURN_RATE if last else "", "y": ""}
         title = "change" if number == 0 else ""
-        changed = _draw_field(figure, place, change, title, labels, both_ways, CHANGE) or changed
+        changed = _draw_field(figure, place, change, title, labels, both_ways, colours_of_change(*ENDS)) or changed
     if shared is not None:
         add_colour_bar(figure, shared, Place(0.85, 0.52, 2 * width + gap, 0.12), "mean offset (m)", levels)
     if changed is not None:
@@ -184,7 +188,7 @@ def _draw_field(
     title: str,
     labels: dict[str, str],
     levels: Floats,
-    colours: str,
+    colours: str | Colormap,
 ) -> Any:
     """Draw filled contours and one dot per trial, or only dots if the trials span no area.
 
@@ -204,13 +208,20 @@ def _draw_field(
         zorder=4, clip_on=False,
     )  # fmt: skip
     colours_of_dots = dots.cmap(dots.norm(field.offset_m[known]))
-    dots.set_edgecolor([DARK if light else LIGHT for light in luminance(np.asarray(colours_of_dots)) > 0.3])
+    dots.set_edgecolor([_edge_on(colour) for colour in np.asarray(colours_of_dots)])
     _mark_extreme(panel, field, signed=bool(levels[0] < 0.0))
     panel.set_xticks(field.turn_rates_deg_s[:: max(1, len(field.turn_rates_deg_s) // 4)])
     if not labels["y"]:
         panel.tick_params(labelleft=False)
     panel.margins(0.02)
     return drawn or dots
+
+
+def _edge_on(colour: Floats) -> str:
+    """Choose the edge of a dot; a dot that is nearly transparent gets the colour of text on the page."""
+    if colour[3] < 0.5:
+        return INK
+    return DARK if luminance(colour) > 0.3 else LIGHT
 
 
 def _mark_extreme(panel: Axes, field: _Field, signed: bool) -> None:
