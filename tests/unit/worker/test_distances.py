@@ -15,6 +15,7 @@ from marey_motion.gait import generate_gait
 from marey_schemas.encoding.codecs import JSON, decode_tree
 from marey_schemas.encoding.digests import digest_of
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_schemas.queue import job_params
 from marey_schemas.queue.job_params import DistancesParams, count_distance_tasks
 from marey_schemas.queue.worker_protocol import PinnedInput
@@ -42,11 +43,13 @@ class StoredClips:
         )}  # fmt: skip
         self.files = files
         self.notes: list[str] = []
+        self.motions_read = 0
 
     def documents(
         self, pins: Sequence[PinnedInput], part: str, *, required: bool = True
     ) -> Iterator[tuple[PinnedInput, Any]]:
         for pin in pins:
+            self.motions_read += part == "motion"
             skeleton = {"item": "skeleton_x", "revision": 1}
             yield pin, clip_to_tree(walks()[pin.name], skeleton) if part == "motion" else None
 
@@ -90,6 +93,13 @@ def test_the_number_of_tasks_changes_nothing_in_the_result(tmp_path: Path) -> No
     for context in contexts:
         measured = {note for note in context.notes if note.startswith("measuring")}
         assert len(measured) <= 4, "a task measures the clips of two blocks"
+
+
+def test_only_the_first_task_in_a_process_reads_all_clips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("marey_worker.kinds.distances._RIGS", LruCache(max_entries=1))
+    result, _, contexts = compared(tmp_path, 6)  # three blocks of two clips; the last task runs first
+    assert [context.motions_read for context in reversed(contexts)] == [6, 4, 2, 4, 4, 2]
+    assert compared(tmp_path, 6)[0] == result, "a task that reads its own clips alone gives the same bytes"
 
 
 def test_the_number_of_tasks_depends_on_that_of_the_clips(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """Kind `distances`: measures how different clips look to people, by a perceptual metric.
 
 The clips are divided into blocks. Each task compares the clips of two blocks, so it holds few clips in memory, and
-measures each of them once for many pairs.
+measures each of them once for many pairs. Only the first task in a process reads all clips, to find the skeleton that
+they have in common.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from marey_reports.perception.page import draw_distance_figures, render_distance
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.metrics import MetricDocument, MetricIdentity
 from marey_schemas.documents.references import RevisionRef
+from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.lru import LruCache
 from marey_schemas.options.perception import DistanceOptions
 from marey_schemas.queue.job_params import MOST_COMPARED_CLIPS, DistancesParams
 from marey_schemas.queue.worker_protocol import PinnedInput
@@ -45,6 +48,9 @@ from marey_worker.job_io.stored_reports import inputs_of, stored_figure
 
 Prepared = dict[int, ComparableClip]
 """Clips that can be compared, by their position in the input `clips`."""
+
+_RIGS: LruCache[bytes, Rig] = LruCache(max_entries=16)
+"""Skeletons of the clips of jobs, by the inputs of the job, which all its tasks have."""
 
 
 def run(context: Context, params: DistancesParams) -> dict[str, Any]:
@@ -147,13 +153,21 @@ def _read(context: Context, wanted: Collection[int]) -> tuple[Rig, Moving]:
     Raises `JobRefused` if the clips have several skeletons.
     """
     pins = context.inputs["clips"]
-    (rig,) = context.inputs.get("rig", ()) or (None,)
+    (edited,) = context.inputs.get("rig", ()) or (None,)
+    clips = ClipSet(pins, edited)
+    key = canonical_json(clips.as_tree())
+    rig = _RIGS.get(key)
     used, motions = [], Moving()
-    for number, (_, motion) in enumerate(read_motions(context, pins)):
+    numbers = range(len(pins)) if rig is None else sorted(wanted)
+    read = read_motions(context, [pins[number] for number in numbers])
+    for number, (_, motion) in zip(numbers, read, strict=True):
         used.append(skeleton_of(motion))
         if number in wanted:
             motions[number] = pins[number], motion
-    return common_rig(context, ClipSet(pins, rig), used), motions
+    if rig is None:
+        rig = common_rig(context, clips, used)
+        _RIGS.put(key, rig)
+    return rig, motions
 
 
 def _prepare(
