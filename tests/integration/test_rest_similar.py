@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +13,19 @@ import pytest
 from tests.support.rest_server import stored_file
 from tests.support.studying import make_study
 
+from marey_motion.arrays import Ints
 from marey_motion.documents import clip_to_tree, skeleton_to_document
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.rigs import map_joints
 from marey_motion.similarity.features import clip_features
-from marey_motion.similarity.shards import write_shard
+from marey_motion.similarity.shards import Runs, Shard, write_shard
 from marey_schemas.documents.metrics import built_in_metric
 from marey_schemas.documents.motion_indexes import IndexShard, ShardClips
 from marey_schemas.search import SimilarRequest
-from marey_server.errors import NotFoundProblem
+from marey_schemas.sizes import MIB
+from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import pack_tree
 from marey_server.motions.similar import FoundWindows, ShardFiles, SimilarOrder, search_index
 
@@ -113,3 +117,73 @@ def test_changed_dropped_and_left_out_clips_are_not_searched_and_unknown_ones_ar
             assert {one.clip for one in found.windows} == expected
             assert (found.searched_clips, found.behind) == (len(expected), 2)
             assert found.windows[0].distance == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_second_search_uses_the_mapped_shards_until_their_files_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clip = generate_gait(1.3, 0.2, 3.0, 30.0)
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    rows = clip_features(Motion.of(clip), body, 30.0).rows
+    write_shard(tmp_path / "poses", [rows, rows])
+    for name, lengths in (("clips", [len(rows)] * 2), ("other", [2 * len(rows)]), ("wrong", [len(rows)])):
+        (tmp_path / name).write_text(json.dumps({
+            "items": [f"clip_{number}" for number in range(len(lengths))], "revisions": [1] * len(lengths),
+            "rows": lengths, "frames": lengths, "joints": [2**15 - 1] * len(lengths), "rates_hz": [30.0] * len(lengths),
+        }), encoding="utf-8")  # fmt: skip
+    opened: list[Path] = []
+
+    class Counted(Shard):
+        @classmethod
+        def open(cls, path: Path, runs: Runs, joints: Ints) -> Shard:
+            opened.append(path)
+            return Shard.open(path, runs, joints)
+
+    monkeypatch.setattr("marey_motion.similarity.shards.Shard", Counted)
+
+    def found(listed: str) -> FoundWindows:
+        shard = ShardFiles(clips=str(tmp_path / listed), poses=str(tmp_path / "poses"), dropped=())
+        order = SimilarOrder(
+            request=SimilarRequest(clip="clip_x", frames=(30, 45)), metric=built_in_metric("published/sigmoid"),
+            revision=1, motion=pack_tree(clip_to_tree(clip, {"item": "skeleton_a", "revision": 1})), first=30,
+            hierarchy=pack_tree(skeleton_to_document(clip.skeleton).model_dump(by_alias=True)), mapping=None,
+            shards=(shard,), heads={},
+        )  # fmt: skip
+        return FoundWindows.unpack(search_index(order.pack()))
+
+    assert {one.clip for one in found("clips").windows} == {"clip_0", "clip_1"}
+    assert found("clips") == found("clips")
+    assert len(opened) == 1
+    assert {one.clip for one in found("other").windows} == {"clip_0"}, "the same poses beside another list of clips"
+    with pytest.raises(InvalidProblem, match="no shard of a motion index"):
+        found("wrong")
+    (tmp_path / "poses").unlink()
+    with pytest.raises(NotFoundProblem, match="removed"):
+        found("clips")
+
+
+def test_mapped_files_do_not_count_as_memory_of_a_child(tmp_path: Path) -> None:
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(200 * MIB)
+    program = f"""
+import mmap
+from marey_schemas.processes.limits import allow_mapped_files, allow_memory
+def is_refused(make):
+    try:
+        make()
+    except (OSError, MemoryError):
+        return True
+    return False
+file = open({str(tmp_path / "large")!r}, "rb")
+kept = []
+allow_memory(100 * 2**20)
+assert is_refused(lambda: mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)), "the limit holds"
+allow_mapped_files(200 * 2**20)
+assert not is_refused(lambda: kept.append(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
+assert is_refused(lambda: bytearray(120 * 2**20)), "the mapped file gives no other memory"
+assert not is_refused(lambda: bytearray(50 * 2**20))
+kept.clear()
+allow_mapped_files(-200 * 2**20)
+assert is_refused(lambda: bytearray(120 * 2**20))
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

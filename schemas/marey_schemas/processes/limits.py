@@ -44,6 +44,18 @@ def allow_memory(limit_bytes: int | None) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
+def allow_mapped_files(more_bytes: int) -> None:
+    """Raise the limit of `allow_memory` by `more_bytes`, or lower it if they are negative; has no effect without limit.
+
+    Files that are mapped only to be read count for this limit, although the system can take back their memory at any
+    time.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    if soft != resource.RLIM_INFINITY:
+        wanted = soft + more_bytes
+        resource.setrlimit(resource.RLIMIT_AS, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
+
+
 def allow_processor_time(seconds: float) -> None:
     """Let this process use at most `seconds` of further processor time; beyond that, the kernel sends SIGXCPU.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +18,9 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.problems import FieldError
+from marey_schemas.processes.limits import allow_mapped_files
 from marey_schemas.search import LONGEST_EXAMPLE_S, SimilarAnswer, SimilarMoment, SimilarRequest
-from marey_schemas.sizes import MIB
+from marey_schemas.sizes import GIB, MIB
 from marey_schemas.wording import counted
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import Message, pack_tree, unpack_tree
@@ -32,6 +33,7 @@ if TYPE_CHECKING:  # numeric modules are loaded by children alone
     from marey_motion.similarity.example import Example
     from marey_motion.similarity.searching import Hit
     from marey_motion.similarity.shard_search import SearchedShard
+    from marey_motion.similarity.shards import Shard
 
 Tree = dict[str, Any]
 
@@ -41,6 +43,8 @@ THREADS = 2
 CONTEXT_READ_S = 1.5
 """Seconds that are read before and after the example; the nearest second influences the features of the example."""
 _LISTS_CACHE_BYTES = 64 * MIB
+MOST_MAPPED_BYTES = 4 * GIB
+"""Greatest size of the files that a child process keeps mapped: those of an index of 200,000 s of motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,6 +226,59 @@ _RANKS: LruCache[tuple[str, ...], list[Any]] = LruCache(max_entries=4)
 """Cache of a child process: the results of `_ranks`, by the paths of all lists."""
 
 
+class MappedShards:
+    """Shards that a child process keeps mapped into memory between searches, at most `most_bytes` of files.
+
+    Half of the processor time of a search would go into mapping them again, page by page. The mapped bytes are added to
+    the memory that the process may use. They are files that are only read, so the system takes their memory back when
+    it needs it.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self._shards: LruCache[tuple[str, str], tuple[Shard, int]] = LruCache(
+            max_bytes=most_bytes, size_of=lambda one: one[1]
+        )
+        """Shards and sizes of their files, by the paths of poses and list of clips.
+
+        Anybody may write an index, which can name the poses of another index beside another list.
+        """
+        self._allowed_bytes = 0
+
+    @contextmanager
+    def searching(self, shards: Iterable[ShardFiles]) -> Iterator[None]:
+        """Allow the process to map some shards while the `with` block runs; forget shards whose files were removed."""
+        kept = {paths for paths, _ in self._shards.items()}
+        for paths in kept:
+            if not Path(paths[0]).exists():
+                self._shards.pop(paths)
+        new = (files.poses for files in shards if (files.poses, files.clips) not in kept)
+        self._allow(self._kept_bytes() + sum(Path(poses).stat().st_size for poses in new))
+        try:
+            yield
+        finally:
+            self._allow(self._kept_bytes())
+
+    def open(self, files: ShardFiles, listed: ListedShard) -> Shard:
+        """Return a shard, mapped into memory. Raises `MotionError` if its poses do not fit the list of its clips."""
+        from marey_motion.similarity.shards import Shard
+
+        def opened() -> tuple[Shard, int]:
+            path = Path(files.poses)
+            return Shard.open(path, listed.runs, listed.joints), path.stat().st_size
+
+        return self._shards.get_or_make((files.poses, files.clips), opened)[0]
+
+    def _kept_bytes(self) -> int:
+        return sum(size for _, (_, size) in self._shards.items())
+
+    def _allow(self, mapped_bytes: int) -> None:
+        allow_mapped_files(mapped_bytes - self._allowed_bytes)
+        self._allowed_bytes = mapped_bytes
+
+
+_MAPPED = MappedShards(MOST_MAPPED_BYTES)
+
+
 def search_index(packed: bytes) -> bytes:
     """Search an index of motions, in a child process. `packed` is a `SimilarOrder` as bytes.
 
@@ -278,7 +335,9 @@ def opened(order: SimilarOrder) -> Iterator[OpenedSearch]:
         example, rate_hz = _example(order)
         ranks = _RANKS.get_or_make(tuple(files.clips for files in order.shards), lambda: _ranks(lists))
         parts = zip(order.shards, lists, ranks, strict=True)
-        yield OpenedSearch(lists, [_searched(order, *one, rate_hz, example) for one in parts], example, rate_hz, metric)
+        shards = [_searched(order, *one, rate_hz, example) for one in parts]
+        with _MAPPED.searching(order.shards):
+            yield OpenedSearch(lists, shards, example, rate_hz, metric)
     except MotionError as error:
         raise _invalid("/clip", f"The example cannot be searched for: {error}", error.code) from error
     except FileNotFoundError as error:  # a search of another index needed the space
@@ -360,7 +419,6 @@ def _searched(
     import numpy as np
 
     from marey_motion.similarity.shard_search import SearchedShard
-    from marey_motion.similarity.shards import Shard
 
     closed = np.zeros(len(listed.clips.items), np.bool_)
     closed[list(files.dropped)] = True
@@ -372,8 +430,7 @@ def _searched(
         for own in listed.places.get(order.request.clip, ()):
             closed[own] |= order.request.leave_out == "clip"
             windows[own] = example.rows_around(order.request.frames[0], rate_hz)
-    path = Path(files.poses)
-    return SearchedShard(lambda: Shard.open(path, listed.runs, listed.joints), ranks, closed, windows)
+    return SearchedShard(lambda: _MAPPED.open(files, listed), ranks, closed, windows)
 
 
 def _window(hit: Hit, clips: ShardClips, length_s: float) -> FoundWindow:
