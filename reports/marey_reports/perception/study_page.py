@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _BOUNDARY = "#009e73"
-_LEFT, _BOTTOM, _TOP, _PER_MOTION = 1.1, 1.35, 0.45, 0.26
+_LEFT, _BOTTOM, _TOP, _PER_MOTION = 1.4, 1.35, 0.45, 0.26
 _LEAST_SIDE = 3.2
 
 
@@ -122,7 +122,7 @@ def draw_table(analysis: StudyAnalysis, names: Sequence[str]) -> Sketch:
         for draw in (panel.axvline, panel.axhline):
             draw(boundary, color=_BOUNDARY, lw=1.6, ls="--")
     _name_along(panel, ordered)
-    panel.set_yticks(range(count), [plain(name) for name in labels_of(ordered)], fontsize=SMALL, parse_math=False)
+    panel.set_yticks(range(count), _labels(ordered), fontsize=SMALL, parse_math=False)
     add_colour_bar(figure, image, Place(_LEFT + side + 0.15, _BOTTOM, 0.12, side), "perceived difference")
     caption = (
         "Perceived difference of each pair: the share of the trials with both motions in which another pair was "
@@ -144,8 +144,12 @@ def _boundary(order: MotionOrder) -> float | None:
 
 
 def _name_along(panel: Axes, names: Sequence[str]) -> None:
-    labels = [plain(name) for name in labels_of(names, 16)]
-    panel.set_xticks(range(len(names)), labels, rotation=90, fontsize=SMALL, parse_math=False)
+    panel.set_xticks(range(len(names)), _labels(names), rotation=90, fontsize=SMALL, parse_math=False)
+
+
+def _labels(names: Sequence[str]) -> list[str]:
+    """Return names that are short enough for the space beside and below a panel."""
+    return [plain(name) for name in labels_of(names, 16)]
 
 
 # -- texts and tables -------------------------------------------------------------------------------------------------
