@@ -229,9 +229,9 @@ _RANKS: LruCache[tuple[str, ...], list[Any]] = LruCache(max_entries=4)
 class MappedShards:
     """Shards that a child process keeps mapped into memory between searches, at most `most_bytes` of files.
 
-    Half of the processor time of a search would go into mapping them again, page by page. The mapped bytes are added to
-    the memory that the process may use. They are files that are only read, so the system takes their memory back when
-    it needs it.
+    Up to a quarter of the processor time of a search would go into mapping them again, page by page. The mapped bytes
+    are added to the memory that the process may use: they are files that are only read, so the system can take their
+    memory back.
     """
 
     def __init__(self, most_bytes: int) -> None:
