@@ -21,18 +21,13 @@ from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.result import Metrics, TrialResult
 from marey_motion.evaluation.scenario import LEAST_TRAVEL_M_S, TIME_TOLERANCE_S, Reference, Trial
 from marey_motion.matching.record import Status, TrialRecord
-from marey_schemas.options.evaluation import EvaluationOptions, Grid
+from marey_schemas.options.evaluation import EvaluationOptions, Grid, settling_s
 
 REGIMES = ("approach", "base", "switched")
 RESPONSE_SHARE = 0.1
 """A desired speed counts as reached if the error stays below this share of that speed for `RESPONSE_HOLD_S` seconds."""
 RESPONSE_HOLD_S = 0.5
 """Seconds for which the error must stay below `RESPONSE_SHARE` for the speed to count as reached."""
-SETTLING_S = 1.0
-"""Seconds before and after a change of the desired speed or direction that do not count as settled.
-
-The character reacts before a change, too, because it looks one second ahead.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +44,7 @@ class TrialSeries:
     cross_track_m, along_track_m : components of this offset, positive to the left and ahead in the reference's
         direction of travel
     heading_errors_rad : recorded minus desired heading at the same tick
-    settled : whether the step is at least `SETTLING_S` seconds away from any change of the desired speed or direction;
-        if changes are frequent, at least a quarter of the time between two changes
+    settled : whether the step is at least `settling_s` away from any change of the desired speed or direction
     changes_speed : whether the desired speed alternates, so that there are responses to measure
     varies : whether the desired speed and turn rate vary all the time, so that the spread of their errors is measured
     regimes : index of the step's regime in `REGIMES`
@@ -175,14 +169,10 @@ def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
 
 
 def _settled(trial: Trial, times_s: Floats) -> Flags:
-    """Mark the times that are not near a change of the desired motion.
-
-    A time that is not near a change is at least `SETTLING_S` seconds away from it or, if changes are frequent, at least
-    a quarter of the time between two changes.
-    """
+    """Mark the times that are at least `settling_s` away from any change of the desired motion."""
     if (every_s := trial.changes_every_s) is None:
         return np.full(len(times_s), True)
-    margin_s = min(SETTLING_S, 0.25 * every_s)
+    margin_s = settling_s(every_s)
     since_s = np.mod(times_s + TIME_TOLERANCE_S - trial.approach_s, every_s)
     return (since_s >= margin_s) & (since_s < every_s - margin_s)
 

@@ -26,6 +26,11 @@ COVERAGE_LEAST_S = 1.0
 """Default number of seconds of data that a cell needs to count as covered."""
 TARGET_PATH_S = 4.0
 """Default duration in seconds of the path to record for a cell without enough data."""
+SETTLING_S = 1.0
+"""Seconds before and after a change of the desired speed or direction in which these are not judged.
+
+The character reacts before a change, too, because it looks one second ahead.
+"""
 
 
 class Grid(Options):
@@ -166,7 +171,24 @@ class EvaluationOptions(Grid):
                 raise ValueError(
                     f"{family} trials cannot be followed in the mode {self.controller.follow}; choose {possible}"
                 )
+        self._require_changes()
         return self
+
+    def _require_changes(self) -> None:
+        """Check that corners and figures of eight are long enough for a change and for judged time after it."""
+        periods_s: list[tuple[Family, float, str]] = []
+        if "corners" in self.families:
+            periods_s.append(("corners", self.switch_every_s, "the first corner comes"))
+        if "eights" in self.families and (rates := self.courses_deg("eights")):
+            slowest = min(map(abs, rates))
+            periods_s.append(("eights", 360.0 / slowest, f"a full circle at {slowest:g} degrees/s ends"))
+        for family, every_s, change in periods_s:
+            least_s = every_s + settling_s(every_s)
+            if self.duration_s <= least_s:
+                raise ValueError(
+                    f"{family} trials of {self.duration_s:g} s are too short: {change} after {every_s:.4g} s, and the "
+                    f"next {settling_s(every_s):.4g} s are not judged; choose a duration above {least_s:.4g} s"
+                )
 
     def courses_deg(self, family: Family) -> tuple[float, ...]:
         """Return the values that trials of a family combine with each speed: turn rates (deg/s) or angles (deg).
@@ -178,6 +200,14 @@ class EvaluationOptions(Grid):
         if family in ANGLED_FAMILIES:
             return self.corner_angles_deg if family == "corners" else self.strafe_angles_deg
         return tuple(rate for rate in self.turn_rates_deg_s if rate or family != "eights")
+
+
+def settling_s(every_s: float) -> float:
+    """Return the seconds before and after each change that are not judged, if changes are `every_s` seconds apart.
+
+    Half of the time between two changes is always judged.
+    """
+    return min(SETTLING_S, 0.25 * every_s)
 
 
 def _require_different(name: str, values: tuple[object, ...]) -> None:

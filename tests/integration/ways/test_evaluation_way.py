@@ -158,7 +158,7 @@ def test_courses_and_takes_are_simulated_drawn_and_compared(
     lab: ProjectHandle, run: CommandLine, tmp_path: Path
 ) -> None:
     options = ("--duration", 6, "--switch-every-s", 2, "--approach", 1, "--replicates", 3, "--no-baseline")
-    grid = ("--speeds", 1, "--turns", 50, "--corner-angles-deg", 90, "--strafe-angles-deg", 180)
+    grid = ("--speeds", 1, "--turns", 100, "--corner-angles-deg", 90, "--strafe-angles-deg", 180)
     courses = ("--families", "stopping,corners,eights,strafing", *grid, *options)
     told = run(
         "evaluate", "lab/walks", "--name", "all", *courses, "--trial-figure", "corners v=1 a=90", "--out", "all.html"
@@ -167,7 +167,7 @@ def test_courses_and_takes_are_simulated_drawn_and_compared(
     assert all(f"\n{region}: " in told for region in regions), told
     (found,) = lab.evaluations.list()
     assert [one["trial"] for one in found.trials()] == [
-        "stopping v=1 w=50", "corners v=1 a=90", "eights v=1 w=50", "strafing v=1 a=180",
+        "stopping v=1 w=100", "corners v=1 a=90", "eights v=1 w=100", "strafing v=1 a=180",
     ]  # fmt: skip
     drawn = {figure["name"] for figure in found.part("report")["figures"] if figure["trial"] == "corners v=1 a=90"}
     assert {"scenario-course", "clip-graph"} <= drawn

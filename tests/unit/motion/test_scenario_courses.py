@@ -110,6 +110,24 @@ def test_a_trial_that_ends_soon_after_a_switch_is_judged_without_the_new_speed()
     assert judge_trial(found, VerdictLimits()).followed
 
 
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"families": ("corners",), "duration_s": 1.0}, "first corner comes after 5 s.*above 6 s"),
+        ({"families": ("corners",), "duration_s": 2.5, "switch_every_s": 2.0}, "above 2.5 s"),
+        ({"families": ("eights",), "duration_s": 5.0}, "a full circle at 90 degrees/s ends after 4 s.*above 5 s"),
+    ],
+)
+def test_courses_that_end_before_the_time_after_their_first_change_is_judged_are_refused(
+    options: dict[str, Any], why: str
+) -> None:
+    with pytest.raises(ValidationError, match=why):
+        OPTIONS.replace(**options)
+    long_enough = OPTIONS.replace(**{**options, "duration_s": options["duration_s"] + 5.1})
+    for trial in suite_trials(long_enough):
+        assert measured(trial).metrics["settled_heading_rms_deg"] is not None
+
+
 def late(asked: Reference, ticks: int) -> TrialRecord:
     """Return the record of a character that does everything later, and stands at the origin until then."""
     moments = np.maximum(np.arange(asked.tick_count) - ticks, 0)
