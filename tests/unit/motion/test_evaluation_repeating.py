@@ -60,6 +60,22 @@ def test_repetitions_lie_in_the_interval_even_if_few_runs_change(affected: float
         assert plain < 0.85, "the replicates alone do not show how large a jump is that did not happen"
 
 
+@pytest.mark.parametrize("affected", [0.5, 4.0, 8.0, 20.0])
+def test_the_stated_percentage_holds_even_if_a_jump_is_far_larger_than_chance(affected: float) -> None:
+    """The measurements that found fewer than eight changed runs are counted apart from the others."""
+    rng = np.random.default_rng(int(10 * affected))
+    found = [measured(*jumps(rng, affected, 30.0)) for _ in range(MEASUREMENTS)]
+    inside: dict[int, list[bool]] = {}
+    for one, again in zip(found, found[1:] + found[:1], strict=True):
+        assert one.again_low is not None
+        assert one.again_high is not None
+        assert one.again_percent is not None
+        inside.setdefault(one.again_percent, []).append(one.again_low <= again.change <= one.again_high)
+    assert set(inside) == {0.5: {75}, 4.0: {75, 95}, 8.0: {75, 95}, 20.0: {95}}[affected]
+    for percent, cases in inside.items():
+        assert np.mean(cases) >= percent / 100 - 0.02
+
+
 def test_if_all_runs_change_the_interval_is_hardly_wider_than_that_of_normal_differences() -> None:
     rng = np.random.default_rng(3)
     before, after = rng.normal(size=(2, TRIALS, REPLICATES)) / TRIALS

@@ -185,8 +185,8 @@ SURE = effect(-0.0021, -0.0024, -0.0027, -0.0024)
     [
         (
             effect(0.0, 0.0, 0.0),
-            "the mean distance from the path stays the same (another such measurement: +0.00 to +0.00 cm, in 95 of "
-            "100 cases).",
+            "the mean distance from the path stays the same (another such measurement: +0.00 to +0.00 cm, in 75 of "
+            "100 cases or more, because few runs changed).",
         ),
         (
             SURE,

@@ -7,7 +7,7 @@ from marey_motion.evaluation.improvement.duplicates import NearDuplicate
 from marey_motion.evaluation.improvement.effects import Effect
 from marey_motion.evaluation.improvement.filling import Addition, FilledCell, Filling
 from marey_motion.evaluation.improvement.redundancy import Removal
-from marey_motion.evaluation.improvement.repeating import RepeatedChange
+from marey_motion.evaluation.improvement.repeating import PERCENT, RepeatedChange
 from marey_motion.evaluation.improvement.unused import UnusedClip, UnusedRange
 
 
@@ -111,7 +111,8 @@ def _interval(change: MetricChange) -> str:
     if not isinstance(change, RepeatedChange) or change.again_low is None or change.again_high is None:
         return ""
     low, high = 100 * change.again_low, 100 * change.again_high
-    return f" (another such measurement: {low:+.2f} to {high:+.2f} cm, in 95 of 100 cases)"
+    few = "" if change.again_percent == PERCENT else " or more, because few runs changed"
+    return f" (another such measurement: {low:+.2f} to {high:+.2f} cm, in {change.again_percent} of 100 cases{few})"
 
 
 def why_duplicate(source: str, pair: NearDuplicate, most_perceived: float | None = None) -> str:
