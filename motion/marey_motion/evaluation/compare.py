@@ -48,6 +48,9 @@ LESS_IS_BETTER = (
     "foot_skate",
     "foot_depth_p95",
     "treading_per_s",
+    "pose_error_mean",
+    "pose_error_p95",
+    "pose_error_nearest",
 )
 """Metrics for which a lower value is better.
 

@@ -2,6 +2,8 @@
 
 A person walked such a path, so if the set cannot follow it, the set lacks data. Clips without a path, such as those of
 standing people, have no trial; of a long clip, only the beginning is used.
+
+The poses of the clip are the ground truth with which the displayed poses are compared.
 """
 
 from __future__ import annotations
@@ -16,13 +18,21 @@ from marey_motion.evaluation.improvement.selection import rows_of_sources, sourc
 from marey_motion.evaluation.scenario import KEY_RATE_HZ, LOOK_AHEAD_S, Trial, require_names
 from marey_motion.matching.copies import equal_clips
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+from marey_motion.matching.display import displayed_points
+from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.matching import ControllerOptions
 
 LEAST_S = 3.0
 """Shortest part of a clip that can be a desired path, in seconds; a second more is needed for the look-ahead."""
 LEAST_PATH_M = 2.0
 """Shortest path of a clip, in metres, that can be a desired path."""
+PHASE_S = 0.5
+"""Seconds by which a displayed pose may be earlier or later than the pose of the take with which it is compared.
+
+This is about half a stride: the character can make the same steps as the take, but with the other foot first.
+"""
 MOST_NAME = 80
 """Longest name of a clip in the name of a trial; longer names are replaced by the uid."""
 
@@ -128,6 +138,60 @@ def index_for(database: MatchingDatabase, index: SearchIndex, trial: Trial) -> S
         return index
     allowed = index.selectable & ~_rows_of_take(database, trial.left_out)
     return build_index(index.rows, database.starts, allowed, method="boxes" if index.boxed else "scan")
+
+
+def pose_errors(
+    database: MatchingDatabase, options: ControllerOptions, trial: Trial, record: TrialRecord, window: Flags
+) -> dict[str, float | None]:
+    """Compare the displayed poses of a trial along a take with the poses of the take.
+
+    The error of a pose is the mean distance of its joints from those of the take, each in the frame of its own root.
+    The joints are those of the pose cost.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the set
+    options : ControllerOptions    options of the trial
+    trial : Trial    the trial
+    record : TrialRecord    T simulated ticks of the trial
+    window : (T - 1,) bool    the steps that count; step k leads from tick k to tick k + 1
+
+    Returns
+    -------
+    dict of str to float or None    metres: `pose_error_mean` and `pose_error_p95`, compared with the pose of the take
+        at the same time; and `pose_error_nearest`, the mean of the errors compared with the nearest pose of the take at
+        most `PHASE_S` earlier or later. Empty if the trial is not along a take; None if no step counts
+    """
+    if not trial.left_out:
+        return {}
+    start = round(trial.approach_s * record.rate_hz)
+    ticks = np.flatnonzero(np.append(False, window))
+    ticks = ticks[ticks >= start]
+    if not len(ticks):
+        return dict.fromkeys(("pose_error_mean", "pose_error_p95", "pose_error_nearest"))
+    shown = displayed_points(database, record.rows, database.body.pose_chain, options)[ticks]
+    take = _take_of(database, trial.left_out)
+    truth = database.pose_points[take.start : take.stop].astype(np.float64)
+
+    def errors(shift: int) -> Floats:
+        frames = np.clip(ticks - start + shift, 0, len(truth) - 1)
+        return np.asarray(np.linalg.norm(shown - truth[frames], axis=-1).mean(axis=-1))
+
+    own = nearest = errors(0)
+    most = round(PHASE_S * record.rate_hz)
+    for shift in range(-most, most + 1):
+        nearest = np.minimum(nearest, errors(shift))
+    return {
+        "pose_error_mean": float(own.mean()),
+        "pose_error_p95": float(np.percentile(own, 95.0)),
+        "pose_error_nearest": float(nearest.mean()),
+    }
+
+
+def _take_of(database: MatchingDatabase, source: str) -> DatabaseClip:
+    """Return the clip of a source; its mirrored copy only if the set contains nothing else of it."""
+    own = [clip for clip in database.clips if source_of(clip) == source]
+    return min(own, key=lambda clip: clip.mirrored_from is not None)
 
 
 def _rows_of_take(database: MatchingDatabase, source: str) -> Flags:

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.arrays import AnyFloats, Flags, Floats
+from marey_motion.evaluation.held_out import pose_errors
 from marey_motion.evaluation.relevance import treading_steps
+from marey_motion.evaluation.scenario import Trial
 from marey_motion.kinematics import CONTACT_WINDOW_S, forward_kinematics, without_flicker
 from marey_motion.looping import rotated
 from marey_motion.matching.database import MatchingDatabase
@@ -69,11 +71,12 @@ class LooksMeter:
         self._database, self._options = database, options
         self.clips = clip_looks(database)
 
-    def measure(self, record: TrialRecord, window: Flags) -> dict[str, float | None]:
-        """Measure how the simulated motion of a trial looks: feet, steps on the spot, and smoothness.
+    def measure(self, trial: Trial, record: TrialRecord, window: Flags) -> dict[str, float | None]:
+        """Measure how the simulated motion of a trial looks: feet, steps on the spot, smoothness, and errors of poses.
 
         Parameters
         ----------
+        trial : Trial    the trial; only poses of trials along takes can have errors
         record : TrialRecord    T simulated ticks
         window : (T - 1,) bool    the steps that count; step k leads from tick k to tick k + 1
 
@@ -89,6 +92,7 @@ class LooksMeter:
                 float(np.count_nonzero(treading_steps(self._database.clips, record) & window)) * record.rate_hz,
                 float(np.count_nonzero(window)),
             ),
+            **pose_errors(self._database, self._options, trial, record, window),
         }
 
     def _foot_metrics(self, record: TrialRecord, window: Flags, shown: Mapping[str, float]) -> dict[str, float | None]:

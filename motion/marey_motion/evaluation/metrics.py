@@ -150,7 +150,7 @@ def measure_trial(
     window = np.full(len(series.times_s), True) if options.window == "all" else series.pieces >= 0
     metrics = _metrics(series, record, window)
     if looks is not None:
-        metrics |= looks.measure(record, window)
+        metrics |= looks.measure(trial, record, window)
     if options.literal_formulas:
         metrics |= _literal_metrics(series, window, options)
     regimes = {}

@@ -91,6 +91,19 @@ METRICS = {
         3,
         "distance over hips, spine, head, hands and feet between successive frames of the clips shown",
     ),
+    "pose_error_mean": Metric(
+        "pose error",
+        "m",
+        3,
+        "along takes: mean distance of hips, spine, head, hands and feet from those of the left-out take at the same "
+        "time, each in the frame of its root",
+    ),
+    "pose_error_nearest": Metric(
+        "pose error, any phase",
+        "m",
+        3,
+        "along takes: the same distance from the nearest pose of the take at most half a second earlier or later",
+    ),
     "transitions_per_s": Metric(
         "transitions", "1/s", 2, "number of jumps per second that a search chose although the clip could have continued"
     ),

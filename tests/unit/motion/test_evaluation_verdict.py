@@ -13,6 +13,7 @@ from marey_motion.evaluation.judgement import LOOKS, judge, judge_trial
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import result_from_tree, result_to_tree
+from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.matching.record import Status, TrialRecord
 from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_schemas.options.matching import ControllerOptions
@@ -84,6 +85,8 @@ def test_poses_chosen_by_their_distance_alone_slide_and_jerk() -> None:
 
 # The measures, one by one
 
+CIRCLE = suite_trials(FEW)[0]
+
 
 def played(clips: list[Clip], start: int = 60, ticks: int = 240) -> tuple[LooksMeter, TrialRecord]:
     """Return a record that plays the first clip as it is, from one of its frames on."""
@@ -98,7 +101,7 @@ def played(clips: list[Clip], start: int = 60, ticks: int = 240) -> tuple[LooksM
 
 def test_a_clip_played_as_it_is_looks_like_itself() -> None:
     meter, record = played(walks()[1:2])
-    looks = meter.measure(record, np.full(239, True))
+    looks = meter.measure(CIRCLE, record, np.full(239, True))
     assert looks["foot_skate"] == pytest.approx(looks["foot_skate_clips"], abs=1e-3)
     assert looks["contacts_per_m"] == pytest.approx(looks["contacts_per_m_clips"], rel=0.15)
     assert looks["foot_depth_p95"] == pytest.approx(0.0, abs=0.002)
@@ -109,7 +112,7 @@ def test_a_clip_played_as_it_is_looks_like_itself() -> None:
 def test_feet_skate_as_fast_as_the_root_is_carried_away() -> None:
     meter, record = played(walks()[1:2])
     drift = np.arange(240)[:, None] / record.rate_hz * np.array([0.3, 0.4])
-    looks = meter.measure(replace(record, positions=record.positions + drift), np.full(239, True))
+    looks = meter.measure(CIRCLE, replace(record, positions=record.positions + drift), np.full(239, True))
     assert looks["foot_skate"] == pytest.approx(0.5, abs=0.01)
 
 
@@ -117,7 +120,7 @@ def test_a_pose_that_is_held_takes_no_steps_and_returning_to_it_is_treading() ->
     meter, record = played(walks()[1:2])
     rows = np.tile(np.arange(60, 66, dtype=np.int32), 40)
     status = np.tile(np.array([Status.REPLACING, 0, 0, 0, 0, Status.REPLACED], dtype=np.int8), 40)
-    looks = meter.measure(replace(record, rows=rows, status=status), np.full(239, True))
+    looks = meter.measure(CIRCLE, replace(record, rows=rows, status=status), np.full(239, True))
     assert looks["contacts_per_m"] == 0.0
     assert looks["treading_per_s"] == pytest.approx(39 * 60 / 239)
 

@@ -5,18 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.judged_sets import database_of, walks
 from tests.support.suggestion_cases import OPTIONS, named, places
 from tests.support.synthetic_databases import Track, arc_track, mirrored_track, random_tracks, synthetic_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.held_out import index_for, take_trials
+from marey_motion.evaluation.held_out import index_for, pose_errors, take_trials
 from marey_motion.evaluation.judgement import judge_trial
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import result_from_tree, result_to_tree
-from marey_motion.evaluation.scenario import demand, reference, suite_trials
+from marey_motion.evaluation.scenario import Trial, demand, reference, suite_trials
 from marey_motion.evaluation.suite import evaluate
 from marey_motion.matching.copies import index_of
 from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.record import TrialRecord
 
 TAKES = OPTIONS.replace(families=("takes",), duration_s=5.0, approach_s=1.0, replicates=2)
 LEFT = arc_track(2.0, 50.0, 9.0, uid="left")
@@ -72,6 +74,50 @@ def test_a_path_of_which_the_set_has_another_take_is_followed_best(result: Evalu
     others = [offset for source, offset in offsets.items() if not source.startswith("left")]
     assert max(offsets["left"], offsets["left again"]) < min(others)
     assert {judge_trial(one, TAKES.limits).region for one in result.trials} == {"real paths"}
+
+
+def played(trial: Trial, rows: np.ndarray) -> TrialRecord:
+    """Return the record of a character that displays these rows while it follows the path of a trial exactly."""
+    asked, count = reference(trial), len(rows)
+    nothing = np.full(count, np.nan)
+    return TrialRecord(
+        60.0, rows.astype(np.int32), asked.positions[:count], asked.headings[:count],
+        np.zeros(count, np.int8), nothing, nothing, nothing,
+    )  # fmt: skip
+
+
+def test_pose_errors_are_distances_from_the_poses_of_the_left_out_take() -> None:
+    gaits = database_of(walks(seconds=6.0)[:2])
+    options = TAKES.replace(approach_s=0.0, duration_s=3.0)
+    trial = take_trials(gaits, options)[0]
+    ticks = np.arange(reference(trial).tick_count)
+    window = ticks[1:] >= 30
+
+    def errors(rows: np.ndarray, counted: np.ndarray = window) -> dict[str, float | None]:
+        return pose_errors(gaits, options.controller, trial, played(trial, rows), counted)
+
+    names = ("pose_error_mean", "pose_error_p95", "pose_error_nearest")
+    assert errors(ticks) == pytest.approx(dict.fromkeys(names, 0.0), abs=1e-5)
+    later = errors(ticks + 20)
+    points = gaits.pose_points.astype(np.float64)
+    apart = np.linalg.norm(points[ticks[30:] + 20] - points[ticks[30:]], axis=-1).mean(axis=-1)
+    assert later["pose_error_mean"] == pytest.approx(apart.mean(), abs=1e-5)
+    assert later["pose_error_p95"] == pytest.approx(np.percentile(apart, 95), abs=1e-5)
+    assert apart.mean() > 0.05
+    assert later["pose_error_nearest"] == pytest.approx(0.0, abs=1e-5), "the take has the same pose a little later"
+    assert errors(ticks, np.full(len(window), False)) == dict.fromkeys(names)
+    assert pose_errors(gaits, options.controller, suite_trials(OPTIONS)[0], played(trial, ticks), window) == {}
+
+
+def test_evaluations_along_takes_have_pose_errors() -> None:
+    gaits = database_of([*walks(seconds=6.0)[1:3], *walks(seconds=7.0)[1:2]])
+    options = TAKES.replace(duration_s=3.0, families=("circle", "takes"))
+    found = evaluate(gaits, options, threads=1, with_baseline=False)
+    errors = {one.trial.left_out: one.metrics["pose_error_nearest"] for one in found.trials if one.trial.left_out}
+    assert max(errors["clip-000"] or 9.9, errors["clip-002"] or 9.9) < 0.02, "another take has the same poses"
+    assert (errors["clip-001"] or 0.0) > 0.02
+    assert found.suite["takes.pose_error_mean"] == found.suite["pose_error_mean"]
+    assert "circle.pose_error_mean" not in found.suite
 
 
 def test_equal_and_mirrored_clips_are_left_out_with_the_take() -> None:
