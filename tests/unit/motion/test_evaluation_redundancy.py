@@ -1,13 +1,17 @@
 """Predicted effect of leaving out clips: it equals an evaluation of the remaining clips."""
 
+from collections.abc import Sequence
+from typing import Literal
+
 import pytest
 from pydantic import ValidationError
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
 from tests.support.synthetic_databases import synthetic_database
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement import redundancy
 from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, objective_value
-from marey_motion.evaluation.improvement.redundancy import leave_one_out, plan_removals
+from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.selection import without_sources
 from marey_motion.evaluation.result import EvaluationResult
@@ -76,9 +80,15 @@ def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(
     assert [removal.harm_per_s for removal in removals] == sorted(removal.harm_per_s for removal in removals)
 
 
+def planned(simulation: Resimulation, count: int, removed: Sequence[str] = ()) -> tuple[PlannedRemoval, ...]:
+    """Plan removals by the default objective."""
+    ranked = leave_one_out(simulation, ObjectiveOptions(), removed=removed)
+    return plan_removals(simulation, ranked, count, ObjectiveOptions(), removed=removed)
+
+
 def test_a_plan_predicts_every_step_exactly(database: MatchingDatabase, simulation: Resimulation) -> None:
-    plan = plan_removals(simulation, 4, ObjectiveOptions(), removed=["fast_000", "fast_001"])
     gone = ["fast_000", "fast_001"]
+    plan = planned(simulation, 4, gone)
     for step in plan:
         gone.append(step.removal.source)
         again = evaluated(without_sources(database, gone))
@@ -88,11 +98,41 @@ def test_a_plan_predicts_every_step_exactly(database: MatchingDatabase, simulati
 
 
 def test_a_plan_takes_the_least_harmful_removal_at_each_step(simulation: Resimulation) -> None:
-    plan = plan_removals(simulation, 3, ObjectiveOptions())
+    plan = planned(simulation, 3)
     gone: list[str] = []
     for step in plan:
         assert step.removal == leave_one_out(simulation, ObjectiveOptions(), removed=gone)[0]
         gone.append(step.removal.source)
+
+
+def test_later_steps_of_a_plan_try_only_the_clips_that_came_first(
+    database: MatchingDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(redundancy, "TRIED_AGAIN", 2)
+    simulation = Resimulation(database, OPTIONS, headlines_only=True)
+    ranked = leave_one_out(simulation, ObjectiveOptions())
+    before = simulation.simulated
+    plan = plan_removals(simulation, ranked, 3, ObjectiveOptions())
+    few = simulation.simulated - before
+    assert len(plan) == 3
+    assert plan[0].removal == ranked[0]
+    assert plan[1].removal.source in {removal.source for removal in ranked[1:3]}
+    monkeypatch.setattr(redundancy, "TRIED_AGAIN", 99)
+    every = Resimulation(database, OPTIONS, headlines_only=True)
+    leave_one_out(every, ObjectiveOptions())
+    plan_removals(every, ranked, 3, ObjectiveOptions())
+    assert few < every.simulated - before
+
+
+@pytest.mark.parametrize("window", ["circle", "all"])
+def test_headline_metrics_alone_are_those_of_an_evaluation(
+    database: MatchingDatabase, window: Literal["circle", "all"]
+) -> None:
+    options = OPTIONS.replace(families=("circle", "switching"), switch_every_s=2.0, window=window)
+    whole, few = (Resimulation(database, options, replicates=(0, 3), headlines_only=only) for only in (False, True))
+    for outcome, quick in zip(whole.outcomes(), few.outcomes(), strict=True):
+        assert quick.result.metrics == {name: outcome.result.metrics[name] for name in HEADLINES}
+        assert (quick.result.trial, quick.needed) == (outcome.result.trial, outcome.needed)
 
 
 def test_only_as_many_clips_are_tried_as_asked_for_those_first_that_few_trials_need(simulation: Resimulation) -> None:
@@ -112,7 +152,7 @@ def test_a_clip_and_its_mirrored_twin_go_together() -> None:
 
 def test_the_last_clip_is_never_taken() -> None:
     simulation = Resimulation(synthetic_database(named(wandering_tracks(2)[:2])), OPTIONS)
-    assert len(plan_removals(simulation, 5, ObjectiveOptions())) <= 1
+    assert len(planned(simulation, 5)) <= 1
 
 
 def test_a_clip_that_is_not_there_cannot_be_left_out(simulation: Resimulation) -> None:

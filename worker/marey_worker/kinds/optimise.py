@@ -96,6 +96,7 @@ def _simulation(
         records=evaluated.result.records if alone else None,
         replicates=replicates,
         seed=seed,
+        headlines_only=True,
         threads=context.threads,
     )
 

@@ -102,6 +102,7 @@ def confirm(
             trials=[one.trial for one in result.trials],
             replicates=confirmation_replicates(how, result.options),
             seed=how.confirmation_seed,
+            headlines_only=True,
             threads=threads,
             progress=stages.within,
             cancelled=cancelled,

@@ -6,7 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from marey_motion.arrays import Floats
+from marey_motion.evaluation.metrics import trial_series
 from marey_motion.evaluation.result import TrialResult
+from marey_motion.evaluation.scenario import Reference, Trial
+from marey_motion.matching.record import Status, TrialRecord
+from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.improvement import ObjectiveOptions
 
 HEADLINES = ("offset_mean", "abs_se_v", "abs_se_omega_deg", "pose_cost_mean", "transitions_per_s")
@@ -65,3 +70,41 @@ def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
         values = [value for result in results if (value := result.metrics.get(name)) is not None]
         means[name] = float(np.mean(values)) if values else 0.0
     return means
+
+
+def measure_headlines(
+    trial: Trial, reference: Reference, record: TrialRecord, options: EvaluationOptions
+) -> TrialResult:
+    """Compute only the headline metrics of a trial, in a third of the time that all metrics take.
+
+    Parameters
+    ----------
+    trial : Trial    the trial
+    reference : Reference    trajectory of the trial
+    record : TrialRecord    simulated ticks of the trial
+    options : EvaluationOptions    options of the evaluation
+
+    Returns
+    -------
+    TrialResult    the values that `metrics.measure_trial` computes, to the last bit; without regimes
+    """
+    series = trial_series(trial, reference, record)
+    window = np.full(len(series.times_s), True) if options.window == "all" else series.pieces >= 0
+    replacing = np.count_nonzero(record.status[1:][window] == Status.REPLACING)
+    costs = record.pose_cost[:-1][window]
+    steps = np.count_nonzero(window)
+    means = {
+        "offset_mean": _mean(series.offsets_m[window]),
+        "abs_se_v": _mean((series.speeds_m_s - series.wanted_speeds_m_s)[window]),
+        "abs_se_omega_deg": _mean((series.turn_rates_rad_s - series.wanted_turn_rates_rad_s)[window]),
+        "pose_cost_mean": _mean(costs[np.isfinite(costs)]),
+        "transitions_per_s": float(replacing) * record.rate_hz / steps if steps else None,
+    }
+    if means["abs_se_v"] is not None and means["abs_se_omega_deg"] is not None:
+        means["abs_se_v"] = abs(means["abs_se_v"])
+        means["abs_se_omega_deg"] = 180.0 / np.pi * abs(means["abs_se_omega_deg"])
+    return TrialResult(trial, means, {})
+
+
+def _mean(values: Floats) -> float | None:
+    return float(np.mean(values)) if len(values) else None

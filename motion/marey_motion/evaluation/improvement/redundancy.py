@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from marey_motion.evaluation.improvement.effects import Effect, effect_of
 from marey_motion.evaluation.improvement.lost_poses import LostPoses
 from marey_motion.evaluation.improvement.objective import headline_means
-from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation
+from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation, Sources
 from marey_schemas.options.improvement import ObjectiveOptions
 
 ProgressCallback = Callable[[int, int, str], None]
+
+TRIED_AGAIN = 12
+"""Number of clips that each step of a plan tries, except the first step.
+
+The order of harm changes little from step to step, and trying all clips in each step took most of the time.
+"""
 
 
 @dataclass(frozen=True)
@@ -105,60 +111,84 @@ def leave_one_out(
     candidates = [source for source in rarest if simulation.leaves_rows(gone | {source})][:consider]
     found = []
     for done, source in enumerate(candidates):
-        estimate = effect_of(simulation, objective, gone, gone | {source})
-        seconds = simulation.seconds_of(source)
-        harm = estimate.objective.change
-        name = name_of(simulation, source)
-        lost = replaced = None
-        if appearance is not None:
-            lost = appearance.poses.seconds(gone | {source}) - appearance.poses.seconds(gone)
-            replaced = appearance.poses.replaced_share(source, gone)
-            harm += appearance.price_m_per_s * lost
-        found.append(Removal(source, name, seconds, counts[source], estimate, harm, harm / seconds, lost, replaced))
+        found.append(_without(simulation, objective, gone, source, counts[source], appearance))
         if progress is not None:
             progress(done + 1, len(candidates), source)
-    return tuple(sorted(found, key=lambda removal: (removal.harm_per_s, removal.source)))
+    return _ranked(found)
+
+
+def _without(
+    simulation: Resimulation,
+    objective: ObjectiveOptions,
+    gone: Sources,
+    source: str,
+    trials: int,
+    appearance: Appearance | None,
+) -> Removal:
+    """Measure the effect of leaving out one source clip, which `trials` trials need, if `gone` are removed already."""
+    estimate = effect_of(simulation, objective, gone, gone | {source})
+    seconds, harm = simulation.seconds_of(source), estimate.objective.change
+    lost = replaced = None
+    if appearance is not None:
+        lost = appearance.poses.seconds(gone | {source}) - appearance.poses.seconds(gone)
+        replaced = appearance.poses.replaced_share(source, gone)
+        harm += appearance.price_m_per_s * lost
+    name = name_of(simulation, source)
+    return Removal(source, name, seconds, trials, estimate, harm, harm / seconds, lost, replaced)
+
+
+def _ranked(removals: Iterable[Removal]) -> tuple[Removal, ...]:
+    return tuple(sorted(removals, key=lambda removal: (removal.harm_per_s, removal.source)))
 
 
 def plan_removals(
     simulation: Resimulation,
+    ranked: Sequence[Removal],
     count: int,
     objective: ObjectiveOptions,
     *,
     removed: Collection[str] = NONE,
-    consider: int | None = None,
     appearance: Appearance | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[PlannedRemoval, ...]:
     """Plan removals: each step removes the source clip whose removal harms least per second of data saved.
 
-    Every step is simulated, so the metrics of a step equal the metrics of an evaluation of the remaining clips. The
-    plan ends early if nothing more can be removed. Progress counts steps.
+    The first step removes the first of `ranked`. Each later step tries only the `TRIED_AGAIN` sources that came first
+    when each was last tried. Every step is simulated, so the metrics of a step equal the metrics of an evaluation of
+    the remaining clips. The plan ends early if nothing more can be removed. Progress counts steps.
 
     Parameters
     ----------
     simulation : Resimulation    the suite over the set
+    ranked : sequence of Removal    result of `leave_one_out` with the same objective, sources and appearance
     count : int    largest number of removals
     objective : ObjectiveOptions    weights of the objective, whose change is the harm
     removed : collection of str    sources that are removed already
-    consider, appearance : optional    as for `leave_one_out`
+    appearance : optional    as for `leave_one_out`
     progress : callable, optional    called as progress(steps done, total, uid)
 
     Returns
     -------
     tuple of PlannedRemoval    in order
     """
-    gone = frozenset(removed)
+    gone, left = frozenset(removed), list(ranked)
     steps: list[PlannedRemoval] = []
-    while len(steps) < count:
-        ranked = leave_one_out(simulation, objective, removed=gone, consider=consider, appearance=appearance)
-        if not ranked:
-            break
-        gone |= {ranked[0].source}
-        metrics = headline_means(simulation.results(gone))
-        steps.append(PlannedRemoval(ranked[0], metrics, simulation.seconds(gone)))
+    while left and len(steps) < count:
+        if steps:
+            counts = simulation.trials_needing(gone)
+            again = [one.source for one in left if counts[one.source] and simulation.leaves_rows(gone | {one.source})]
+            tried = [
+                _without(simulation, objective, gone, source, counts[source], appearance)
+                for source in again[:TRIED_AGAIN]
+            ]
+            left = [*_ranked(tried), *(one for one in left if one.source in again[TRIED_AGAIN:])]
+            if not left:
+                break
+        chosen = left.pop(0)
+        gone |= {chosen.source}
+        steps.append(PlannedRemoval(chosen, headline_means(simulation.results(gone)), simulation.seconds(gone)))
         if progress is not None:
-            progress(len(steps), count, ranked[0].source)
+            progress(len(steps), count, chosen.source)
     return tuple(steps)
 
 

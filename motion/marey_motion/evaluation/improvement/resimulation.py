@@ -21,18 +21,19 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.evaluation.held_out import index_for
+from marey_motion.evaluation.improvement.objective import measure_headlines
 from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
 from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.replicates import TrialReplicate, measure_run, run_of, simulate, trajectory_for
 from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.running import CancelCallback, ProgressCallback, run_each
-from marey_motion.evaluation.scenario import Trial, require_names, suite_trials
+from marey_motion.evaluation.scenario import Trial, reference, require_names, suite_trials
 from marey_motion.matching.copies import index_of, searchable
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.display import switched_rows
@@ -61,6 +62,7 @@ class Resimulation:
     records : records of these trials over the whole database, if they exist already: those of replicate 0
     replicates : numbers of the replicates in which each trial runs
     seed : seed of the replicates; that of the options if None
+    headlines_only : whether only the headline metrics of each run are computed, which is faster
     threads, cancelled : as in `suite.run_suite`
     progress : called as progress(runs done, runs to do, name of the trial)
 
@@ -77,6 +79,7 @@ class Resimulation:
         records: Sequence[TrialRecord] | None = None,
         replicates: Sequence[int] = (0,),
         seed: int | None = None,
+        headlines_only: bool = False,
         threads: int | None = None,
         cancelled: CancelCallback | None = None,
         progress: ProgressCallback | None = None,
@@ -90,7 +93,7 @@ class Resimulation:
         self._progress = progress or (lambda _done, _total, _note: None)
         self._source_of_clip = np.array([source_of(clip) for clip in database.clips], dtype=object)
         self.index = index_of(database)
-        self._looks = LooksMeter(database, options.controller)
+        self._looks = None if headlines_only else LooksMeter(database, options.controller)
         drawn = options if seed is None else options.replace(seed=seed)
         self._runs = [run_of(trial, number, drawn) for number in replicates for trial in self.trials]
         self._known: list[list[tuple[Sources, Outcome]]] = [[] for _ in self._runs]
@@ -253,10 +256,13 @@ class Resimulation:
     def _outcome(self, index: SearchIndex, run: TrialReplicate, record: TrialRecord) -> Outcome:
         rows = needed_rows(self.database, index, run.driven, record, self.options)
         clips = np.unique(self.database.clip_of_row[rows])
-        return Outcome(
-            measure_run(self.database, self.options, self._looks, run, record),
-            frozenset(self._source_of_clip[clips].tolist()),
-        )
+        return Outcome(self._measured(run, record), frozenset(self._source_of_clip[clips].tolist()))
+
+    def _measured(self, run: TrialReplicate, record: TrialRecord) -> TrialResult:
+        if self._looks is not None:
+            return measure_run(self.database, self.options, self._looks, run, record)
+        asked = reference(run.driven, self.database.options.rate_hz)
+        return replace(measure_headlines(run.driven, asked, record, self.options), trial=run.trial)
 
 
 def needed_rows(

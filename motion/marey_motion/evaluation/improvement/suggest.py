@@ -173,6 +173,7 @@ def _simulation(
         trials=[trial.trial for trial in result.trials],
         records=result.records,
         replicates=estimation_replicates(how),
+        headlines_only=True,
         threads=threads,
         cancelled=cancelled,
     )
@@ -248,10 +249,10 @@ def _redundancy(
     )
     plan = plan_removals(
         simulation,
+        found,
         how.removals,
         how.objective,
         removed=gone,
-        consider=how.consider,
         appearance=appearance,
         progress=stages.within("planning"),
     )
