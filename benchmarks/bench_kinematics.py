@@ -1,6 +1,8 @@
-"""Forward kinematics of 63 joints against pymotion, and retargeting from 31 to 63 joints."""
+"""Forward kinematics of 63 joints against pymotion, and retargeting from 31 to 63 joints, also with kept limbs."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import numpy as np
 from pymotion.ops import skeleton as pymotion_skeleton
@@ -8,13 +10,15 @@ from pymotion.ops import skeleton as pymotion_skeleton
 from benchmarks.material import captured_walk, noisy_clip, with_fingers
 from benchmarks.timing import Row, time_in_turn
 from marey_motion import kinematics
-from marey_motion.gait import game_skeleton
-from marey_motion.retargeting import RetargetPlan, plan_retarget, retarget
+from marey_motion.gait import game_skeleton, generate_gait
+from marey_motion.retargeting import RetargetPlan, plan_retarget, retarget, retarget_with_checks
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.retargeting import RetargetOptions
 
 FRAMES, JOINTS = 10_000, 63
 SOURCE_JOINTS = 31
+KEPT_FRAMES = 2_000
 GOAL = 25
 GOAL_NS = 3.0
 GOAL_POSES_PER_S = 50_000
@@ -23,7 +27,7 @@ PREDECESSOR_POSES_PER_S = 573
 
 def run() -> list[Row]:
     """Measure Marey and pymotion, each on one thread."""
-    return [_forward_kinematics(), _retargeting()]
+    return [_forward_kinematics(), _retargeting(), *_retargeting_with_kept_limbs()]
 
 
 def _forward_kinematics() -> Row:
@@ -67,6 +71,27 @@ def _retargeting() -> Row:
         f"≥ {GOAL_POSES_PER_S:,} poses/s",
         FRAMES / timing.median_s >= GOAL_POSES_PER_S,
     )
+
+
+def _retargeting_with_kept_limbs() -> list[Row]:
+    """Measure retargeting of a walk whose planted feet, hands, or both are kept by inverse kinematics."""
+    clip = generate_gait(1.3, 0.1, KEPT_FRAMES / 60.0, 60.0)
+    plan = _plan(clip.skeleton, game_skeleton())
+    rows = []
+    for name, options in (
+        ("kept feet", RetargetOptions(keep_feet=True)),
+        ("kept hands", RetargetOptions(keep_hands=True)),
+        ("kept feet and hands", RetargetOptions(keep_feet=True, keep_hands=True)),
+    ):
+        (timing,) = time_in_turn(partial(retarget_with_checks, clip, plan, options), repeats=3)
+        rows.append(
+            Row(
+                f"retargeting, {name}",
+                f"{KEPT_FRAMES} frames, {len(plan.pairs)} mapped joints",
+                f"{KEPT_FRAMES / timing.median_s:,.0f} poses/s",
+            )
+        )
+    return rows
 
 
 def _plan(source: Skeleton, target: Skeleton) -> RetargetPlan:
