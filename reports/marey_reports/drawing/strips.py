@@ -45,6 +45,12 @@ LABEL_LINE = 0.16
 LABEL_LETTERS, MOST_LABEL_LINES = 26, 4
 FILLED = 0.84  # of a cell's height, by the highest point
 
+DEEP_M = 0.5
+"""Depth below height 0, in metres, from which a motion is drawn with the floor at its lowest point.
+
+In some files, height 0 is at the hips; with the floor there, bodies would be drawn tiny.
+"""
+
 POSE_CELL_IN = (1.15, 1.7)
 """Width and height of a cell in the strip of a clip, inches."""
 CAMERA_TURN_RAD = np.radians(40.0)  # from where the body faces at first to where it is seen from, to its left
@@ -136,12 +142,14 @@ def draw_clip_strip(poses: Sequence[Clip], frames: Sequence[int], frame_rate_hz:
     """
     body = body_of(poses[0].skeleton)
     points = _points_of(poses)
+    floor = _floor_m(points)
+    points -= (0.0, floor, 0.0)
     middles = points[:, body.pelvis][:, (0, 2)]
     labels = [f"{frame / frame_rate_hz:.2f} s" for frame in frames]
     moments = StripMoments(middles, [f"frame {frame}" for frame in frames], labels)
     row = StripRow("", "", points[None], np.empty((0, 0, 3)))
     direction = _camera_direction(points, body.facing)
-    figure = draw_strips(body, [row], moments, direction, cell_in=POSE_CELL_IN, whole=True)
+    figure = draw_strips(body, [row], moments, direction, cell_in=POSE_CELL_IN, about=_floor_text(floor), whole=True)
     return to_svg(figure, title)
 
 
@@ -181,16 +189,28 @@ def draw_pose_rows(
     drawn = []
     for row in rows:
         points = _points_of(row.poses)
-        pelvis = points[:, body.pelvis] * (1.0, 0.0, 1.0)
-        behind = _points_of(row.ghost) - pelvis[:, None] if row.ghost else None
-        points = points - pelvis[:, None]
+        floor = _floor_m(points)
+        origin = points[:, body.pelvis] * (1.0, 0.0, 1.0) + (0.0, floor, 0.0)
+        behind = _points_of(row.ghost) - origin[:, None] if row.ghost else None
+        points = points - origin[:, None]
         if row.headings_rad is not None:
             points = _turned(points, body.facing, row.headings_rad)
-        drawn.append(StripRow(row.label, row.note, points[None], np.empty((0, 0, 3)), behind))
+        note = ", ".join(text for text in (row.note, _floor_text(floor)) if text)
+        drawn.append(StripRow(row.label, note, points[None], np.empty((0, 0, 3)), behind))
     moments = StripMoments(np.zeros((len(names), 2)), names, labels)
     direction = _camera_direction(drawn[0].bodies[0], body.facing)
     legend = [(ghost, REFERENCE)] if ghost else []
     return draw_strips(body, drawn, moments, direction, cell_in=POSE_CELL_IN, legend=legend, about=about, whole=True)
+
+
+def _floor_m(points: Floats) -> float:
+    """Return the height at which the floor is drawn: 0, or the lowest of points that are far below 0."""
+    lowest = float(points[..., 1].min())
+    return lowest if lowest < -DEEP_M else 0.0
+
+
+def _floor_text(floor_m: float) -> str:
+    return f"floor drawn at {floor_m:.2f} m" if floor_m else ""
 
 
 def _points_of(poses: Sequence[Clip]) -> Floats:

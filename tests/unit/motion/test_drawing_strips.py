@@ -163,3 +163,19 @@ def test_a_long_name_is_broken_into_lines_and_leaves_the_width_to_the_poses(name
     assert "revision 1" in texts
     if len(name) <= 60:
         assert name.replace(" ", "") in "".join(texts).replace(" ", "")
+
+
+def test_a_motion_whose_origin_is_at_the_hips_is_as_large_as_one_on_the_floor() -> None:
+    clip = generate_gait(1.2, 0.0, 1.0)
+    lowered = clip.poses.copy()
+    lowered[:, 1] -= 0.95
+    sunk = replace(clip, poses=lowered)
+    heights = []
+    for one in (clip, sunk):
+        poses = [one.sliced(frame, frame + 1) for frame in (0, 20, 40)]
+        figure = draw_pose_rows([PoseRow("walk", "", poses, ghost=poses)], ["0", "20", "40"], [""] * 3)
+        (legs, *_) = coloured(figure, COLOURS[0])
+        heights.append(float(np.ptp(points_of(legs)[:, 1])))
+        texts = {text.get_text() for text in figure.axes[0].texts}
+        assert any("floor drawn at -" in text for text in texts) == (one is sunk)
+    assert heights[1] == pytest.approx(heights[0], rel=0.1)
