@@ -252,7 +252,8 @@ class SuggestKeywords(TypedDict, total=False):
     replicates."""
     removals: int
     """Greatest number of removals to plan, in addition to the clips that no trial uses. Each step removes the clip
-    whose removal harms least per second of data. 0: none."""
+    whose removal harms least per second of data; steps after the first try only the clips again that came first. 0:
+    none."""
     simulated_additions: int
     """Number of suggested additions whose effect on the trials is simulated: the first ones that have the skeleton of
     the set. Each simulation takes as long as an evaluation with `confirmation_replicates`."""

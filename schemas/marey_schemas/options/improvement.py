@@ -87,7 +87,8 @@ class SuggestionOptions(ConfirmedEffects):
         ge=0,
         le=1000,
         description="Greatest number of removals to plan, in addition to the clips that no trial uses. Each step "
-        "removes the clip whose removal harms least per second of data. 0: none.",
+        "removes the clip whose removal harms least per second of data; steps after the first try only the clips again "
+        "that came first. 0: none.",
     )
     simulated_additions: int = Field(
         3,
