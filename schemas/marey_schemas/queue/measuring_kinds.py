@@ -35,7 +35,7 @@ EVALUATE = KindDeclaration(
     implementation="marey_worker.kinds.evaluate:run",
     gathering="marey_worker.kinds.evaluate:gather",
     task_count=job_params.count_evaluation_tasks,
-    version=6,
+    version=7,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
         "rig": RIG,
@@ -141,7 +141,7 @@ SUGGEST = KindDeclaration(
     "coverage.",
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
-    version=7,
+    version=8,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": METRIC},
     outputs={"document": "file"},
     facets=REMOVAL_FACETS,
@@ -164,7 +164,7 @@ SWEEP = KindDeclaration(
     implementation="marey_worker.kinds.sweep:run",
     gathering="marey_worker.kinds.sweep:gather",
     task_count=job_params.count_sweep_tasks,
-    version=5,
+    version=6,
     inputs={"evaluation": _EVALUATED},
     outputs={"document": "file"},
 )
