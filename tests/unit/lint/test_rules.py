@@ -18,6 +18,7 @@ from lint import (
     unused,
     wording,
 )
+from lint.__main__ import RULES, check
 from lint.commit_subject import faults_of
 from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, shrink_baseline
 from lint.sample import draw
@@ -350,6 +351,18 @@ def test_a_migration_that_only_adds_may_run_before_the_new_servers(step: str) ->
 def test_a_migration_of_an_unknown_phase_is_found() -> None:
     (message,) = migration_offences("pass", "befor")
     assert "the phase 'befor' is unknown" in message
+
+
+def test_the_command_checks_every_rule() -> None:
+    """Plant an offence for each rule."""
+    text = "import marey_motion.b\nMOST = 3\nWORDS = ('one', 'two', 'three')\nclass Take: ...\ndef turned(): ...\n"
+    planted = {f"marey_x.m{number}": "" for number in range(26)}
+    planted |= {"marey_motion.a": text.replace("n.b", "n.a2"), "marey_motion.a2": text.replace("n.b", "n.a")}
+    planted |= {"marey_motion.long": "x = 'what becomes of it'\n" * 401}
+    modules = house(planted).modules
+    migration = {ROOT / "migrations" / "versions" / "0099_next.py": "phase = 'befor'\n"}
+    found = {rule for rule, _ in check(House(modules, {}, migration), ROOT)}
+    assert found >= {*RULES, "wording"}
 
 
 def test_an_exception_with_a_reason_lets_one_offence_pass_and_is_reported_when_nothing_needs_it() -> None:
