@@ -18,6 +18,7 @@ from marey_reports.comparisons import page
 from marey_reports.comparisons.axes import axis_title
 from marey_reports.comparisons.page import draw_comparison
 from marey_reports.comparisons.subjects import ComparedSubject
+from marey_schemas.formats.pictures import Plot
 from marey_schemas.queue.comparisons import Curve, RunComparison
 
 EVIL = "<script>alert('$x_1$')</script>&\u202e\x1b[31m\n\x00 名前 \U0001f3c3"
@@ -153,7 +154,7 @@ def test_the_page_says_whether_the_best_setting_is_apart_from_the_others() -> No
         assert ("overlaps that of another setting" in text) == says
 
 
-WITHOUT_VALUES: list[tuple[str, page.Plot | None, str]] = [
+WITHOUT_VALUES: list[tuple[str, Plot | None, str]] = [
     ("no number", None, "no numbers for a chart"),
     ("integers", "lines", "no compared field was logged"),
     ("one run", "scatter", "no parameter"),
