@@ -53,8 +53,10 @@ def _make_clips(tx: Transaction, skeleton: RevisionRef, numbers: range) -> None:
     parts = clip_parts(noisy_clip(FRAMES, JOINTS), skeleton)
     poses = parts["motion"]["poses"]
     assert isinstance(poses, np.ndarray)
+    aside = np.zeros(poses.shape[1], np.float32)
+    aside[0] = 1  # x of the root
     for number in numbers:
-        shifted = parts["motion"] | {"poses": poses + np.float32(number)}
+        shifted = parts["motion"] | {"poses": poses + aside * np.float32(number)}
         name, place = f"take {number:05d}", f"day {number // 1000}"
         wanted = ItemCreate(name=name, collection=place, tags=("walk",), parts=parts | {"motion": shifted})
         items.create_item(tx, PROJECT, Kind.CLIP, wanted)
