@@ -25,6 +25,7 @@ from marey_client.tracing import TracedRequest, calling
 from marey_client.unanswered import explain_silence, media_type_of, not_of_marey, require_marey, server_of
 from marey_schemas.address import API
 from marey_schemas.encoding.codecs import JSON, CodecError, decode_tree, encode_tree
+from marey_schemas.encoding.compression import LEAST_BYTES_COMPRESSED, ZSTD, compress
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM
 from marey_schemas.problems import Problem
 from marey_schemas.wording import first_reason
@@ -36,6 +37,8 @@ Params = Mapping[str, str | int | float | bool | None]
 
 BLOCKS = "application/msgpack; arrays=blocks"
 MAX_ANSWER_BYTES = 1 << 28
+UNSUPPORTED = 415
+"""Status with which servers of earlier versions refuse compressed bodies."""
 LIMITS = httpx.Limits(max_connections=32, max_keepalive_connections=16)
 
 TRIES_TO_REACH = 3
@@ -82,7 +85,7 @@ class Transport:
         require_address(url)
         self.url = url.rstrip("/")
         self.retries = retries or Retries()
-        self._reached = threading.Event()
+        self._reached, self._refuses_zstd = threading.Event(), threading.Event()
         self._auth = BearerToken(token) if token else None
         self._connections = _Connections(self.url, timeout_s, http)
 
@@ -242,6 +245,26 @@ class Transport:
             self.retries.report_wait(self.url, tried, time.monotonic() - started, busy=busy)
             self.retries.sleep(delay_s)
         raise AssertionError("the loop over the tries ended without a result")
+
+    def send_compressed(
+        self,
+        method: str,
+        path: str,
+        *,
+        content: bytes | None,
+        media_type: str = JSON,
+        headers: Mapping[str, str] | None = None,
+    ) -> httpx.Response:
+        """Send a body compressed by zstd, for operations that accept it; servers of earlier versions get it plain."""
+        if content is not None and len(content) >= LEAST_BYTES_COMPRESSED and not self._refuses_zstd.is_set():
+            coded = {"Content-Encoding": ZSTD, **(headers or {})}
+            try:
+                return self.send(method, path, content=compress(content), media_type=media_type, headers=coded)
+            except RequestFailed as error:
+                if error.problem.status != UNSUPPORTED:
+                    raise
+                self._refuses_zstd.set()
+        return self.send(method, path, content=content, media_type=media_type, headers=headers)
 
     # -- documents with arrays -----------------------------------------------------------------------------------------
 

@@ -32,6 +32,7 @@ from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.canonical import array_digest
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
+from marey_server.http import negotiation
 from marey_server.store import projects
 from marey_server.store.datasets import partial_contents
 from marey_server.store.items.facets import publish_facets
@@ -134,6 +135,23 @@ def test_a_checkout_creates_labels_of_a_deleted_clip(lab: ProjectHandle) -> None
     assert made.part("annotation")["clip"] == {"item": clip.id, "revision": 1}
     gaits.commit("none", changes=[RemoveEntry(path="labels", kind=Kind.ANNOTATION)])
     assert gaits.check_out().removed == 1
+
+
+def test_a_server_of_an_earlier_version_gets_plain_bodies(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[bool] = []
+    is_compressed = negotiation.is_compressed
+
+    def noted(content_encoding: str | None, *, may_be: bool) -> bool:
+        if may_be:
+            sent.append(content_encoding is not None)
+        return is_compressed(content_encoding, may_be=False)
+
+    monkeypatch.setattr(negotiation, "is_compressed", noted)
+    assert_copied(partner, gaits, commit(gaits, rig=make_rig(lab, joints=200)))
+    assert sent.count(True) == 1
+    assert False in sent[sent.index(True) :]
 
 
 def measure(server: Server, item: ItemHandle, project: str = "lab", **values: float) -> None:

@@ -28,7 +28,7 @@ def request_contents(
     arrays stay compressed.
     """
     url = f"{project_url}/contents"
-    response = transport.send("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
+    response = transport.send_compressed("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
     answer: dict[str, Any] = decode_tree(response.content, MSGPACK, max_bytes=MAX_ANSWER_BYTES, keep_blocks=keep_blocks)
     return answer
 

@@ -12,7 +12,7 @@ from marey_client.archives.contents import ArrayBases, bases_of_arrays, request_
 from marey_client.blobs import Blobs
 from marey_client.errors import Conflict, DifferencesRefused, EarlierVersionsMissing, Invalid, LargeCommit
 from marey_client.progress import OnProgress
-from marey_client.transport import Transport, as_json, read_model
+from marey_client.transport import BLOCKS, Transport, as_json, read_model
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.contents import (
     MOST_CONTENTS,
@@ -26,6 +26,7 @@ from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import attach_arrays
+from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import KIB, MIB, batched
 from marey_versions.archive.members import ArchiveMember, MemberKind
@@ -280,7 +281,12 @@ class _Import:
                 | ({"facets": facets} if facets else {})  # which servers of earlier versions do not know
             )
         try:
-            self.dataset.transport.send_tree("POST", f"{self.dataset.url}/contents", {"revisions": sent})
+            self.dataset.transport.send_compressed(
+                "POST",
+                f"{self.dataset.url}/contents",
+                content=encode_tree({"revisions": sent}, MSGPACK, arrays="blocks"),
+                media_type=BLOCKS,
+            )
         except (Conflict, Invalid) as error:
             documents = [document for content in contents for document in self._revision(content).parts.values()]
             if not any(map(self._differences, documents)):
@@ -352,7 +358,7 @@ class _Import:
             begins=begins,
         )
         url = f"{self.dataset.url}/received-commits"
-        return read_model(Commit, self.dataset.transport.send("POST", url, content=as_json(request)))
+        return read_model(Commit, self.dataset.transport.send_compressed("POST", url, content=as_json(request)))
 
 
 def _received(key: str, change: EntryChange) -> ReceivedChange:

@@ -115,6 +115,8 @@ class Operation:
     """True if a change answers with names of the project's content, such as those of conflicts of a merge."""
     for_browsers: bool = False
     """True if people open the address in a browser, so that errors are pages, too."""
+    compressed: bool = False
+    """True if the body may be compressed with zstd, and the answer is compressed if the caller accepts it."""
 
     @property
     def required_role(self) -> RequiredRole:
@@ -173,6 +175,8 @@ def conditions_of(operation: Operation) -> str:
         sentences.append("Send If-Match with the ETag that you read, or `If-None-Match: *` to create the resource")
     if operation.idempotency == "key":
         sentences.append("With Idempotency-Key, a repeated request gets the same answer")
+    if operation.compressed:
+        sentences.append("Body and answer may be compressed (`Content-Encoding: zstd`, `Accept-Encoding: zstd`)")
     if operation.paged:
         sentences.append("The answer is one page; its `next_cursor` as `cursor` gives the next")
     return " ".join(f"{one}." for one in sentences)
@@ -196,6 +200,7 @@ def reads(
     reserved: bool = False,
     attempts: bool = False,
     for_browsers: bool = False,
+    compressed: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes nothing.
 
@@ -211,11 +216,12 @@ def reads(
     reserved : whether the method runs in threads that are kept free for such methods
     attempts : whether running attempts of jobs may use the method
     for_browsers : whether errors are answered with pages, because people open the address in a browser
+    compressed : whether the body and the answer may be compressed with zstd
     """
     return _declare(
         access=access, scope=scope, query=query, body=body, answer=answer, paged=paged, etag=etag, status=status,
         answer_types=answer_types, also=also, public=public, headers=headers, stream=stream, reserved=reserved,
-        attempts=attempts, for_browsers=for_browsers,
+        attempts=attempts, for_browsers=for_browsers, compressed=compressed,
     )  # fmt: skip
 
 
@@ -237,6 +243,7 @@ def writes(
     replays: bool = False,
     in_folders: bool = False,
     names: bool = False,
+    compressed: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes something.
 
@@ -245,7 +252,7 @@ def writes(
     access : minimum access, but not `Access.READER`, because readers may not change a project
     precondition : `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts both
     idempotency : `key` accepts Idempotency-Key; `nature` means that a repeated request has no further effect
-    answer, also, headers, reserved, attempts : as for `reads`
+    answer, also, headers, reserved, attempts, compressed : as for `reads`
     replays : whether an ended attempt may repeat the request
     in_folders : whether members who have the role only in some folders may use the method in these folders; the
         function that the method calls must check the role in the folder
@@ -257,7 +264,7 @@ def writes(
         access=access, scope=scope, query=query, body=body, answer=answer,
         status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,
         etag=etag, also=also, headers=headers, reserved=reserved, attempts=attempts,
-        replays=replays, in_folders=in_folders, names=names,
+        replays=replays, in_folders=in_folders, names=names, compressed=compressed,
     )  # fmt: skip
 
 
@@ -284,6 +291,7 @@ def _declare(
     in_folders: bool = False,
     names: bool = False,
     for_browsers: bool = False,
+    compressed: bool = False,
 ) -> Callable[[Method], Declared]:
     def attach(method: Method) -> Declared:
         @wraps(method)
@@ -295,7 +303,7 @@ def _declare(
         perform.operation = Operation(  # pyrefly: ignore[missing-attribute]  # read by `Resource`
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, taken, answer,
             status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream, reserved,
-            attempts, replays, in_folders, names, for_browsers,
+            attempts, replays, in_folders, names, for_browsers, compressed,
         )  # fmt: skip
         return perform
 

@@ -8,6 +8,7 @@ from typing import Literal
 
 from marey_schemas import problems
 from marey_schemas.encoding import codecs
+from marey_schemas.encoding.compression import ZSTD
 from marey_server.errors import NotAcceptableProblem, UnauthenticatedProblem, UnsupportedMediaTypeProblem
 from marey_server.motions.child import AnswerEncoding
 
@@ -144,15 +145,27 @@ def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TY
     return name
 
 
-def require_plain_encoding(content_encoding: str | None) -> None:
-    """Raise `UnsupportedMediaTypeProblem` if the body of a request is compressed.
+def is_compressed(content_encoding: str | None, *, may_be: bool) -> bool:
+    """Return whether the body of a request is compressed with zstd.
 
-    A small compressed body could expand to a very large one.
+    Raises `UnsupportedMediaTypeProblem` for any other compression. If `may_be` is false, raises it for zstd, too: a
+    small compressed body could expand to a very large one.
     """
-    if content_encoding and content_encoding.strip().lower() not in ("", "identity"):
-        raise UnsupportedMediaTypeProblem(
-            f"Compressed request bodies are not accepted; send the body without Content-Encoding: {content_encoding}."
-        )
+    coding = (content_encoding or "").strip().lower()
+    if coding in ("", "identity"):
+        return False
+    if may_be and coding == ZSTD:
+        return True
+    accepted = "Only bodies that are compressed with zstd are" if may_be else "Compressed request bodies are not"
+    raise UnsupportedMediaTypeProblem(
+        f"{accepted} accepted; send the body without Content-Encoding: {content_encoding}."
+    )
+
+
+def accepts_zstd(accept_encoding: str | None) -> bool:
+    """Return whether the header Accept-Encoding names zstd, and does not exclude it by the quality 0."""
+    ranges = (_split_parameters(text) for text in (accept_encoding or "").split(",")[:MAX_RANGES])
+    return any(name == ZSTD and params.get("q", "1").strip("0.") for name, params in ranges)
 
 
 def bearer_token(authorization: str | None) -> str | None:

@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from marey_schemas.address import API
 from marey_schemas.encoding.codecs import JSON as JSON_NAME
 from marey_schemas.encoding.codecs import encode_tree
+from marey_schemas.encoding.compression import LEAST_BYTES_COMPRESSED, ZSTD, compress
 from marey_schemas.lru import LruCache
 from marey_server.http.caching import REVALIDATED
 from marey_server.http.etags import entity_tag, matches, without_digest
@@ -84,6 +85,15 @@ class Rendered:
     status: int
     headers: Mapping[str, str]
     body: bytes
+
+    @property
+    def worth_compressing(self) -> bool:
+        """Whether the body is long enough for compression."""
+        return len(self.body) >= LEAST_BYTES_COMPRESSED
+
+    def compressed(self) -> Rendered:
+        """Return this answer with its body compressed by zstd."""
+        return Rendered(self.status, {**self.headers, "Content-Encoding": ZSTD}, compress(self.body))
 
     def without_content(self) -> Rendered:
         """Return this answer without its body, for a caller who may make the change, but may not read its result.

@@ -59,7 +59,7 @@ from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.receiving import PauseLimit
 from marey_server.http.reply import AnswerForm, LoadedDocument, Rendered, Reply, render
-from marey_server.http.validation import decode_body, parse_query, validate_body
+from marey_server.http.validation import decode_body, decompressed, parse_query, stated_size, validate_body
 from marey_server.store.transaction import Transaction
 
 P = ParamSpec("P")
@@ -85,6 +85,8 @@ class Resource(CallingExchange):
     media: negotiation.MediaType
     query: BaseModel | None = None
     precondition: Precondition = ANY_STATE
+    is_compressed = False
+    """True if the body of the request is compressed."""
 
     def __init_subclass__(cls) -> None:
         methods = {name: getattr(cls, name) for name in _METHODS if hasattr(vars(cls).get(name), "operation")}
@@ -320,7 +322,9 @@ class Resource(CallingExchange):
 
     def _check_body_head(self, operation: Operation) -> None:
         body = operation.body
-        negotiation.require_plain_encoding(self.request.headers.get("Content-Encoding"))
+        self.is_compressed = negotiation.is_compressed(
+            self.request.headers.get("Content-Encoding"), may_be=operation.compressed
+        )
         if body is None or not self.expects_body():
             return
         if self.declared_length() > self._most_bytes(body):
@@ -399,6 +403,9 @@ class Resource(CallingExchange):
             return
         if not self.caller.sees_answer(self.path_kwargs.get("project")):
             outcome = outcome.without_content()
+        accepted = self.request.headers.get("Accept-Encoding")
+        if self.operation.compressed and outcome.worth_compressing and negotiation.accepts_zstd(accepted):
+            outcome = await self.compute(outcome.compressed)
         if len(outcome.body) > JOINED_BYTES and self.request.method != "HEAD":
             self.holding.grow(len(outcome.body))
             await self.send_in_pieces(outcome)
@@ -422,6 +429,9 @@ class Resource(CallingExchange):
             if body.required:
                 raise BadRequestProblem("The request needs a body.", code="body-missing")
             return None
+        if self.is_compressed:
+            self.holding.grow(stated_size(data, self._most_bytes(body)))
+            data = await self.compute(decompressed, data)
         decode = partial(
             decode_body,
             data,

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from marey_schemas.encoding import codecs
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.encoding.compression import CompressionError, content_size, decompress
 from marey_schemas.problems import FieldError
 from marey_server.errors import BadRequestProblem, InvalidProblem, TooLargeProblem
 from marey_server.field_errors import MAX_ERRORS, field_errors, json_pointer
@@ -65,6 +66,32 @@ def _known_parameters(known: Mapping[str, Any]) -> str:
 def _bad_query(faults: list[FieldError]) -> BadRequestProblem:
     first = f"{faults[0].pointer}: {faults[0].detail}"
     return BadRequestProblem(f"The query is not valid: {first}", code="bad-query", errors=faults[:MAX_ERRORS])
+
+
+def stated_size(compressed: bytes, most_bytes: int) -> int:
+    """Return the number of bytes that a compressed body states for its content.
+
+    Raises `TooLargeProblem` for more than `most_bytes`, and `BadRequestProblem` if the body states no size.
+    """
+    try:
+        size = content_size(compressed)
+    except CompressionError as error:
+        raise _not_compressed(error) from None
+    if size > most_bytes:
+        raise TooLargeProblem(f"The compressed body contains {size} bytes; this address accepts at most {most_bytes}.")
+    return size
+
+
+def decompressed(compressed: bytes) -> bytes:
+    """Return the content of a compressed body. Raises `BadRequestProblem` if the body is damaged."""
+    try:
+        return decompress(compressed)
+    except CompressionError as error:
+        raise _not_compressed(error) from None
+
+
+def _not_compressed(error: CompressionError) -> BadRequestProblem:
+    return BadRequestProblem(f"The request body cannot be decompressed: {error}.", code="bad-compression")
 
 
 def decode_body(

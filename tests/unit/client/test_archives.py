@@ -235,7 +235,7 @@ def test_each_commit_is_sent_once_and_the_newest_with_the_branch_that_begins_wit
     receiver = SimpleNamespace(
         at=dataset.at,
         url="/gaits",
-        transport=SimpleNamespace(send=send),
+        transport=SimpleNamespace(send_compressed=send),
     )
     with (tmp_path / "gaits.tar").open("rb") as file:
         send_versions(cast(ReceivingDataset, receiver), Archive(file), ignore_progress, has, begins=branch)

@@ -50,9 +50,24 @@ def test_other_bodies_are_refused(content_type: str) -> None:
         negotiation.body_type(content_type)
 
 
-def test_compressed_bodies_are_refused() -> None:
-    with pytest.raises(UnsupportedMediaTypeProblem):
-        negotiation.require_plain_encoding("gzip")
+def test_only_bodies_of_operations_that_accept_zstd_may_be_compressed() -> None:
+    assert negotiation.is_compressed(" ZSTD ", may_be=True)
+    for plain in (None, "", "identity"):
+        assert not negotiation.is_compressed(plain, may_be=True)
+    for coding, may_be in (("gzip", True), ("zstd, gzip", True), ("zstd", False)):
+        with pytest.raises(UnsupportedMediaTypeProblem, match=f"without Content-Encoding: {coding}"):
+            negotiation.is_compressed(coding, may_be=may_be)
+
+
+@pytest.mark.parametrize(
+    ("header", "accepted"),
+    [
+        (None, False), ("*", False), ("gzip", False), ("Zstd", True), ("gzip, deflate, zstd", True),
+        ("zstd;q=0.5", True), ("zstd;q=0", False), ("zstd; q=0.000", False),
+    ],
+)  # fmt: skip
+def test_answers_are_compressed_for_callers_who_name_zstd(header: str | None, accepted: bool) -> None:
+    assert negotiation.accepts_zstd(header) is accepted
 
 
 def test_only_bearer_tokens_are_credentials() -> None:

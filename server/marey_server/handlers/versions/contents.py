@@ -27,7 +27,7 @@ class ProjectContents(Resource):
     path = "/projects/{project}/contents"
     tag = "ProjectDatasets"
 
-    @reads(access=Access.READER, body=ContentsRequest, answer=Document)
+    @reads(access=Access.READER, body=ContentsRequest, answer=Document, compressed=True)
     async def post(self, project: str, body: ContentsRequest) -> Rendered:
         """Return revisions and documents by their content digests.
 
@@ -73,6 +73,7 @@ class ReceivedContents(Resource):
         access=Access.MAINTAINER,
         body=RequestBody(ReceivedRevisions, max_bytes=MAX_DOCUMENT_BYTES),
         answer=StoredRevisions,
+        compressed=True,
     )
     async def post(self, project: str, dataset: str, body: ReceivedRevisions) -> Rendered:
         """Store revisions from an archive or another server, so that received commits can refer to them.
@@ -99,6 +100,7 @@ class ReceivedCommits(Resource):
         body=RequestBody(ReceivedCommit, max_bytes=MAX_RECEIVED_BYTES),
         answer=Commit,
         status=201,
+        compressed=True,
     )
     async def post(self, project: str, dataset: str, body: ReceivedCommit) -> Rendered:
         """Record a commit from an archive or another server with its author, time and digest.

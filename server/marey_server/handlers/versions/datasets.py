@@ -283,7 +283,7 @@ class DatasetEntries(Resource):
     path = "/projects/{project}/datasets/{dataset}/entries"
     tag = "ProjectDatasets"
 
-    @reads(access=Access.READER, query=EntriesQuery, answer=Entry, paged=True)
+    @reads(access=Access.READER, query=EntriesQuery, answer=Entry, paged=True, compressed=True)
     async def get(self, project: str, dataset: str, query: EntriesQuery) -> Rendered:
         """List the entries of a version in the order of their paths; all pages are from the same commit."""
         return await self.answer(
@@ -337,7 +337,7 @@ class VersionDifference(Resource):
     path = "/projects/{project}/datasets/{dataset}/difference"
     tag = "ProjectDatasets"
 
-    @reads(access=Access.READER, query=DifferenceQuery, answer=DatasetDifference)
+    @reads(access=Access.READER, query=DifferenceQuery, answer=DatasetDifference, compressed=True)
     async def get(self, project: str, dataset: str, query: DifferenceQuery) -> Rendered:
         """Return the entries that were added, removed, moved or changed between two versions."""
         return await self.answer(
