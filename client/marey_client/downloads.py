@@ -45,14 +45,17 @@ def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
         raise
 
 
-def safe_file_name(name: str) -> str:
-    """Return `name` without characters that file systems refuse or treat as a path; long names keep their ending."""
-    clean = _NOT_IN_A_NAME.sub("_", name).strip(". ") or "unnamed"
-    if len(clean.encode()) <= LONGEST_NAME_BYTES:
-        return clean
-    ending = Path(clean).suffix if len(Path(clean).suffix) <= LONGEST_ENDING else ""
-    room = LONGEST_NAME_BYTES - len(ending.encode())
-    return clean.removesuffix(ending).encode()[:room].decode(errors="ignore") + ending
+def safe_file_name(name: str, ending: str = "") -> str:
+    """Return `name` without characters that file systems refuse or treat as a path, with `ending` added.
+
+    A long name is cut, but keeps its own ending and gets all of `ending`.
+    """
+    clean, most = _NOT_IN_A_NAME.sub("_", name).strip(". ") or "unnamed", LONGEST_NAME_BYTES - len(ending.encode())
+    if len(clean.encode()) <= most:
+        return clean + ending
+    own = Path(clean).suffix if len(Path(clean).suffix) <= LONGEST_ENDING else ""
+    room = most - len(own.encode())
+    return clean.removesuffix(own).encode()[:room].decode(errors="ignore") + own + ending
 
 
 class TakenPaths:

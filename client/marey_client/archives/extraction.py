@@ -27,6 +27,8 @@ def extract_archive(archive: Archive, folder: Path) -> Iterator[Path]:
     """
     entries = list(archive.versions().entries(archive.manifest.commit))
     extraction = _Extraction(archive, folder, {one.content: one for one in entries}, TakenPaths())
+    for place in sorted({_folder_of(folder, one.path) for one in entries}):
+        extraction.taken.take(place)
     for entry in entries:
         yield from extraction.write(entry)
 
@@ -47,13 +49,12 @@ class _Extraction:
             "schema": ENTRY_SCHEMA, "path": entry.path, "kind": entry.kind, "tags": list(entry.tags),
             "parts": parts, "revisions": {one: self._revision(one) for one in sorted(set(contents_in(parts)))},
         }  # fmt: skip
-        *folders, name = (safe_file_name(one) for one in entry.path.split("/"))
-        folder = self.folder.joinpath(*folders)
-        yield self._save(folder / f"{name}.{entry.kind}.json", [encode_tree(tree, JSON)])
-        original = original_of_clip(name, parts.get("info"))
+        folder, name = _folder_of(self.folder, entry.path), entry.path.rpartition("/")[2]
+        yield self._save(folder / safe_file_name(name, f".{entry.kind}.json"), [encode_tree(tree, JSON)])
+        original = original_of_clip(safe_file_name(name), parts.get("info"))
         if original is not None:
             ending = Path(safe_file_name(original.name)).suffix
-            yield self._save(folder / f"{name}{ending}", self.archive.file(original.digest))
+            yield self._save(folder / safe_file_name(name, ending), self.archive.file(original.digest))
 
     def _revision(self, content: str) -> dict[str, Any]:
         if content in self.entries:
@@ -75,3 +76,8 @@ class _Extraction:
             for piece in pieces:
                 file.write(piece)
         return target
+
+
+def _folder_of(folder: Path, path: str) -> Path:
+    """Return the folder below `folder` that receives the files of the entry at `path`."""
+    return folder.joinpath(*(safe_file_name(one) for one in path.split("/")[:-1]))
