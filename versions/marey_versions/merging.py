@@ -329,7 +329,7 @@ def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: Datas
     differing = {name for name in names if len({parts.get(name) for parts in versions}) > 1}
     for pair in _made_together(ours.kind):
         if _excludes(*(tuple(parts.get(name) for name in pair) for parts in versions)):
-            clashing.update(pair)
+            clashing |= differing.intersection(pair)
     for made_from, made in _made_together(ours.kind):
         if made_from in clashing & differing and made in differing:
             clashing.add(made)
