@@ -15,6 +15,8 @@ from marey_schemas.names import Digest, Message, PartName
 
 MOST_CONFLICTS = 1000
 """Greatest number of conflicts that an answer lists."""
+MOST_RESOLUTIONS = 10_000
+"""Greatest number of resolutions in a request."""
 
 
 MOST_CONFLICTING_SEGMENTS = 100
@@ -57,7 +59,7 @@ class CombineRequest(Request):
 
     into: RefName = Field(MAIN, description="Branch that gets the changes.")
     message: Message = Field("", description="Message of the commit; empty: a sentence that names the versions.")
-    resolutions: tuple[Resolution, ...] = Field((), max_length=10_000)
+    resolutions: tuple[Resolution, ...] = Field((), max_length=MOST_RESOLUTIONS)
     preview: bool = Field(False, description="Compute the result without recording it.")
     expected: Digest | None = Field(
         None, description="Digest that the newest commit of the branch must have; null: any."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -49,6 +49,13 @@ Base = Annotated[
         "repeated.",
     ),
 ]
+Others = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SIDE",
+        help="Resolve all conflicts that no other option resolves with the content of this side: ours, theirs or base.",
+    ),
+]
 Parent = Annotated[
     int | None,
     typer.Option(
@@ -75,20 +82,22 @@ def merge(
     ours: Ours = None,
     theirs: Theirs = None,
     base: Base = None,
+    others: Others = None,
     as_json: AsJson = False,
 ) -> None:
     """Merge a version into a branch. Changes of different parts of one entry are combined. In an annotation, labels of
     different frames are combined, too.
 
     If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
-    --ours, --theirs or --base. The exit status is 1 while a conflict is left.
+    --ours, --theirs, --base or --others. The exit status is 1 while a conflict is left.
     """
     at = parse(place, version=True)
-    resolutions = resolutions_of(ours, theirs, base)
-    _combine(
-        context, at, into, as_json,
-        lambda on: on.merge(at.version, into=into, message=message, resolutions=resolutions, preview=preview),
-    )  # fmt: skip
+    choices = Decisions(resolutions_of(ours, theirs, base), others)
+
+    def change(on: DatasetHandle, resolutions: Sequence[Resolution], preview: bool) -> MergeAnswer:
+        return on.merge(at.version, into=into, message=message, resolutions=resolutions, preview=preview)
+
+    _combine(context, at, into, as_json, choices, preview, change)
 
 
 def cherry_pick(
@@ -101,16 +110,21 @@ def cherry_pick(
     ours: Ours = None,
     theirs: Theirs = None,
     base: Base = None,
+    others: Others = None,
     as_json: AsJson = False,
 ) -> None:
     """Repeat the changes of one commit on a branch.
 
     If the branch has changed the same part of an entry, nothing is recorded until each such conflict is decided by
-    --ours, --theirs or --base. The exit status is 1 while a conflict is left.
+    --ours, --theirs, --base or --others. The exit status is 1 while a conflict is left.
     """
     at = parse(place, version=True)
-    options = _pick_options(into, parent, message, preview, resolutions_of(ours, theirs, base))
-    _combine(context, at, into, as_json, lambda on: on.cherry_pick(at.version, **options))
+    choices = Decisions(resolutions_of(ours, theirs, base), others)
+
+    def change(on: DatasetHandle, resolutions: Sequence[Resolution], preview: bool) -> MergeAnswer:
+        return on.cherry_pick(at.version, **_pick_options(into, parent, message, preview, resolutions))
+
+    _combine(context, at, into, as_json, choices, preview, change)
 
 
 def revert(
@@ -123,6 +137,7 @@ def revert(
     ours: Ours = None,
     theirs: Theirs = None,
     base: Base = None,
+    others: Others = None,
     as_json: AsJson = False,
 ) -> None:
     """Undo the changes of one commit on a branch. Later changes stay.
@@ -132,8 +147,12 @@ def revert(
     exit status is 1 while a conflict is left.
     """
     at = parse(place, version=True)
-    options = _pick_options(into, parent, message, preview, resolutions_of(ours, theirs, base))
-    _combine(context, at, into, as_json, lambda on: on.revert(at.version, **options))
+    choices = Decisions(resolutions_of(ours, theirs, base), others)
+
+    def change(on: DatasetHandle, resolutions: Sequence[Resolution], preview: bool) -> MergeAnswer:
+        return on.revert(at.version, **_pick_options(into, parent, message, preview, resolutions))
+
+    _combine(context, at, into, as_json, choices, preview, change)
 
 
 def _pick_options(
@@ -147,12 +166,53 @@ def _pick_options(
     return options
 
 
+class Decisions(NamedTuple):
+    """Decisions about conflicts: those of the options --ours, --theirs and --base, and the side for all others."""
+
+    given: Sequence[Resolution]
+    others: str | None
+
+    def complete(self, preview: Callable[[Sequence[Resolution]], MergeAnswer]) -> list[Resolution]:
+        """Return the decisions, with one for each conflict that `preview` of these decisions finds.
+
+        Previews are repeated, because an answer lists a limited number of conflicts, and a decision can move an entry
+        to a path that is taken. A conflict that stays after it was decided is left.
+        """
+        from marey_schemas.datasets.merges import MOST_RESOLUTIONS, Resolution, Side
+
+        found = list(self.given)
+        if self.others is not None and self.others not in list(Side):
+            raise WrongUsage(f"--others {self.others!r} names no side; write {', '.join(Side)}")
+        while self.others is not None:
+            added = []
+            for one in preview(found).conflicts:
+                partly = any((one.path, one.kind) == (known.path, known.kind) for known in self.given)
+                part = one.parts[0] if partly else None
+                resolution = Resolution(path=one.path, kind=one.kind, take=Side(self.others), part=part)
+                stays = resolution in found and one.reason and one.segments is None
+                added += [] if stays else [resolution]
+            if not added or len(found) + len(added) > MOST_RESOLUTIONS:
+                break
+            found += added
+        return found
+
+
 def _combine(
-    context: typer.Context, at: NamedVersion, into: str, as_json: bool, change: Callable[[DatasetHandle], MergeAnswer]
+    context: typer.Context,
+    at: NamedVersion,
+    into: str,
+    as_json: bool,
+    choices: Decisions,
+    preview: bool,
+    change: Callable[[DatasetHandle, Sequence[Resolution], bool], MergeAnswer],
 ) -> None:
-    """Send a request that changes a branch, and print the result; exit with status 1 if there are conflicts."""
+    """Call `change` with a dataset, the decisions and `preview`, and print the result.
+
+    The exit status is 1 if there are conflicts.
+    """
     with connect(context) as marey, conflicts_printed(into=into, as_json=as_json):
-        found = change(at.on(marey))
+        on = at.on(marey)
+        found = change(on, choices.complete(lambda resolutions: change(on, resolutions, True)), preview)
     _print(found, into, as_json=as_json)
     if found.conflict_count:
         raise typer.Exit(1)
@@ -225,9 +285,11 @@ def _print_result(found: MergeAnswer, into: str) -> None:
         print_table(("conflict", "kind", "changed on both sides"), rows)
         for one in found.conflicts:
             _print_reason(one)
+        if found.conflict_count > len(rows):
+            print_message(f"the first {len(rows):,} conflicts are listed")
         print_message(
             f"{counted(found.conflict_count, 'conflict')}; nothing was recorded. Decide each conflict by --ours, "
-            "--theirs or --base"
+            "--theirs or --base, or all that are left by --others"
         )
     elif found.commit is None:
         print_message(f"{counted(found.changes, 'entry')} of {into} would change, without conflicts")
