@@ -18,6 +18,10 @@ MOST_REVISIONS = 1000
 """Greatest number of revisions that a graph contains in each direction (inputs and results)."""
 MOST_LINKS = 10_000
 """Greatest number of links that a graph contains in each direction (inputs and results)."""
+MERGED = "merged"
+"""Role of the inputs of a revision that a merge of two versions made: the revisions from which it has its parts."""
+RESTORED = "restored"
+"""Role of the input of a revision that a revert or a checkout made: a revision with the same content."""
 CUT_OFF = (
     f"The graph is cut off: it has more than {MOST_REVISIONS:,} revisions or {MOST_LINKS:,} links in one direction. "
     "The nearest ones are shown."
@@ -79,7 +83,10 @@ class LineageLink(Answer):
 
     source: int = Field(description="Index, in `revisions`, of the revision that was used.")
     result: int = Field(description="Index, in `revisions`, of the revision that was created.")
-    role: str = Field(description="Name of the job input for which the source was used.")
+    role: str = Field(
+        description="Name of the job input for which the source was used. `merged` or `restored` if no job made the "
+        "result, but a merge of versions, or a checkout or revert."
+    )
 
 
 class LineageJob(Answer):

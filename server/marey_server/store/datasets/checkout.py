@@ -14,6 +14,7 @@ from marey_schemas.datasets.checkouts import CheckoutAnswer, CheckoutRequest
 from marey_schemas.datasets.commits import MOST_CHANGES
 from marey_schemas.items import ItemChange
 from marey_schemas.kinds import Kind
+from marey_schemas.lineage import RESTORED
 from marey_schemas.names import MOST_TAGS
 from marey_schemas.wording import counted
 from marey_server.access.folder_rights import FolderRoleProblem
@@ -28,13 +29,13 @@ from marey_server.store.datasets.selecting import SelectedEntries
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.facets import add_facets, facets_of_contents
-from marey_server.store.items.revisions import read_part_digests
+from marey_server.store.items.revisions import StoredContent, read_part_digests
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges, require_no_purge_since
 from marey_server.store.tables import collection, dataset, item
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.compared import ComparedEntry, compare_entries
-from marey_versions.records import DatasetEntry
+from marey_versions.records import DatasetEntry, RevisionKey
 from marey_versions.tree.difference import Changed
 from marey_versions.tree.reading import Tree
 
@@ -172,10 +173,9 @@ class _Checkout:
             self._add(one, documents)
         self._keep_facets()
 
-    def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
-        """Find, for the content of each entry, an item with a revision that has this content.
+    def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, StoredContent]:
+        """Return, for the content digest of each entry, a revision that has this content.
 
-        Returns, by content digest, the id of the item, and the digests of the revision's documents by name of the part.
         Raises `InvalidProblem` if the project does not have the content of an entry.
         """
         wanted = {entry.content: entry for entry in entries}
@@ -189,7 +189,7 @@ class _Checkout:
                 "Check out another version.",
             )
         parts = read_part_digests(self.tx, set(held.values()))
-        return {content: (key[0], parts[key]) for content, key in held.items()}
+        return {content: StoredContent(RevisionKey(*key), parts[key]) for content, key in held.items()}
 
     def _item(self, one: ComparedEntry) -> str:
         assert one.before is not None
@@ -205,11 +205,12 @@ class _Checkout:
         kind = Kind(one.present.kind)
         items.change_item(self.tx, self.project.name, kind, self._item(one), change, expected_rev=None)
 
-    def _change(self, one: ComparedEntry, documents: Mapping[str, tuple[str, Mapping[str, str]]]) -> None:
+    def _change(self, one: ComparedEntry, documents: Mapping[str, StoredContent]) -> None:
         assert one.after is not None
         kind, item_id = Kind(one.after.kind), self._item(one)
         if one.parts:
-            items.set_parts(self.tx, self.project, kind, item_id, documents[one.after.content][1], self._message)
+            source = documents[one.after.content]
+            items.restore_content(self.tx, self.project, kind, item_id, source, self._message)
             self.given[item_id] = one.after.content
         if one.before is not None and set(one.before.tags) != set(one.after.tags):
             tags = ItemChange(tags=one.after.tags)
@@ -219,22 +220,23 @@ class _Checkout:
     def _message(self) -> str:
         return f"Checkout of the dataset {self.dataset.name}"
 
-    def _add(self, one: ComparedEntry, documents: Mapping[str, tuple[str, Mapping[str, str]]]) -> None:
+    def _add(self, one: ComparedEntry, documents: Mapping[str, StoredContent]) -> None:
         assert one.after is not None
         kind = Kind(one.after.kind)
-        item_id, parts = documents[one.after.content]
+        source = documents[one.after.content]
+        item_id = source.key.item
         name, folder = one.after.path.rpartition("/")[2], _folder_of(self.dataset, one.after)
         if self._can_restore(kind, item_id):
             items.restore_item(self.tx, self.project.name, kind, item_id)
             place = ItemChange(name=name, collection=folder, tags=one.after.tags)
             items.change_item(self.tx, self.project.name, kind, item_id, place, expected_rev=None)
-            items.set_parts(self.tx, self.project, kind, item_id, parts, self._message)
+            items.restore_content(self.tx, self.project, kind, item_id, source, self._message)
             self.given[item_id] = one.after.content
             return
         draft = Draft(
             name_in_batch="", kind=kind, item_name=name, collection=folder, tags=one.after.tags,
-            parts={part: StoredDocument(digest) for part, digest in parts.items()}, reuse="new",
-            message=self._message,
+            parts={part: StoredDocument(digest) for part, digest in source.parts.items()}, reuse="new",
+            message=self._message, sources={RESTORED: [source.key]},
         )  # fmt: skip
         (made,) = items.publish(
             self.tx, self.project, [draft], author_id=self.tx.principal.user_id,

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from marey_schemas.kinds import Kind
+from marey_schemas.lineage import MERGED
 from marey_schemas.wording import counted
 from marey_server.access.folder_rights import FolderRights
 from marey_server.errors import ConflictProblem, InvalidProblem
@@ -100,9 +101,10 @@ def store_combined(
     project lacks a revision from which an entry takes a part.
     """
     sides = {side.content for one in combined for part in one.entry.parts if (side := one.source_of(part)) is not None}
-    held = {content: RevisionKey(*key) for content, key in revisions_with(tx, project_row.id, sides).items()}
+    of_sides = {side.content for one in combined for side in one.sides}
+    held = {content: RevisionKey(*key) for content, key in revisions_with(tx, project_row.id, of_sides).items()}
     require_contents(sides - held.keys())
-    stored = read_part_digests(tx, set(held.values()))
+    stored = read_part_digests(tx, {held[content] for content in sides})
     drafts: dict[str, Draft] = {}
     for one in combined:
         entry, parts = one.entry, dict[str, PartContent]()
@@ -112,5 +114,17 @@ def store_combined(
         drafts[entry.content] = Draft(
             name_in_batch=entry.content, kind=Kind(entry.kind), parts=parts, reuse="new", message=message,
             item_name=item_name(entry.path, entry.content), collection=folder or "", hidden=True,
+            sources={MERGED: _sources(one, held)},
         )  # fmt: skip
     publish_contents(tx, project_row, drafts, author_id=author_id, job_id=job_id)
+
+
+def _sources(one: CombinedEntry, held: Mapping[str, RevisionKey]) -> list[RevisionKey]:
+    """Return the revisions of which an entry has parts; for parts that were merged, those of both sides."""
+    found: dict[RevisionKey, None] = {}
+    for part in one.entry.parts:
+        side = one.source_of(part)
+        for source in one.sides[:2] if side is None else (side,):
+            if source.content in held:
+                found[held[source.content]] = None
+    return list(found)

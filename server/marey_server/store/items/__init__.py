@@ -12,9 +12,9 @@ from marey_server.store.items.changing import (
     prepare_part,
     prepare_parts,
     put_part,
+    restore_content,
     restore_item,
     revert_item,
-    set_parts,
 )
 from marey_server.store.items.consents import find_ended_consents, permit_export, require_consent
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
@@ -79,7 +79,7 @@ __all__ = [
     "read_revision",
     "read_staleness",
     "require_consent",
+    "restore_content",
     "restore_item",
     "revert_item",
-    "set_parts",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from sqlalchemy import delete, insert
@@ -10,6 +9,7 @@ from sqlalchemy import delete, insert
 from marey_schemas.access import Role
 from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert
 from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.lineage import RESTORED
 from marey_schemas.problems import FieldError
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.prepared_documents import PreparedDocument, prepared
@@ -24,6 +24,7 @@ from marey_server.store.items.reading import find_item, no_item, shown_items
 from marey_server.store.items.references import ReferenceCheck
 from marey_server.store.items.revisions import (
     NewRevision,
+    StoredContent,
     event_of_item,
     read_part_digests,
     write_head,
@@ -34,8 +35,9 @@ from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import daily, holdings
 from marey_server.store.quotas.holdings import ItemTotals
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
-from marey_server.store.tables import item, item_tag
+from marey_server.store.tables import item, item_tag, lineage
 from marey_server.store.transaction import Transaction
+from marey_versions.records import RevisionKey
 
 
 def prepare_parts(kind: Kind, parts: dict[str, Any]) -> dict[str, PreparedDocument]:
@@ -124,15 +126,15 @@ def put_part(
     raise moved_on(found.rev)
 
 
-def set_parts(
-    tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, parts: Mapping[str, str], message: str
+def restore_content(
+    tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, source: StoredContent, message: str
 ) -> None:
-    """Create a revision whose parts are exactly the given documents, unless the newest revision has them already.
+    """Create a revision with the documents of `source`, unless the newest revision has the same documents.
 
-    The documents are stored already. They must come from the server itself, because the caller's access to them is not
-    checked. Raises `PreconditionFailedProblem` if another request changes the item.
+    The lineage of the new revision names `source`. The caller's access to `source` is not checked. Raises
+    `PreconditionFailedProblem` if another request changes the item.
     """
-    found = _find_to_change(tx, project_row, kind, item_id)
+    found, parts = _find_to_change(tx, project_row, kind, item_id), source.parts
     before = read_part_digests(tx, [(item_id, found.head)])[item_id, found.head]
     if before == parts:
         return
@@ -142,6 +144,12 @@ def set_parts(
         raise moved_on(found.rev)
     made = NewRevision(item_id, found.head + 1, parts, message)
     write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
+    tx.execute(
+        insert(lineage).values(
+            item_id=item_id, number=made.number, role=RESTORED, position=0, input_item_id=source.key.item,
+            input_number=source.key.revision,
+        )
+    )  # fmt: skip
     holdings.count_added(tx, project_row.id, {found.creator_id: ItemTotals(stored_bytes=added)})
     shown = _shown(tx, project_row, kind, item_id)
     tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
@@ -163,7 +171,9 @@ def revert_item(
     parts = read_part_digests(tx, [(item_id, request.revision)])[item_id, request.revision]
     if not parts:
         raise no_revision(item_id, request.revision)
-    set_parts(tx, project_row, kind, item_id, parts, request.message or f"Revert to revision {request.revision}")
+    source = StoredContent(RevisionKey(item_id, request.revision), parts)
+    message = request.message or f"Revert to revision {request.revision}"
+    restore_content(tx, project_row, kind, item_id, source, message)
     repeat_facets(tx, item_id, request.revision, _find_to_change(tx, project_row, kind, item_id).head)
     return _shown(tx, project_row, kind, item_id)
 

@@ -10,6 +10,7 @@ from sqlalchemy import ColumnElement, Row, Select, and_, exists, func, select, t
 from marey_schemas.documents.skeleton_merges import SKELETON_MERGE
 from marey_schemas.items import Lineage, LineageEdge, Page, Revision, Staleness
 from marey_schemas.kinds import Kind
+from marey_schemas.lineage import MERGED, RESTORED
 from marey_schemas.tracing.context import HEADER
 from marey_server.errors import NotFoundProblem
 from marey_server.store import listing, projects
@@ -163,8 +164,9 @@ def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str)
     """Return whether a direct or indirect input of the newest revision has a newer revision.
 
     An earlier revision of an item can be an input of the same item: the tree of a model is computed from its previous
-    revision. Such an input does not count as outdated, but its own inputs are examined. Revisions that a merge of
-    skeletons made do not count as newer, because the motion is the same.
+    revision. Such an input does not count as outdated, but its own inputs are examined. The same holds for a revision
+    whose content was only taken over, by a merge, a checkout or a revert. Revisions that a merge of skeletons made do
+    not count as newer, because the motion is the same.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     return _staleness(tx, item_id, found.head)
@@ -181,6 +183,7 @@ def _staleness(tx: Transaction, item_id: str, head: int) -> Staleness:
     outdated = and_(
         tuple_(lineage.c.item_id, lineage.c.number).in_(select(ancestry.c.item_id, ancestry.c.number)),
         lineage.c.input_item_id != lineage.c.item_id,
+        lineage.c.role.not_in((MERGED, RESTORED)),
         item.c.head > lineage.c.input_number,
         _has_newer_content(lineage.c.input_item_id, lineage.c.input_number),
     )

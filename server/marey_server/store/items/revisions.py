@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, insert, select, update
 
@@ -15,6 +15,7 @@ from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import item, revision, revision_part
 from marey_server.store.transaction import Transaction, in_lists
+from marey_versions.records import RevisionKey
 
 
 def read_part_digests(tx: Transaction, revisions: Collection[tuple[str, int]]) -> dict[tuple[str, int], dict[str, str]]:
@@ -70,6 +71,13 @@ class NewRevision:
     number: int
     parts: Mapping[str, str]
     message: str
+
+
+class StoredContent(NamedTuple):
+    """Revision that exists, and the digests of its documents by the name of the part."""
+
+    key: RevisionKey
+    parts: Mapping[str, str]
 
 
 def write_revisions(
