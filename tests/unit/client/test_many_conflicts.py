@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import pytest
 
@@ -16,9 +15,11 @@ ROUND = 40
 """Greatest number of conflicts in an answer of the pretended server."""
 
 
-def conflict(number: int, **more: Any) -> EntryConflict:
-    changed = {"parts": ("model", "tree"), "base": None, "ours": None, "theirs": None, "reason": "", "segments": None}
-    return EntryConflict(path=f"models/walk {number:03d}", kind=Kind.MODEL, **{**changed, **more})
+def conflict(number: int, reason: str = "") -> EntryConflict:
+    return EntryConflict(
+        path=f"models/walk {number:03d}", kind=Kind.MODEL, parts=("model", "tree"), base=None, ours=None, theirs=None,
+        reason=reason,
+    )  # fmt: skip
 
 
 def answer(conflicts: Sequence[EntryConflict]) -> MergeAnswer:
