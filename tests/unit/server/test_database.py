@@ -1,5 +1,6 @@
 """Transactions: retries, translation of errors, and the clock."""
 
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -308,3 +309,18 @@ def test_time_does_not_pass_within_a_transaction(database: Database) -> None:
         return tx.now_us - first
 
     assert database.write(SYSTEM, look) == 0
+
+
+def test_a_write_follows_one_whose_commit_found_the_disk_full(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def commit(dialect: DefaultDialect, _connection: object) -> None:
+        full = "database or disk is full"
+        raise sqlite3.OperationalError(full) if dialect.name == "sqlite" else psycopg.errors.DiskFull(full)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(DefaultDialect, "do_commit", commit)
+        with pytest.raises(StorageFullProblem):
+            database.write(SYSTEM, add_user)
+    database.write(SYSTEM, add_user)
+    assert database.read(SYSTEM, user_names) == ["u"]

@@ -233,6 +233,8 @@ class Database:
                         "The connection to the database broke during the commit, so it is unknown whether "
                         "the change was stored; check before you try again."
                     ) from error
+                if self.is_sqlite:  # a commit that fails on a full disk may leave its transaction open
+                    cast(sqlite3.Connection, tx.connection.connection.driver_connection).rollback()
                 raise
         self._high_water_us = high_water_us
         if self._log is not None:
