@@ -93,17 +93,16 @@ def measure_headlines(
     replacing = np.count_nonzero(record.status[1:][window] == Status.REPLACING)
     costs = record.pose_cost[:-1][window]
     steps = np.count_nonzero(window)
-    means = {
+    speed_error = _mean((series.speeds_m_s - series.wanted_speeds_m_s)[window])
+    turn_error = _mean((series.turn_rates_rad_s - series.wanted_turn_rates_rad_s)[window])
+    metrics = {
         "offset_mean": _mean(series.offsets_m[window]),
-        "abs_se_v": _mean((series.speeds_m_s - series.wanted_speeds_m_s)[window]),
-        "abs_se_omega_deg": _mean((series.turn_rates_rad_s - series.wanted_turn_rates_rad_s)[window]),
+        "abs_se_v": None if speed_error is None else abs(speed_error),
+        "abs_se_omega_deg": None if turn_error is None else 180.0 / np.pi * abs(turn_error),
         "pose_cost_mean": _mean(costs[np.isfinite(costs)]),
         "transitions_per_s": float(replacing) * record.rate_hz / steps if steps else None,
     }
-    if means["abs_se_v"] is not None and means["abs_se_omega_deg"] is not None:
-        means["abs_se_v"] = abs(means["abs_se_v"])
-        means["abs_se_omega_deg"] = 180.0 / np.pi * abs(means["abs_se_omega_deg"])
-    return TrialResult(trial, means, {})
+    return TrialResult(trial, metrics, {})
 
 
 def _mean(values: Floats) -> float | None:
