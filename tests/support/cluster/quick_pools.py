@@ -19,13 +19,11 @@ PAUSES = Backoff(first_s=0.5, longest_s=2.0)
 
 
 class QuickPoolsServer(ServerProcess):
-    """`marey serve` with such pools, or the module `program` in its place."""
-
-    program = __name__
+    """`marey serve` with such pools."""
 
     def spawn(self, arguments: list[str], environment: dict[str, str], stdin: bytes | None = None) -> None:
         """Start the server from this module."""
-        super().spawn([self.program, *arguments[1:]], environment, stdin)
+        super().spawn([__name__, *arguments[1:]], environment, stdin)
 
 
 QUICK: tuple[tuple[ModuleType, str, object], ...] = (
