@@ -86,7 +86,7 @@ def _make_clips(marey: Marey) -> list[str]:
 
 def _make_index(rest: httpx.Client, shards: Sequence[Shard], clips: Sequence[str]) -> None:
     """Store the shards as an index whose runs belong to the clips in turn."""
-    entries = []
+    entries: list[dict[str, Any]] = []
     for path, lengths in shards:
         count = len(lengths)
         listed = {

@@ -112,7 +112,8 @@ def draw_loops(walks: Sequence[ComparableClip]) -> Sketch:
         panel.axvline(1.0, color=QUIET, lw=0.6)
         panel.set(xticks=[0, 1, 2], yticks=[], ylim=(-0.6, 1.1))
         write(panel, (0.0, 1.08), walk.name, transform=panel.transAxes)
-    add_keys(panel, loc="upper right", bbox_to_anchor=(1.0, -0.2), ncols=2)
+        if number == len(walks) - 1:
+            add_keys(panel, loc="upper right", bbox_to_anchor=(1.0, -0.2), ncols=2)
     jumps = {"walk": [one.name for one in walks], "jump_at_seam": [jump_at_seam(one) for one in walks]}
     return Sketch(figure, {"seams": jumps}, "The right toe over two rounds of each loop.")
 

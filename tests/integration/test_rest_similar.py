@@ -132,14 +132,13 @@ def test_a_second_search_uses_the_mapped_shards_until_their_files_are_removed(
             "rows": lengths, "frames": lengths, "joints": [2**15 - 1] * len(lengths), "rates_hz": [30.0] * len(lengths),
         }), encoding="utf-8")  # fmt: skip
     opened: list[Path] = []
+    plain_open = Shard.open
 
-    class Counted(Shard):
-        @classmethod
-        def open(cls, path: Path, runs: Runs, joints: Ints) -> Shard:
-            opened.append(path)
-            return Shard.open(path, runs, joints)
+    def counted_open(path: Path, runs: Runs, joints: Ints) -> Shard:
+        opened.append(path)
+        return plain_open(path, runs, joints)
 
-    monkeypatch.setattr("marey_motion.similarity.shards.Shard", Counted)
+    monkeypatch.setattr(Shard, "open", counted_open)
 
     def found(listed: str) -> FoundWindows:
         shard = ShardFiles(clips=str(tmp_path / listed), poses=str(tmp_path / "poses"), dropped=())
