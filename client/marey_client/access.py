@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import TypeVar
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.errors import UnexpectedAnswer
 from marey_client.handles.invitations import AccountInvitations
 from marey_client.paging import pages
@@ -46,6 +46,7 @@ def change_quotas(transport: Transport, path: str, change: QuotaChange, answer: 
     return read_model(answer, transport.send("PATCH", path, content=as_json(change), repeatable=True))
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Users:
     """Users of a server, managed by administrators."""
@@ -111,6 +112,7 @@ class Users:
         return self.change(name, checked(UserChange, disabled=False))
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Tokens:
     """Tokens of the caller; administrators can also list and revoke tokens of other users."""
@@ -159,6 +161,7 @@ class Tokens:
         self.transport.send("DELETE", f"/tokens/{token_id}", params={"with_created": with_created or None})
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Members:
     """Members of a project, each with a role in the project; in some folders, members may have other roles."""
@@ -193,6 +196,7 @@ class Members:
         self.transport.send("DELETE", f"/projects/{self.project}/members/{user}", headers=ANY_STATE, repeatable=False)
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class FolderRoles:
     """Roles of members in folders of a project, and in everything below these folders.

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import httpx
 
-from marey_client.arguments import several
+from marey_client.arguments import checks_arguments, several
 from marey_client.downloads import saved_atomically
 from marey_client.errors import BlobTooLarge, Conflict, DigestMismatch, FileChanged, Unreachable
 from marey_client.transport import Transport, as_json, read_model
@@ -26,6 +26,7 @@ PIECE_BYTES = 16 << 20
 TRIES_PER_PIECE = 5
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Blobs:
     """Blobs (bytes identified by their digest) that the user of the token may read or has uploaded."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import TypeAdapter, ValidationError
 
-from marey_client.arguments import several
+from marey_client.arguments import checks_arguments, several
 from marey_client.asynchronous.interruption import CallPool
 from marey_client.blobs import Blobs
 from marey_client.errors import BadFileName, NothingToUpload, SameName
@@ -194,6 +194,7 @@ def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
         yield list(portion.values())
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Imports:
     """Imports of motion files into a project: search, upload, import, and restoring of exported clips."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, Unpack
 
-from marey_client.arguments import checked, several
+from marey_client.arguments import checked, checks_arguments, several
 from marey_client.downloads import TakenPaths, download
-from marey_client.errors import BadArgument, NoSuchPath, NotFound
+from marey_client.errors import NoSuchPath, NotFound
 from marey_client.keywords.asking import DifferenceKeywords, LineageKeywords
 from marey_client.listing.paths import missing_path, require_folder
 from marey_client.listing.tables import summary_table
@@ -32,6 +32,7 @@ from marey_schemas.lineage import LineageGraph, LineageRequest
 from marey_schemas.queue.jobs import ItemInput
 
 
+@checks_arguments
 class ItemHandle:
     """Handle of an item, in the state in which the item was read; its methods send requests to the server."""
 
@@ -205,6 +206,7 @@ class ItemHandle:
 Handle = TypeVar("Handle", bound=ItemHandle)
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Items(Generic[Handle]):
     """Items of one kind in a project: iterable, counted by `len`, and looked up by `items[path]`."""
@@ -235,8 +237,6 @@ class Items(Generic[Handle]):
 
     def find(self, name: str) -> Handle | None:
         """Return the item with a path or an id, or None. A path may begin with the name of the project."""
-        if not isinstance(name, str):  # a position in a list, for example
-            raise BadArgument(f"{self.kind.plural}: give the path or the id of a {self.kind} as text, not {name!r}")
         name = name.strip("/")
         for path in dict.fromkeys((name, name.removeprefix(f"{self.project}/"))):
             for found in self.list(path=path, page_size=1):

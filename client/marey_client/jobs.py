@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from marey_client.arguments import checks_arguments
 from marey_client.asynchronous.interruption import pause, waiting
 from marey_client.errors import BadArgument, JobUnsuccessful, WaitedTooLong
 from marey_client.paging import pages
@@ -28,6 +29,7 @@ def job_request(kind: str, inputs: Mapping[str, JobInput | Sequence[JobInput]], 
     return JobCreate(kind=kind, inputs=given, params=params.model_dump(mode="json", exclude_unset=True))
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Jobs:
     """Jobs of a server, which are named by their ids; methods submit, read, await and cancel them."""

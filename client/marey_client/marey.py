@@ -11,7 +11,7 @@ import httpx
 from pydantic import SecretStr
 
 from marey_client.access import Tokens, Users
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.audit import AuditConditions, read_audit
 from marey_client.blobs import Blobs
 from marey_client.credentials import TokenFile, resolve
@@ -28,6 +28,7 @@ from marey_schemas.queue.workers import Worker
 from marey_schemas.sign_ins import BrowserSignIn, BrowserSignInCode, BrowserSignInCreate
 
 
+@checks_arguments
 class Marey:
     """Client of a Marey server. Several threads may share a client; close it, or use it in a `with` block.
 
@@ -42,6 +43,7 @@ class Marey:
     http : HTTP transport that replaces the network in tests
     """
 
+    @checks_arguments
     def __init__(
         self,
         url: str | None = None,
@@ -161,6 +163,7 @@ class Marey:
         return Tokens(self.transport)
 
 
+@checks_arguments
 def connect(url: str | None = None, token: str | TokenFile | None = None) -> Marey:
     """Return a client of a server, by default of the one that the command line uses.
 

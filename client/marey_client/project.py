@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Unpack
 
 from marey_client.access import Members, change_quotas
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.audit import AuditConditions, read_audit
 from marey_client.handles.bisections import read_range
 from marey_client.handles.coverage_streams import CoverageStreams
@@ -36,6 +36,7 @@ from marey_schemas.queue.jobs import CacheMode
 from marey_schemas.sign_ins import BrowserLink
 
 
+@checks_arguments
 class ProjectHandle(JobSubmission):
     """Handle of a project, given by name; requests are sent only by its methods."""
 

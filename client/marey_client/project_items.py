@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Unpack
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.blobs import Blobs
 from marey_client.errors import NotFound
 from marey_client.handles.annotations import AnnotationHandle
@@ -35,6 +35,7 @@ from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.search import SimilarAnswer, SimilarRequest
 
 
+@checks_arguments
 class ProjectItems:
     """Items of a project, given by name; requests are sent only by its methods."""
 
@@ -187,6 +188,7 @@ class ProjectItems:
         return tuple(edited)
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Collections:
     """Folders of a project."""

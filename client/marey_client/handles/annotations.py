@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from marey_client.arguments import checked, several
+from marey_client.arguments import checked, checks_arguments, several
 from marey_client.items import ItemHandle
 from marey_client.transport import as_json, read_model
 from marey_schemas.documents.annotations import Annotation
@@ -13,6 +13,7 @@ from marey_schemas.editing.annotation_commands import AnnotationChange
 from marey_schemas.items import Item
 
 
+@checks_arguments
 class AnnotationHandle(ItemHandle):
     """Handle of an annotation: one layer of segments and keyframes over a clip."""
 

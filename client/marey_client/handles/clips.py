@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Unpack
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.blobs import Blobs
 from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.edits import Commands, preview_edit
@@ -23,6 +23,7 @@ from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 
 
+@checks_arguments
 class ClipHandle(PosesHandle):
     """Handle of a clip: poses, description (the part `info`) and annotations of the clip."""
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_client.arguments import checked, several
+from marey_client.arguments import checked, checks_arguments, several
 from marey_client.paging import pages
 from marey_client.transport import Transport, read_model
 from marey_schemas.coverage_streams import (
@@ -23,6 +23,7 @@ from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 ROOT_COLUMNS = 3
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class CoverageStreams:
     """Coverage streams of a project: each measures which motions a performance has covered, while it is recorded."""
@@ -61,6 +62,7 @@ class CoverageStreams:
         return pages(self.transport, CoverageStream, self.url)
 
 
+@checks_arguments
 class CoverageStreamHandle:
     """Handle of a coverage stream, to which the frames of a performance are sent."""
 

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.errors import Conflict, NotFound, RequestFailed
 from marey_client.handles.versions import DatasetHandle
 from marey_client.paging import pages
@@ -34,6 +34,7 @@ class ImportedVersion(NamedTuple):
     """The tag that was copied with the version, or None."""
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Datasets:
     """Datasets of a project, and imports of versions into them."""

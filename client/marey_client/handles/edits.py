@@ -7,7 +7,7 @@ from typing import Any, Unpack
 
 from pydantic import BaseModel
 
-from marey_client.arguments import checked, several
+from marey_client.arguments import checked, checks_arguments, several
 from marey_client.items import ItemHandle, Items
 from marey_client.keywords.asking import EditPreviewKeywords
 from marey_client.transport import BLOCKS, Transport, as_json, read_tree
@@ -16,6 +16,7 @@ from marey_schemas.editing.previews import EditPreview, EditPreviewRequest
 from marey_schemas.items import Item
 
 
+@checks_arguments
 class EditHandle(ItemHandle):
     """Handle of an edit: a saved list of commands with a title."""
 
@@ -36,6 +37,7 @@ Commands = EditHandle | EditDocument | Command | Sequence[Command]
 """Edit as a handle or a document, or a list of commands such as `{"command": "trim", "start": 10}`."""
 
 
+@checks_arguments
 class Edits(Items[EditHandle]):
     """Edits (saved lists of commands) of a project."""
 

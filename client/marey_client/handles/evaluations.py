@@ -11,7 +11,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.errors import BadArgument
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.findings import Findings
@@ -32,6 +32,7 @@ TRIAL_VERDICT = ("followed", "worst_rank", "beyond_limits")
 """Fields of a trial's verdict: whether it was followed, its rank among the worst trials (0: worst), exceeded limits."""
 
 
+@checks_arguments
 class EvaluationHandle(ReportedHandle):
     """Handle of an evaluation of locomotion clips: trials, use of the clips, report, and jobs to improve the clips."""
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from marey_client.arguments import checks_arguments
 from marey_client.blobs import Blobs
 from marey_client.downloads import safe_file_name
 from marey_client.errors import NotComparable
@@ -21,6 +22,7 @@ FILES = ("document", "report", "maps", "figures", "fitted", "table")
 """Names of members of a job's result that refer to files, such as a report, instead of numbers."""
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Findings:
     """Findings of one job: its results, with the files that some kinds of jobs also make."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import timedelta
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.paging import pages
 from marey_client.transport import Transport
 from marey_schemas.access import Role
@@ -15,6 +15,7 @@ from marey_schemas.invitations import AccountInvitationCreate, Invitation, Invit
 WEEK = timedelta(days=7)
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class _OpenInvitations:
     """Invitations below `url` that can be listed and withdrawn."""
@@ -31,6 +32,7 @@ class _OpenInvitations:
         self.transport.send("DELETE", f"{self.url}/{named}", repeatable=False)
 
 
+@checks_arguments
 class Invitations(_OpenInvitations):
     """Invitations to a project; only its owners may use them."""
 
@@ -45,6 +47,7 @@ class Invitations(_OpenInvitations):
         return self.transport.post(NewInvitation, self.url, request, repeatable=False)
 
 
+@checks_arguments
 class AccountInvitations(_OpenInvitations):
     """Invitations of people who have no account; only administrators may use them."""
 

@@ -7,12 +7,14 @@ from typing import Any
 
 from pydantic import PrivateAttr
 
+from marey_client.arguments import checks_arguments
 from marey_client.jobs import Jobs, OnProgress
 from marey_client.progress import is_shown, progress, show_progress
 from marey_client.project_items import ProjectItems
 from marey_schemas.queue.jobs import Job
 
 
+@checks_arguments
 class JobHandle(Job):
     """Job in the state in which it was read; its methods send requests."""
 

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.arguments import checks_arguments
 from marey_client.blobs import Blobs
 from marey_client.handles.findings import Findings
 from marey_client.items import ItemHandle, Items
@@ -17,6 +18,7 @@ from marey_schemas.documents.metrics import MetricDocument, built_in_metric, is_
 from marey_schemas.queue.jobs import ItemInput
 
 
+@checks_arguments
 class MetricHandle(ItemHandle):
     """Handle of a stored perceptual metric."""
 
@@ -29,6 +31,7 @@ Metric: TypeAlias = MetricHandle | str
 """A stored metric, its id, or the name of a built-in metric such as `published/sigmoid`."""
 
 
+@checks_arguments
 class PerceptualMetrics(Items[MetricHandle]):
     """Stored perceptual metrics of a project."""
 

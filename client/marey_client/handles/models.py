@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.arguments import checks_arguments
 from marey_client.downloads import download, safe_file_name, saved_atomically
 from marey_client.handles.clips import ClipHandle, MotionArrays
 from marey_client.handles.searches import SearchableHandle
@@ -38,6 +39,7 @@ class Samples:
     motions: tuple[MotionArrays, ...]
 
 
+@checks_arguments
 class ModelHandle(SearchableHandle):
     """Handle of a generative model of one action: its quality, its report, and motions drawn from it."""
 

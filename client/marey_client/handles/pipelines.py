@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from types import MappingProxyType
 
+from marey_client.arguments import checks_arguments
 from marey_client.asynchronous.interruption import pause
 from marey_client.errors import Conflict, JobUnsuccessful, WaitedTooLong
 from marey_client.jobs import LONGEST_WAIT_S, Jobs
@@ -21,6 +22,7 @@ SHORTEST_PAUSE_S = 0.2
 """Shortest time in seconds from one request for the state of the jobs to the next."""
 
 
+@checks_arguments
 class PipelineRun:
     """Jobs of a pipeline by the names of its steps, in the states that the last request returned."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.arguments import checks_arguments
 from marey_client.handles.clips import ClipHandle
 from marey_client.poses.handle import PosesHandle
 from marey_schemas.documents.alignments import AlignmentInfo
@@ -12,6 +13,7 @@ from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 
 
+@checks_arguments
 class ProcessedHandle(PosesHandle):
     """Handle of an aligned clip: poses at the canonical frames of an action, and the source frame of each of them.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, read_model, sends_nothing
 from marey_schemas.datasets.merges import Resolution
@@ -26,6 +26,7 @@ from marey_schemas.datasets.proposals import (
 from marey_schemas.kinds import Kind
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Proposals:
     """Proposals to merge versions into branches of a dataset."""
@@ -49,6 +50,7 @@ class Proposals:
         return ProposalHandle(self.transport, f"{self.url}/{number}")
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class ProposalHandle:
     """Handle of a proposal; requests are sent only by its methods."""

@@ -6,11 +6,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from marey_client.arguments import checks_arguments
 from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.items import ItemHandle
 from marey_schemas.documents.reports import StoredFigure
 
 
+@checks_arguments
 class ReportedHandle(ItemHandle):
     """Handle of an evaluation or a model, which has a verdict in words and may have a part `report`."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.jobs import Jobs
 from marey_client.paging import pages
 from marey_client.transport import Transport, as_json, read_model, sends_nothing
@@ -13,6 +13,7 @@ from marey_schemas.queue.jobs import Job, JobCreate
 from marey_schemas.queue.schedules import Schedule, ScheduleChange, ScheduleCreate
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Schedules:
     """Schedules of a project, each of which submits a job at the times of a cron expression."""
@@ -59,6 +60,7 @@ class Schedules:
         return ScheduleHandle(self.transport, self.project, f"{self.url}/{name}")
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class ScheduleHandle:
     """Handle of a schedule; requests are sent only by its methods."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.paging import pages
 from marey_client.transport import Transport, sends_nothing
 from marey_schemas.queue.commits import OutputsCommit
@@ -15,6 +15,7 @@ from marey_schemas.queue.jobs import Job, JobInput
 from marey_schemas.queue.scripts import Script, ScriptCreate, ScriptRun, ScriptRunCreate, Value
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Scripts:
     """Scripts of a project: commands of pinned Git commits, which run as jobs."""
@@ -45,6 +46,7 @@ class Scripts:
         return ScriptHandle(self.transport, f"{self.url}/{name}")
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class ScriptHandle:
     """Handle of a script; requests are sent only by its methods."""

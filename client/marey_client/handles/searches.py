@@ -8,7 +8,7 @@ from typing import Any, Unpack
 
 from pydantic import BaseModel
 
-from marey_client.arguments import checked, several
+from marey_client.arguments import checked, checks_arguments, several
 from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.handles.reports import ReportedHandle
 from marey_client.jobs import Jobs, OnProgress, job_request
@@ -25,6 +25,7 @@ Constraints = Constraint | Sequence[Constraint]
 """Constraints such as `{"type": "joint_position", "joint": "left_wrist", "at": "end", "target_m": (0.3, 1, None)}`."""
 
 
+@checks_arguments
 class SearchableHandle(ReportedHandle):
     """Handle of an item whose motions can be searched."""
 

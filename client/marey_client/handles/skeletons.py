@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from marey_client.arguments import checks_arguments
 from marey_client.items import ItemHandle
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.items import Item
 
 
+@checks_arguments
 class SkeletonHandle(ItemHandle):
     """Handle of a skeleton: its hierarchy of joints, and its joint mapping."""
 

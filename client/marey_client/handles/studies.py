@@ -9,7 +9,7 @@ from datetime import timedelta
 from itertools import combinations
 from typing import Any, Unpack
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.errors import BadArgument
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.findings import Findings
@@ -37,6 +37,7 @@ TRIAL_COLUMNS = (
 PAIR_COLUMNS = ("participant", "index", "nearer_1", "nearer_2", "farther_1", "farther_2")
 
 
+@checks_arguments
 class StudyHandle(ItemHandle):
     """Handle of a perceptual study: its design, participants, judgements and analysis."""
 
@@ -86,6 +87,7 @@ class StudyHandle(ItemHandle):
         return job_request("analyse_study", {"study": self.as_input()}, params)
 
 
+@checks_arguments
 class Studies(Items[StudyHandle]):
     """Perceptual studies of a project."""
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict, Unpack
 
 from marey_client.access import ANY_STATE
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.errors import NotFound
 from marey_client.handles.bisections import Bisection, IsBad, OnStep, bisect, read_range
 from marey_client.handles.proposals import Proposals
@@ -47,6 +47,7 @@ class PickOptions(TypedDict, total=False):
     """Commit that must be the newest commit of the branch."""
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class DatasetHandle:
     """Handle of a dataset; requests are sent only by its methods.

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.asynchronous.interruption import pause
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model, sends_nothing
@@ -25,6 +25,7 @@ from marey_schemas.webhooks import (
 LOOK_EVERY_S = 0.2
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class Webhooks:
     """Webhooks of a project; only its owners may use them."""
@@ -53,6 +54,7 @@ class Webhooks:
         return WebhookHandle(self.transport, f"{self.url}/{webhook_id}")
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class WebhookHandle:
     """Handle of a webhook; requests are sent only by its methods."""

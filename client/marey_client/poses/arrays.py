@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from marey_client.arguments import several
+from marey_client.arguments import checks_arguments, several
 from marey_client.errors import BadArgument
 from marey_client.items import ItemHandle
 from marey_schemas.documents.clips import MotionDocument
@@ -38,6 +39,7 @@ Joints = str | Sequence[str] | None
 """One joint or several, by name; None: all joints."""
 
 
+@checks_arguments
 class PosedItem(ItemHandle):
     """Handle of an item with the part `motion`.
 
@@ -80,18 +82,16 @@ class PosedItem(ItemHandle):
 def frames_text(frames: slice | None) -> str | None:
     """Return a slice of frames as the query parameter `first:end`; None, which means all frames, stays None.
 
-    Raises `BadArgument` for any other type than a slice, for a step other than 1, and for negative bounds.
+    Raises `BadArgument` for a step other than 1, and for bounds that are negative or not whole numbers.
     """
     if frames is None:
         return None
-    if not isinstance(frames, slice):
-        raise BadArgument(f"frames: give a range such as slice(0, 120), not {frames!r}")
     if frames.step not in (None, 1):
         raise BadArgument(
             f"frames: only ranges with a step of 1 can be requested, not {frames.step}; request "
             "the range, then take every n-th frame of the arrays"
         )
     bounds: tuple[Any, Any] = (frames.start, frames.stop)
-    if any(bound is not None and bound < 0 for bound in bounds):
-        raise BadArgument("frames: negative bounds are not possible; count frames from the start of the clip, from 0")
+    if not all(bound is None or (isinstance(bound, (int, Integral)) and int(bound) >= 0) for bound in bounds):
+        raise BadArgument(f"frames: the bounds of {frames} must be whole numbers from 0; frames are counted from 0")
     return ":".join("" if bound is None else str(bound) for bound in bounds)

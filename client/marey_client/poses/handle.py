@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.arguments import checks_arguments
 from marey_client.errors import MareyError
 from marey_client.poses.arrays import Joints, PosedItem
 from marey_client.poses.frame_tables import to_arrow, to_dataframe, to_xarray
@@ -15,6 +16,7 @@ from marey_client.poses.kinematics import read_contacts, read_positions, read_ve
 from marey_client.poses.pictures import MotionPicture, draw_poses
 
 
+@checks_arguments
 class PosesHandle(PosedItem):
     """Handle of an item with poses. Arguments and arrays are those of `PosedItem`."""
 

@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from marey_client.arguments import checks_arguments
 from marey_client.errors import BadArgument
 from marey_client.poses.arrays import Joints
 from marey_client.poses.handle import PosesHandle
@@ -22,6 +23,7 @@ class MotionWindow(NamedTuple):
     first: int
 
 
+@checks_arguments
 class MotionWindows:
     """Dataset of windows of equal length in clips, at the revisions of the handles; indexing reads one window.
 
@@ -42,6 +44,7 @@ class MotionWindows:
     seed : seed of a random order of the windows; default: None, in the order of the clips, then of time
     """
 
+    @checks_arguments
     def __init__(
         self,
         clips: Iterable[PosesHandle],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Unpack
 
-from marey_client.arguments import checked
+from marey_client.arguments import checked, checks_arguments
 from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.jobs import JobHandle
@@ -66,6 +66,7 @@ CommitTo = OutputsCommit | str | None
 """Branch and folder to which a job commits its results: an `OutputsCommit`, or a text `dataset[@branch][/folder]`."""
 
 
+@checks_arguments
 class JobSubmission(ProjectItems):
     """Items of a project, and methods that submit jobs, which make new items from items.
 

@@ -149,11 +149,12 @@ MISTAKES: dict[str, Callable[[ProjectHandle], object]] = {
     "unit": lambda lab: lab.upload("/tmp", unit=cast(Any, "parsec")),
     "name": lambda lab: lab.clips.create("a/b", {"motion": {}}),
     "path": lambda lab: lab.collections.create("/a//b"),
-    "role": lambda lab: lab.members.put("ann", cast(Any, "emperor")),
+    "role: give 'reader', 'contributor', 'maintainer' or 'owner', not 'emperor'": lambda lab: lab.members.put(
+        "ann", cast(Any, "emperor")
+    ),
     "samples": lambda lab: lab.evaluate("raw", **cast(Any, {"samples": -1})),
     "url": lambda lab: lab.webhooks.create("ftp://x", kinds=["item.created"]),
     "commands": lambda lab: as_edit([{"command": "nope"}]),
-    "clips": lambda lab: lab.clips[cast(Any, 0)],
     "parts": lambda lab: lab.clips.create("walk", {}),
 }
 
