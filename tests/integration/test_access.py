@@ -248,6 +248,7 @@ def test_a_public_project_is_read_by_everybody_but_not_its_members_and_events(ho
 
 def test_a_token_allows_no_more_than_its_scopes(house: House) -> None:
     owner = house.people.client(house.tokens["owner"])
+    assert owner.post("/projects", json={"name": "other"}).status_code == 201
     for scope in ("read", "write", "jobs", "read!project=lab", "write!project=other"):
         made = owner.post("/tokens", json={"name": "narrow", "scopes": [scope]})
         assert made.status_code == 201, scope

@@ -124,9 +124,7 @@ def require(
     row = tx.execute(_DELETED_BY_NAME, who).one_or_none() if deleted else tx.first(_ALIVE_BY_NAME, who)
     seen = None if row is None else _as_seen(tx.principal, row)
     if seen is None or (seen.guest and deleted):
-        raise NotFoundProblem(
-            f"There is no project {name!r} that you may see.", code="no-project", context={"project": name}
-        )
+        raise _unknown(name)
     enough = roles.includes(seen.role, need) or (required.in_folders and _has_role_in_a_folder(tx, seen, need))
     if not enough or (seen.guest and not required.guests):
         if tx.principal.kind == "anonymous":
@@ -137,6 +135,12 @@ def require(
     if not seen.guest:
         require_scope(tx, name, required.scope)
     return seen
+
+
+def _unknown(name: str) -> NotFoundProblem:
+    return NotFoundProblem(
+        f"There is no project {name!r} that you may see.", code="no-project", context={"project": name}
+    )
 
 
 def _has_role_in_a_folder(tx: Transaction, seen: ProjectRow, need: Role) -> bool:
@@ -270,6 +274,14 @@ def meets_hidden(tx: Transaction, name: str, guesses_per_hour: int) -> bool:
         raise _too_many_guesses(wait_s)
     row = tx.first(_ALIVE_BY_NAME, {"name": name, "me": tx.principal.user_id or ""})
     return row is not None and _as_seen(tx.principal, row) is None
+
+
+def require_known(tx: Transaction, names: Iterable[str]) -> None:
+    """Raise `NotFoundProblem` for the first of some projects that does not exist, or that the caller may not know."""
+    for name in names:
+        row = tx.first(_ALIVE_BY_NAME, {"name": name, "me": tx.principal.user_id or ""})
+        if row is None or _as_seen(tx.principal, row) is None:
+            raise _unknown(name)
 
 
 def count_guess(tx: Transaction, guesses_per_hour: int) -> None:

@@ -9,7 +9,7 @@ from tests.support.database_fixtures import AdjustableClock
 from tests.support.present import present
 from tests.support.store_fixtures import Lab
 
-from marey_schemas.access import NewToken, TokenCreate, UserChange, UserCreate
+from marey_schemas.access import NewToken, ProjectCreate, TokenCreate, UserChange, UserCreate
 from marey_schemas.queue.jobs import JobState
 from marey_server.access import passwords
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
@@ -201,6 +201,8 @@ def test_a_token_that_would_outlive_its_creator_is_refused_with_the_latest_date(
 
 
 def test_a_chain_of_tokens_never_widens(database: Database, chief: Principal) -> None:
+    for name in ("walk", "run"):
+        database.write(chief, projects.create_project, ProjectCreate(name=name))
     first = make_token(database, chief, scopes=("read", "write", "jobs!project=walk"), expires_in_s=3600)
     held = first
     for narrower in (("read", "write"), ("write",), ("write!project=run",)):
@@ -213,12 +215,24 @@ def test_a_chain_of_tokens_never_widens(database: Database, chief: Principal) ->
         assert held.expires_at == first.expires_at
 
 
+def test_a_token_for_a_project_that_the_caller_cannot_see_is_refused(database: Database, chief: Principal) -> None:
+    administrator = holder(database, make_token(database, chief))
+    ann = holder(database, make_token(database, sign_up(database, chief, "ann")))
+    database.write(chief, projects.create_project, ProjectCreate(name="hidden"))
+    assert make_token(database, administrator, scopes=("read!project=hidden",)).scopes == ("read!project=hidden",)
+    for name in ("hidden", "hiden"):
+        with pytest.raises(NotFoundProblem, match=f"There is no project '{name}' that you may see") as refused:
+            make_token(database, ann, scopes=("write", f"read!project={name}"))
+        assert refused.value.error_code == "no-project"
+
+
 def holder(database: Database, made: NewToken) -> Principal:
     return database.read(ANONYMOUS, tokens.resolve_token, made.secret)
 
 
 def test_a_token_bound_to_labels_makes_none_that_allows_others(database: Database, chief: Principal) -> None:
     lyon = {"gpu": "a100", "site": "lyon"}
+    database.write(chief, projects.create_project, ProjectCreate(name="walk"))
     held = make_token(database, chief, scopes=("write", "work"), labels=lyon)
     caller = holder(database, held)
     assert caller.labels == held.labels == lyon

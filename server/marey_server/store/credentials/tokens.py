@@ -29,7 +29,7 @@ from marey_server.errors import (
     NotFoundProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store import listing
+from marey_server.store import listing, projects
 from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
@@ -148,7 +148,7 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
 
     The new token may not have more rights than the caller's own token: no other scopes, no other labels of workers,
     and no later expiry. Otherwise, raises `ForbiddenProblem`. Raises `InvalidProblem` for labels without the scope
-    `work`.
+    `work`, and `NotFoundProblem` for a scope of a project that the caller cannot see.
     """
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
@@ -158,6 +158,7 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
         )
     labels, ends_us = _labels_of(tx, request), _end_of(tx, request)
     if tx.principal.token_id is not None:  # the server itself may always make one, for its workers or after a loss
+        projects.require_known(tx, sorted({scope.partition("!project=")[2] for scope in request.scopes} - {""}))
         lock_own(tx)
         require_room(tx, "user_tokens")
     return _insert(tx, user_id, request, ends_us, labels=labels)
