@@ -150,7 +150,8 @@ def _axis_of_person(
 def _compare_with_body(given: UpAxis, body: BodyMeasures, *, trusted: bool) -> None:
     """Refuse a given axis that the motion and the rest pose or the ground contradict; warn if only the motion does.
 
-    A body may lie or do a handstand in the whole motion, so the motion alone is weak evidence.
+    A body may lie or do a handstand in the whole motion, so the motion alone is weak evidence. But such a body stays at
+    one height along the axis that points up: if its lowest point moves along the given axis, the axis is wrong.
     """
     if body.leg is None:
         return
@@ -162,7 +163,7 @@ def _compare_with_body(given: UpAxis, body: BodyMeasures, *, trusted: bool) -> N
     if axis == given or cosine < _CLEAR_COSINE or given in others:
         return
     reason = f"from feet to head, the body points along {axis} (mean cosine {cosine:.2f}), not along {given}"
-    if axis in others and not trusted:
+    if (axis in others or not _keeps_to_ground(body, given)) and not trusted:
         raise ContradictedOption(
             f"the up axis {given} contradicts the motion: {reason}; set the right axis with --up-axis (up_axis), "
             "or confirm the given axis with --trust-options (trust_options)",

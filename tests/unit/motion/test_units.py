@@ -309,6 +309,18 @@ def test_weak_evidence_against_a_given_fact_gives_a_warning(walk: Clip) -> None:
     assert warned(unit="cm", up_axis="y", frame_rate_hz=60.0) == warned()
 
 
+def test_an_axis_along_which_an_upright_body_travels_does_not_point_up(walk: Clip) -> None:
+    """The motion suffices where neither the rest pose nor the ground shows the axis: both are tilted here."""
+    tilt = quaternions.from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.pi / 2)
+    clip = in_axes(walk, quaternions.as_matrix(tilt))  # the rest pose points along x
+    poses = clip.poses.astype(np.float64)
+    poses[:, 3:7] = quaternions.multiply(quaternions.conjugate(tilt), poses[:, 3:7])
+    poses[:, :3] = walk.root_translations + 0.3 * np.array([0.0, 1.0, 0.0]) * walk.root_translations[:, 2:]  # uphill
+    file = write_bvh(replace(clip, poses=poses.astype(np.float32)), unit="cm")
+    with pytest.raises(ContradictedOption, match=r"the up axis z contradicts .* points along y"):
+        read_motion(file, "uphill.bvh", options=ImportOptions(up_axis="z"))
+
+
 def test_a_body_that_lies_does_not_contradict_the_axis_of_its_rest_pose(walk: Clip) -> None:
     turned = quaternions.from_axis_angle(np.array([1.0, 0.0, 0.0]), np.pi / 2).astype(np.float32)
     poses = walk.poses[:30].copy()
