@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import count, islice
 from typing import Any
 
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from marey_schemas.documents.blob_references import is_array_reference, members_of, references_of
 from marey_schemas.documents.clips import MotionDocument
@@ -23,7 +25,7 @@ from marey_schemas.encoding.canonical import canonical_json, detach_arrays
 from marey_schemas.encoding.digests import digest_of
 from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem
-from marey_server.field_errors import field_errors
+from marey_server.field_errors import MAX_ERRORS, field_errors, json_pointer
 
 OPEN_SCHEMA = "marey/document@1"
 
@@ -139,9 +141,57 @@ def _check(tree: Any, schema: str | None) -> str:
         raise InvalidProblem(
             f"The document is not a valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
         ) from error
+    _require_numbers(str(named), checked, tree)
     if isinstance(checked, MotionDocument):
         _require_rotations(checked)
     return str(named or OPEN_SCHEMA)
+
+
+def _require_numbers(named: str, checked: BaseModel, tree: Any) -> None:
+    """Raise `InvalidProblem` if the document has a text in place of a number.
+
+    The models accept such texts, because queries and settings consist of texts; but the document is stored as sent.
+    """
+    faults = [
+        FieldError(pointer=pointer, code="text-for-number", detail=f"the value must be a number, not the text {text!r}")
+        for pointer, text in islice(_texts_for_numbers(checked, tree), MAX_ERRORS)
+    ]
+    if faults:
+        detail = f"The document is not a valid {named}: {faults[0].pointer}: {faults[0].detail}"
+        raise InvalidProblem(detail, errors=faults)
+
+
+def _texts_for_numbers(checked: Any, sent: Any) -> Iterator[tuple[str, str]]:
+    """Yield pointer and text for each text in a sent document that its model has read as a number."""
+    waiting: list[tuple[tuple[str, ...], Any, Any]] = [((), checked, sent)]
+    while waiting:
+        steps, whole, raw = waiting.pop()
+        for key, value, part in _pairs(whole, raw):
+            if isinstance(part, str):
+                if isinstance(value, (int, float)):
+                    yield json_pointer([*steps, str(key)]), part
+            elif isinstance(part, (dict, list, tuple)):
+                waiting.append(((*steps, str(key)), value, part))
+
+
+def _pairs(checked: Any, sent: Any) -> Iterator[tuple[str | int, Any, Any]]:
+    """Yield key, checked part and sent part for the parts of an object or a list."""
+    if isinstance(sent, Mapping):
+        model = isinstance(checked, BaseModel)
+        names = _names_of(type(checked)) if model else {}
+        parts = vars(checked) if model else checked if isinstance(checked, Mapping) else {}
+        for key, part in sent.items():
+            name = names.get(key, key)
+            if name in parts:
+                yield key, parts[name], part
+    elif isinstance(checked, (list, tuple)):
+        yield from zip(count(), checked, sent, strict=False)
+
+
+@cache
+def _names_of(model: type[BaseModel]) -> dict[str, str]:
+    """Return the name of each field with an alias, by the alias."""
+    return {field.alias: name for name, field in model.model_fields.items() if field.alias}
 
 
 def _require_rotations(motion: MotionDocument) -> None:

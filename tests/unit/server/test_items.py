@@ -166,6 +166,32 @@ def test_a_new_part_makes_a_revision_and_shares_the_others(lab: Lab, rig: Item) 
     assert [one.revision for one in lab.read(items.list_revisions, "lab", Kind.CLIP, clip.id).items] == [2, 1]
 
 
+def test_a_revision_that_does_not_exist_yet_is_named_with_the_newest(lab: Lab, rig: Item) -> None:
+    clip = lab.add_clip(rig)
+    with pytest.raises(NotFoundProblem, match=r"has no revision 7; the newest one is 1\.$"):
+        lab.read(items.find_part, "lab", Kind.CLIP, clip.id, "motion", revision=7)
+
+
+@pytest.mark.parametrize(
+    ("change", "pointer", "reason"),
+    [
+        ({"frame_rate_hz": "30"}, "/motion/frame_rate_hz", "the value must be a number, not the text '30'"),
+        ({"poses": np.zeros((2, 7))}, "/motion/poses", "expected dtype <f4, not <f8"),
+        ({"joints": ["Hips", "Spine"]}, "/motion", "poses: the array has"),
+    ],
+)
+def test_a_document_that_is_not_valid_is_refused_with_place_and_reason_once(
+    lab: Lab, rig: Item, change: dict[str, Any], pointer: str, reason: str
+) -> None:
+    """The text of a number would be stored as it was sent, and fail whoever divides by it."""
+    clip = lab.add_clip(rig)
+    motion = {**motion_tree(rig), **change}
+    with pytest.raises(InvalidProblem) as refused:
+        lab.write(items.put_part, "lab", Kind.CLIP, clip.id, "motion", motion, expected_rev=None)
+    assert f"marey/motion@1: {pointer}: {reason}" in str(refused.value.detail)
+    assert refused.value.errors[0].pointer == pointer
+
+
 def test_the_same_content_again_makes_no_revision(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, info={"subject": "Ann"})
     again = put_info(lab, clip, clip.rev, subject="Ann")

@@ -65,7 +65,10 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
         return prepared(tree, schema=spec.schema)
     except InvalidProblem as error:
         moved = [found.model_copy(update={"pointer": f"/{part}{found.pointer}"}) for found in error.errors]
-        raise InvalidProblem(error.detail, code=error.error_code, errors=moved, context=error.context) from error
+        detail = error.detail
+        for old, new in zip(error.errors, moved, strict=True):
+            detail = detail.replace(f"{old.pointer}: {old.detail}", f"{new.pointer}: {new.detail}")
+        raise InvalidProblem(detail, code=error.error_code, errors=moved, context=error.context) from error
 
 
 def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) -> Item:

@@ -233,11 +233,15 @@ def find_part(
     else:
         row = tx.first(_PART_OF_REVISION, {**which, "number": revision})
     if row is None:
-        raise NotFoundProblem(
-            f"The {kind} {item_id!r} has no part {part!r} at the requested revision; a {kind} can have the parts "
-            f"{', '.join(PARTS[kind])}.",
-            code="no-part",
-        )
+        newest = None if revision is None else tx.first(_PART_OF_HEAD, which)
+        if newest is not None and revision is not None and revision > newest.number:
+            detail = f"The {kind} {item_id!r} has no revision {revision}; the newest one is {newest.number}."
+        else:
+            detail = (
+                f"The {kind} {item_id!r} has no part {part!r} at the requested revision; a {kind} can have the parts "
+                f"{', '.join(PARTS[kind])}."
+            )
+        raise NotFoundProblem(detail, code="no-part")
     return FoundPart(row.document_digest, row.number, row.rev, row.size_bytes)
 
 
