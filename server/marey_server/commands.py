@@ -126,6 +126,7 @@ def upgrade(*, while_serving: bool = False, finish: bool = False, **settings: An
     could not use the upgraded tables.
     """
     from marey_server.process.data_folder import prepare_data_folder
+    from marey_server.store.database.opening import sqlite_file
     from marey_server.store.database.schema import upgrade_schema
 
     chosen = read_settings(**settings)
@@ -135,9 +136,10 @@ def upgrade(*, while_serving: bool = False, finish: bool = False, **settings: An
     if not done.known:
         _say("a newer version of Marey has added to the tables; this version can serve them")
         return
-    _say("the database's schema is up to date")
     if done.created:
+        _say(f"there were no tables; they were created in {sqlite_file(url) or 'the Postgres database'}")
         return
+    _say("the database's schema is up to date")
     if done.applied and done.additive:
         _say("servers of the earlier version can go on, because the upgrade has only added to the tables")
     elif done.applied:

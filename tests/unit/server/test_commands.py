@@ -14,9 +14,9 @@ import pytest
 
 from marey_server import commands
 from marey_server.app import open_database
-from marey_server.errors import StorageFullProblem
+from marey_server.errors import StorageFullProblem, UnavailableProblem
 from marey_server.process.settings import Settings
-from marey_server.store.database.opening import DatabaseUnusable
+from marey_server.store.database.opening import DatabaseUnusable, opening
 from marey_server.store.database.schema import SERVED_FROM
 from marey_server.store.transaction import Transaction
 
@@ -145,6 +145,26 @@ def test_a_database_that_cannot_be_opened_is_told_in_a_sentence_without_its_pass
         command(data=tmp_path, database_url=url)
     assert "sekret" not in str(failed.value)
     assert len(str(failed.value).splitlines()) == 1
+
+
+def test_an_upgrade_of_a_new_database_says_that_it_was_created(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A mistyped data folder is seen, because the database of the right folder existed before."""
+    commands.upgrade(data=tmp_path / "typo")
+    created = f"there were no tables; they were created in {tmp_path / 'typo' / 'marey.db'}\n"
+    assert capsys.readouterr().out == created
+    commands.upgrade(data=tmp_path / "typo")
+    assert capsys.readouterr().out == "the database's schema is up to date\n"
+
+
+def test_an_sqlite_file_on_a_broken_disk_has_no_server_to_start(tmp_path: Path) -> None:
+    with pytest.raises(DatabaseUnusable) as failed, opening(f"sqlite:///{tmp_path}/marey.db"):
+        raise UnavailableProblem("x") from OSError("disk I/O error")
+    assert str(failed.value) == (
+        f"the database {tmp_path}/marey.db cannot be used: disk I/O error; check that its disk works and has free "
+        "space, and that no other program has locked the file"
+    )
 
 
 @pytest.mark.parametrize("command", [start, commands.upgrade])

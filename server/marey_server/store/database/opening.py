@@ -22,12 +22,22 @@ def opening(url: str) -> Iterator[None]:
     """Convert errors in the `with` block, which opens the database at `url`, to `DatabaseUnusable`."""
     try:
         yield
-    except (exc.ArgumentError, ImportError):  # of a url no driver is known for
+    except (exc.ArgumentError, ImportError) as error:  # of a url no driver is known for
+        if isinstance(error, ModuleNotFoundError) and url.startswith("postgresql"):
+            raise DatabaseUnusable(
+                f"a Postgres database needs the package {error.name}, which is not installed; run: "
+                "pip install 'marey[postgres]'"
+            ) from None
         raise DatabaseUnusable(
             "the setting `database_url` is not the URL of a supported database; write "
-            "sqlite:////folder/file.db, or postgresql://user@host/name with the extra `postgres` installed"
+            "sqlite:////folder/file.db, or postgresql://user@host/name"
         ) from None
     except UnavailableProblem as error:
+        if (file := sqlite_file(url)) is not None:
+            raise DatabaseUnusable(
+                f"the database {file} cannot be used: {_reason(error.__cause__)}; check that its disk works and has "
+                "free space, and that no other program has locked the file"
+            ) from error
         raise DatabaseUnusable(
             f"the server of the database {_shown(url)} does not answer: {_reason(error.__cause__)}; start the server "
             "of the database, or correct the setting `database_url`"
