@@ -16,7 +16,7 @@ from typing import Any
 
 from marey_client.credentials import Credential
 from marey_client.errors import MareyError
-from marey_client.extras import import_optional
+from marey_client.extras import import_optional, needing
 from marey_schemas.documents.differences import Difference
 from marey_schemas.lineage import LineageGraph
 from marey_schemas.queue.comparisons import RunComparison
@@ -25,14 +25,14 @@ from marey_schemas.queue.comparisons import RunComparison
 def serve(**settings: Any) -> None:
     """Run a server until it is stopped; settings that are None come from the environment or `marey.toml`."""
     commands = import_optional("marey_server.commands", "server")
-    with _refusals_of(commands):
+    with _refusals_of(commands), needing("server"):
         commands.serve(**_given(settings))
 
 
 def database(action: str, *, data: Path | None, database_url: str | None, **options: Any) -> None:
     """Run the database command `action`, a function of `marey_server.commands`, with the options that are given."""
     commands = import_optional("marey_server.commands", "server")
-    with _refusals_of(commands):
+    with _refusals_of(commands), needing("server"):
         getattr(commands, action)(**_given({"data": data, "database_url": database_url}), **options)
 
 
@@ -80,7 +80,9 @@ def predict_jobs(
 
 def work(credential: Credential, **options: Any) -> None:
     """Run jobs of a server until the worker is stopped."""
-    import_optional("marey_worker.commands", "worker").work(credential, **options)
+    commands = import_optional("marey_worker.commands", "worker")
+    with needing("worker"):
+        commands.work(credential, **options)
 
 
 def draw_difference(difference: Difference, file_type: str) -> bytes:

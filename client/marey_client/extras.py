@@ -6,6 +6,8 @@ The packages are imported only when such a function is called, so that the clien
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 
 from marey_client.errors import MissingPackage
@@ -13,8 +15,15 @@ from marey_client.errors import MissingPackage
 
 def import_optional(module: str, extra: str) -> ModuleType:
     """Import a module. Raises `MissingPackage`, which names the pip extra to install, if a package is missing."""
-    try:
+    with needing(extra):
         return importlib.import_module(module)
+
+
+@contextmanager
+def needing(extra: str) -> Iterator[None]:
+    """Raise `MissingPackage`, which names the pip extra to install, if the `with` block misses a package."""
+    try:
+        yield
     except ModuleNotFoundError as error:
         raise MissingPackage(
             f"this needs the package {error.name}, which is not installed; run: pip install 'marey[{extra}]'"
