@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Any, TypedDict, Unpack
 
+from marey_client.errors import BadArgument
 from marey_client.paging import pages
 from marey_client.transport import Transport
 from marey_schemas.audit import AuditEntry
@@ -29,10 +30,14 @@ class AuditConditions(TypedDict, total=False):
 
 def read_audit(transport: Transport, path: str, **conditions: Unpack[AuditConditions]) -> Iterator[AuditEntry]:
     """List the entries of the audit log at `path` that meet all conditions, newest first."""
-    times = {"since": _text_of(conditions.get("since")), "until": _text_of(conditions.get("until"))}
+    times = {name: _text_of(name, conditions.get(name)) for name in ("since", "until")}
     query: dict[str, Any] = {**conditions, **times}
     return pages(transport, AuditEntry, path, query)
 
 
-def _text_of(moment: datetime | None) -> str | None:
-    return None if moment is None else moment.astimezone().isoformat()
+def _text_of(name: str, moment: object) -> str | None:
+    if moment is None:
+        return None
+    if not isinstance(moment, datetime):
+        raise BadArgument(f"{name}: give a datetime or None, not {moment!r}")
+    return moment.astimezone().isoformat()

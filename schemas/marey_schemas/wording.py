@@ -39,7 +39,7 @@ def one_of(names: Sequence[str]) -> str:
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """Return the known name that is most similar to a misspelt name, ignoring case; None if no name is similar."""
     by_lower = {one.lower(): one for one in known}
-    near = get_close_matches(name.lower(), by_lower, n=1)
+    near = get_close_matches(name.lower(), by_lower, n=1, cutoff=0.65)
     return by_lower[near[0]] if near else None
 
 

@@ -75,7 +75,9 @@ def test_a_misspelt_path_names_the_nearest(lab: ProjectHandle, takes: Path) -> N
         "rwa/walk": "there is no folder 'rwa' in lab; did you mean 'raw'?",
         "rwa": "there is no clip 'rwa' in lab; did you mean 'raw'?",
         "raw": "'raw' is a folder of lab; clips.where('raw') selects the clips in it",
-        "qqqq": "there is no clip 'qqqq' in lab",
+        "qqqq": "there is no clip 'qqqq' in lab; it has raw, skeletons",
+        "raw/qqqq": "there is no clip 'qqqq' in raw; it has walk",
+        "skeletons/walk": "there is no clip 'walk' in skeletons; no clips are directly in it",
     }.items():
         with pytest.raises(NoSuchPath) as told:
             lab.clips[path]

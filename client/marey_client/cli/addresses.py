@@ -93,7 +93,10 @@ def _missing(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -
     """Return the error for an address without an item of these kinds, with the nearest address or other advice."""
     from marey_schemas.kinds import Kind
 
-    if address.path and marey.project(address.project).collections.at(address.path) is not None:
+    if not address.path:
+        marey.project(address.project).read()  # raises the error that names the nearest project
+        return WrongUsage(f"{address} is a project, but this needs the path of an item; `marey ls {address}` lists it")
+    if marey.project(address.project).collections.at(address.path) is not None:
         return WrongUsage(f"{address} is a folder; `marey ls {address}` lists it")
     if address.is_folder:
         what, kinds = "no folder", ()

@@ -79,6 +79,10 @@ class CommandGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Return the name of the command, the command, and its arguments; fail if there is no such command."""
+        if args[0] == "help":
+            ctx.fail(f"No such command 'help'. Type: {' '.join(['marey', *args[1:], '--help'])}")
+        if args[0] not in self.commands and args[0].lower() in self.commands:
+            ctx.fail(f"No such command {args[0]!r}. Type: marey {args[0].lower()}")
         if args[0] not in self.commands and args[0] in OTHER_NAMES:
             ctx.fail(f"No such command {args[0]!r}. Type: marey {OTHER_NAMES[args[0]]}")
         groups = [name for name, one in self.commands.items() if args[0] in getattr(one, "commands", ())]

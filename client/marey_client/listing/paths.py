@@ -10,7 +10,7 @@ from marey_client.paging import pages
 from marey_client.transport import Transport
 from marey_schemas.items import Collection, Item
 from marey_schemas.kinds import Kind
-from marey_schemas.wording import nearest
+from marey_schemas.wording import NAMES_SHOWN, nearest
 
 MOST_COMPARED = 10_000
 """Greatest number of names in a folder with which a misspelt name is compared."""
@@ -37,10 +37,17 @@ def missing_path(transport: Transport, project: str, kind: Kind, path: str) -> s
     if folder and not is_folder(transport, project, folder):
         return _missing_folder(transport, project, folder)
     known = _names_in(transport, project, kind, folder)
-    near = nearest(name, known if folder else [*known, *_folders(transport, project)])
-    place = folder or project
-    hint = f"; did you mean {f'{folder}/{near}'.lstrip('/')!r}?" if near else ""
-    return f"there is no {kind} {name!r} in {place}{hint}"
+    if not folder:
+        known += sorted(_folders(transport, project))
+    near = nearest(name, known)
+    if near:
+        hint = f"did you mean {f'{folder}/{near}'.lstrip('/')!r}?"
+    elif known:
+        more = f" and {len(known) - NAMES_SHOWN:,} more" if len(known) > NAMES_SHOWN else ""
+        hint = f"it has {', '.join(known[:NAMES_SHOWN])}{more}"
+    else:
+        hint = f"no {kind.plural} are directly in it"
+    return f"there is no {kind} {name!r} in {folder or project}; {hint}"
 
 
 def nearest_path(transport: Transport, project: str, path: str, kinds: Iterable[Kind]) -> str | None:

@@ -249,6 +249,8 @@ def _unexpected(text: str, error: Any) -> QueryError:
     expected = one_of([_EXPECTED[name] for name in names if _EXPECTED[name]])
     if token is None or token.type == "$END":
         return QueryError(f"the query ends too early; expected {expected}", len(text.rstrip()) + 1)
+    if text[max(_column(token) - 2, 0) : _column(token)] == "==":
+        return QueryError("write one equals sign, such as subject = 02", _column(token))
     return QueryError(f"expected {expected}, but found {str(token)!r}", _column(token))
 
 

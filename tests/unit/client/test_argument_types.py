@@ -13,9 +13,10 @@ from docs.sdk_source import Sdk
 from tests.support.scripted_server import ScriptedServer
 
 import marey
+from marey_client import embedded
 from marey_client.arguments import Parameters, checks_arguments
 from marey_client.asynchronous.marey import AsyncMarey
-from marey_client.errors import BadArgument
+from marey_client.errors import BadArgument, MissingPackage
 from marey_client.poses.windows import MotionWindows
 from marey_schemas.kinds import Kind
 
@@ -144,3 +145,20 @@ def test_the_async_client_refuses_the_same(script: ScriptedServer) -> None:
 
     asyncio.run(program())
     assert script.requests == []
+
+
+def test_times_of_an_audit_log_are_datetimes(script: ScriptedServer) -> None:
+    options: Any = {"since": "yesterday"}
+    with pytest.raises(BadArgument, match=r"^since: give a datetime or None, not 'yesterday'$"):
+        list(script.marey().audit(**options))
+
+
+def test_a_package_that_a_command_misses_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also a package that the server imports only when it starts."""
+
+    def lacks_tornado(**_settings: Any) -> None:
+        raise ModuleNotFoundError("No module named 'tornado'", name="tornado")
+
+    monkeypatch.setattr("marey_server.commands.serve", lacks_tornado)
+    with pytest.raises(MissingPackage, match=r"the package tornado, .* run: pip install 'marey\[server\]'"):
+        embedded.serve()

@@ -717,6 +717,13 @@ def test_at_a_narrow_terminal_ids_stay_in_one_piece_and_moments_are_told_to_the_
     assert "03:05:58Z" in printed
 
 
+@pytest.mark.parametrize(("typed", "meant"), [(["UPLOAD"], "upload"), (["help", "upload"], "upload --help")])
+def test_capital_letters_and_help_are_answered_with_the_command(typed: list[str], meant: str) -> None:
+    answered = run_here(typed)
+    assert answered.returncode == 2
+    assert f"No such command '{typed[0]}'. Type: marey {meant}\n" in answered.stderr
+
+
 def test_names_of_other_programs_are_answered_with_a_command_that_exists() -> None:
     every_command: Any = typer.main.get_command(app)
     for typed, meant in OTHER_NAMES.items():

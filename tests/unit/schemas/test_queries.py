@@ -96,6 +96,7 @@ def test_conditions_are_read(text: str, expected: object) -> None:
         ('tag = "open', 7, "quotation marks"),
         ("created = 2026-13-01", 11, "not a date"),
         ('name = "a\0b"', 10, "NUL"),
+        ("subject == 02", 10, "write one equals sign, such as subject = 02"),
         ("has tag and " * MOST_CONDITIONS + "has tag", 1, f"at most {MOST_CONDITIONS} conditions"),
         ("has tag" + " " * MOST_CHARACTERS, 1, "characters"),
         ("(" * (DEEPEST + 1) + "has tag" + ")" * (DEEPEST + 1), DEEPEST + 1, "brackets"),

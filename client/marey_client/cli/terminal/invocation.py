@@ -120,6 +120,8 @@ def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Mare
         except NotFound as error:
             if error.code == "no-project" and not error.anonymous:
                 error.add_note(_nearest_project(marey, str(error.context.get("project", ""))))
+            if error.code in _LISTED:
+                error.add_note(_LISTED[error.code])
             if error.code == "not-found" and (path := urlsplit(found.url).path):
                 error.add_note(f"the address of the server, {found.url}, may be right without {path}")
             raise
@@ -127,6 +129,14 @@ def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Mare
             if error.code == "insufficient-scope" and found.origin:
                 error.add_note(f"the token comes from {found.origin}; marey login creates one with all your rights")
             raise
+
+
+_LISTED = {
+    "no-job": "`marey job ls PROJECT` lists the jobs of a project",
+    "no-user": "`marey user ls` lists the users, for administrators",
+    "no-dataset": "`marey dataset ls PROJECT` lists the datasets of a project",
+}
+"""Advice on how to find what does not exist, by the code of the error."""
 
 
 def _nearest_project(marey: Marey, name: str) -> str:
