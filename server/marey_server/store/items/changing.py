@@ -66,8 +66,9 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
     except InvalidProblem as error:
         moved = [found.model_copy(update={"pointer": f"/{part}{found.pointer}"}) for found in error.errors]
         detail = error.detail
-        for old, new in zip(error.errors, moved, strict=True):
-            detail = detail.replace(f"{old.pointer}: {old.detail}", f"{new.pointer}: {new.detail}")
+        if moved:  # the text names the place of the first fault
+            first = error.errors[0]
+            detail = detail.replace(f"{first.pointer}: {first.detail}", f"{moved[0].pointer}: {first.detail}", 1)
         raise InvalidProblem(detail, code=error.error_code, errors=moved, context=error.context) from error
 
 
