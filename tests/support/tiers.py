@@ -152,10 +152,10 @@ def _on_one_database(item: pytest.Item) -> bool:
 def _on_other_database(item: pytest.Item) -> bool:
     """Return whether the tier `test` runs this test only on the other database.
 
-    This concerns fault cases, REST tests, workflows and tests of the server's parts, but not those of SQL that differs
-    between databases, nor those of claims, completions and publications, which have the mark `every_database`. A hash
-    of the name of the test, or of the workflow's module, chooses the database, so about half of these tests run on
-    each. Tests that exist for only one database always run.
+    This concerns fault cases, REST tests, workflows and tests of the server's parts. A hash of the name of the test, or
+    of the workflow's module, chooses the database, so about half of these tests run on each. Tests with the mark
+    `every_database` run on both: those of SQL that differs between databases, of claims, completions and publications,
+    and of parts that the hash would test on one database only. Tests that exist for only one database always run.
     """
     backend = backend_of(item)
     if backend is None or item.get_closest_marker("every_database") or not _on_one_database(item):

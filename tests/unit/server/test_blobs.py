@@ -19,6 +19,8 @@ from marey_server.store import blobs, items, projects
 from marey_server.store.blob_backings import SPOOLED_BYTES, Spool
 from marey_server.store.blobs import GRACE_US
 
+pytestmark = pytest.mark.every_database
+
 FILE = b"HIERARCHY ROOT hips"
 DIGEST = digest_of(FILE)
 

@@ -388,6 +388,7 @@ def run(lab: Lab, known: dict[str, str], count: int, length: int) -> None:
     )  # fmt: skip
 
 
+@pytest.mark.every_database
 def test_a_dataset_behaves_as_its_model(lab: Lab, known_items: dict[str, str]) -> None:
     run(lab, known_items, examples(6, soak=15), steps(30))
 

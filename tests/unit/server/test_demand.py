@@ -3,10 +3,13 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 
+import pytest
 from tests.support.queue_desk import Desk
 
 from marey_server.access.principal import SYSTEM
 from marey_server.store.monitoring.demand import Demand, JobReach, read_demand
+
+pytestmark = pytest.mark.every_database
 
 GPU = {"gpu": "a100", "site": "lyon"}
 

@@ -30,6 +30,8 @@ from marey_server.store.tables import (
     upload,
 )
 
+pytestmark = pytest.mark.every_database
+
 FILE = b"HIERARCHY" * 1000
 
 

@@ -21,6 +21,8 @@ from marey_server.store.fsck import check_store
 from marey_server.store.tables import document, holding, item
 from marey_server.store.transaction import Quotas, Transaction
 
+pytestmark = pytest.mark.every_database
+
 
 def read_rows(database: Database, *tables: sqlalchemy.Table) -> list[Sequence[Any]]:
     with database.engine.connect() as connection:

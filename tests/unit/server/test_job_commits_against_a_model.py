@@ -233,6 +233,7 @@ def run(desk: Desk, count: int, length: int) -> None:
     )  # fmt: skip
 
 
+@pytest.mark.every_database
 def test_jobs_that_commit_behave_as_their_model(desk: Desk) -> None:
     run(desk, examples(3, soak=6), steps(25))
 

@@ -1,10 +1,13 @@
 """Leader election among servers: one leader at a time, and a fence number that grows when the leader changes."""
 
+import pytest
 from tests.support.database_fixtures import AdjustableClock
 
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database.connections import Database
 from marey_server.store.leader import give_up_lead, take_lead
+
+pytestmark = pytest.mark.every_database
 
 TERM_S = 60
 

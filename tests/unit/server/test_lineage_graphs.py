@@ -20,6 +20,8 @@ from marey_server.store.items import Draft, lineage_graphs
 from marey_server.store.items.drafts import Published
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 Edges = Collection[tuple[int, int]]
 
 

@@ -20,6 +20,8 @@ from marey_server.store.credentials.sign_ins import MORE_FOR_MANY, SignInTry, to
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import sign_in_limit
 
+pytestmark = pytest.mark.every_database
+
 PER_MINUTE = 10
 
 

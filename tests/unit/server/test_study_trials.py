@@ -28,6 +28,8 @@ from marey_server.store.database.connections import Database
 from marey_server.store.studies import conducting, judgements, participants, trials
 from marey_server.store.studies.trials import GRACE_US, MOST_TIMEOUTS
 
+pytestmark = pytest.mark.every_database
+
 PARTICIPANTS = declared("POST", "/projects/{project}/{kind}/{item}/participants")
 JUDGEMENTS = declared("GET", "/projects/{project}/{kind}/{item}/judgements")
 SECONDS = 10.0
