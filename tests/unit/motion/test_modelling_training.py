@@ -18,7 +18,7 @@ from marey_motion.alignment.signs import consistent_poses
 from marey_motion.arrays import Flags, Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
-from marey_motion.modelling import reconstruction_kernels
+from marey_motion.modelling import reconstruction_kernels, training
 from marey_motion.modelling.example_groups import ExampleGroups
 from marey_motion.modelling.fpca import Keep, find_components
 from marey_motion.modelling.primitive import MotionPrimitive
@@ -29,10 +29,11 @@ from marey_motion.modelling.splines import SplineBasis
 from marey_motion.modelling.training import TrainedPrimitive, fit_examples, train_primitive
 from marey_motion.modelling.training_warnings import warnings_of
 from marey_motion.modelling.verdict import headline_of, verdict_of
+from marey_motion.skeleton import Skeleton
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_schemas.options.modelling import ModelOptions, Scaling
 
-SCALINGS = ["jacobian", "root_max", "sfpca", "none"]
+SCALINGS: list[Scaling] = ["jacobian", "root_max", "sfpca", "none"]
 QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
 
 
@@ -54,6 +55,19 @@ def test_examples_come_back_from_their_latent_vectors(scaling: str) -> None:
     wanted = [forward_kinematics(aligned.skeleton, one) for one in aligned.poses]
     np.testing.assert_allclose(reached, wanted, atol=5e-3)
     np.testing.assert_allclose(primitive.latents_of(poses, primitive.time_functions(latents)), latents, atol=0.02)
+
+
+def test_only_the_scaling_sfpca_optimises_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    optimised: list[Scaling] = []
+    for scaling in SCALINGS:
+
+        def record(skeleton: Skeleton, *arguments: Any, scaling: Scaling = scaling) -> tuple[Floats, Keep]:
+            optimised.append(scaling)
+            return np.ones(3 + 4 * skeleton.joint_count), Keep(share=0.95)
+
+        monkeypatch.setattr(training, "optimised_weights", record)
+        fit_examples(bending_chains(size=0.02), QUICK.replace(scaling=scaling))
+    assert optimised == ["sfpca"]
 
 
 @pytest.mark.parametrize("copies", [1, 5])
