@@ -122,7 +122,7 @@ class _Container:
         return pointer
 
 
-class _Field(NamedTuple):
+class _RecordField(NamedTuple):
     """Value of a document that is shown as one field, and whether it contains a credential."""
 
     container: _Container | None
@@ -136,17 +136,17 @@ class _Field(NamedTuple):
         return "" if self.container is None else _pointer_to(self.container.pointer, self.key)
 
 
-def _fields(content: Any) -> Iterator[_Field]:
+def _fields(content: Any) -> Iterator[_RecordField]:
     """Yield the fields of a document in its order."""
     if not _is_divided(content) or _is_secret(content):
-        yield _Field(None, "", content, _is_secret(content))
+        yield _RecordField(None, "", content, _is_secret(content))
         return
     open_: list[_Container] = [_Container(None, "", content, searched=True)]
     while open_:
         container = open_[-1]
         for key, value in container.members:
             if not value or isinstance(value, (int, float)):  # no credential; a file may contain a million of these
-                yield _Field(container, key, value, is_secret=False)
+                yield _RecordField(container, key, value, is_secret=False)
                 continue
             is_named = key in container.secrets
             is_secret = container.searched and (has_text(value) if is_named else _is_secret(value))
@@ -154,7 +154,7 @@ def _fields(content: Any) -> Iterator[_Field]:
                 # below the name of a credential, what has no text contains none
                 open_.append(_Container(container, key, value, searched=container.searched and not is_named))
                 break
-            yield _Field(container, key, value, is_secret)
+            yield _RecordField(container, key, value, is_secret)
         else:
             open_.pop()
 
