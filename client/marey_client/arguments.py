@@ -81,7 +81,7 @@ class Parameters:
     @cached_property
     def types(self) -> dict[str, Any]:
         """The type of each parameter; `Any` for `self`, and in place of types that only type checkers import."""
-        known = get_type_hints(self._function, localns=_Names(self._function.__globals__))
+        known = get_type_hints(self._function, localns=_AnnotationNames(self._function.__globals__))
         return {name: known.get(name, Any) for name in inspect.signature(self._function).parameters}
 
     @cached_property
@@ -113,7 +113,7 @@ class Parameters:
                 yield from _reasons(name, value, self.types[declared])
 
 
-class _Names(dict[str, Any]):
+class _AnnotationNames(dict[str, Any]):
     """Names of a module; other names, except those of Python, are `Any`."""
 
     def __missing__(self, name: str) -> Any:
