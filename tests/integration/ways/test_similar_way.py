@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 from tests.support.command_line import CommandLine
 
-from marey_client.errors import Conflict, Invalid, NoSuchPath, NotFound, RequestFailed
+from marey_client.errors import BadArgument, Conflict, Invalid, NoSuchPath, NotFound, RequestFailed
 from marey_client.imports import find_files
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
@@ -98,7 +98,7 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
         lab.similar(walk, (30, 60), metric=superposing)
     with pytest.raises(Invalid, match="no built-in metric 'published/none'"):
         lab.similar(walk, (30, 60), metric="published/none")
-    with pytest.raises(NotFound):
+    with pytest.raises(BadArgument, match="metric: give a MetricHandle, a str or None"):
         lab.similar(walk, (30, 60), metric=cast(Any, walk))
 
     # A mirrored copy of the walk: only a mirrored search sees that it is the same.
