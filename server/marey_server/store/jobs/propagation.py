@@ -153,7 +153,7 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
         tx.execute(statement, [{"of_job": job_id, "left": count} for job_id, count in left.items()])
 
 
-_END_UNRUNNABLE = Prepared(
+_END_UNRUNNABLE = (
     update(job)
     .where(job.c.id == bindparam("of_job"), job.c.state == WAITING)
     .values(
@@ -179,10 +179,11 @@ def _end_unrunnable(tx: Transaction, unrunnable: Sequence[tuple[Row[Any], Ended]
         else Ended(row.id, row.project_id, "failed", row.parent_id, dependency_failure(cause.id, cause.state))
         for row, cause in unrunnable
     ]
-    tx.run_each(
-        _END_UNRUNNABLE,
-        [{"of_job": one.id, "its_state": one.state, "its_failure": one.failure, "now": tx.now_us} for one in ended],
-    )
+    if ended:
+        tx.execute(
+            _END_UNRUNNABLE,
+            [{"of_job": one.id, "its_state": one.state, "its_failure": one.failure, "now": tx.now_us} for one in ended],
+        )
     return [*tasks, *ended]
 
 
