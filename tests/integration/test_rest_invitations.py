@@ -218,7 +218,8 @@ def test_a_validation_error_does_not_repeat_the_code(server: Server) -> None:
 
 def test_an_invitation_cannot_be_accepted_with_a_token_for_one_project(server: Server, owner: httpx.Client) -> None:
     guest = server.client(server.make_user("guest"))
-    for scope in ("write!project=lab", "read"):
+    guest.post("/projects", json={"name": "den"}).raise_for_status()
+    for scope in ("write!project=den", "read"):
         narrow = guest.post("/tokens", json={"name": "narrow", "scopes": [scope]}).json()["secret"]
         code = invite(owner)["code"]
         refused = server.client(narrow).post("/invitations/accept", json={"code": code})

@@ -130,7 +130,7 @@ def test_arrays_are_those_of_the_library_and_only_what_is_asked_for_is_read(
     np.testing.assert_array_equal(clip.contacts(), toes)
     np.testing.assert_array_equal(clip.contacts(frames=slice(30, 45)), toes[30:45])
     assert clip.rotations(joints="Hips", frames=slice(0, 2)).shape == (2, 1, 4)
-    with pytest.raises(ValueError, match="negative bounds"):
+    with pytest.raises(ValueError, match="frames are counted from 0"):
         clip.velocities(frames=slice(0, -5))
     with pytest.raises(NoSuchJoint, match="did you mean 'LeftHand'"):
         clip.positions(joints="lefthand")

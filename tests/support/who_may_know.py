@@ -150,6 +150,28 @@ class Program:
         self.tokens: dict[Caller, str | None] = {CALLERS[0]: None, ROOT: root}
         for user in USERS:
             self.tokens[Caller(user)] = self.people.make_user(user)
+        owners = {
+            name: self.people.client(self.tokens[Caller(user)]) for name, user in zip(PROJECTS, USERS, strict=False)
+        }
+        for (
+            project,
+            owner,
+        ) in owners.items():  # public until tokens for them were made: only a known project can be named
+            made = {"name": project, "description": f"mark-{project}", "visibility": "public"}
+            assert owner.post("/projects", json=made).is_success
+        self._make_tokens()
+        for (project, owner), user in zip(owners.items(), USERS, strict=False):
+            changed = owner.patch(f"/projects/{project}", json={"visibility": "private"}, headers={"If-Match": "*"})
+            assert changed.is_success, changed.text
+            body: dict[str, Any] = {"name": f"mark-{project}-rig", "parts": {"hierarchy": HIERARCHY}}
+            rig = owner.post(f"/projects/{project}/skeletons", json=body)
+            self.skeletons[project] = {"item": rig.json()["id"], "revision": 1}
+            self.world.roles[project, user] = Role.OWNER
+            self._submit_jobs(project)
+        end = update(token).where(token.c.name == EXPIRED.name)
+        self.people.database.write(SYSTEM, lambda tx: tx.execute(end.values(expires_us=tx.now_us)))
+
+    def _make_tokens(self) -> None:
         for caller in CALLERS:
             if caller not in self.tokens and caller not in ATTEMPTS.values():
                 bound = f"!project={caller.bound}" if caller.bound else ""
@@ -157,16 +179,6 @@ class Program:
                 wanted = {"name": caller.name, "scopes": [scope + bound for scope in caller.scopes]}
                 made = self.people.client(self.tokens[maker]).post("/tokens", json=wanted)
                 self.tokens[caller] = made.json()["secret"]
-        for project, user in zip(PROJECTS, USERS, strict=False):
-            owner = self.people.client(self.tokens[Caller(user)])
-            assert owner.post("/projects", json={"name": project, "description": f"mark-{project}"}).is_success
-            body: dict[str, Any] = {"name": f"mark-{project}-rig", "parts": {"hierarchy": HIERARCHY}}
-            made = owner.post(f"/projects/{project}/skeletons", json=body)
-            self.skeletons[project] = {"item": made.json()["id"], "revision": 1}
-            self.world.roles[project, user] = Role.OWNER
-            self._submit_jobs(project)
-        end = update(token).where(token.c.name == EXPIRED.name)
-        self.people.database.write(SYSTEM, lambda tx: tx.execute(end.values(expires_us=tx.now_us)))
 
     def _submit_jobs(self, project: str) -> None:
         """Submit two jobs with marks and claim them; one attempt continues, the other ends."""
