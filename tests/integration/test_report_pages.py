@@ -8,7 +8,7 @@ from typing import Any
 
 import httpx
 import pytest
-from tests.support.every_report import ORIGIN, evaluation_page, write_every_report
+from tests.support.every_report import ORIGIN, REPORTS, evaluation_page, write_reports
 from tests.support.rest_server import Server, stored_file
 from tests.support.tiers import chromium, is_soak
 from tests.support.vitest_runs import run_vitest
@@ -44,8 +44,7 @@ def stored_evaluation(owner: httpx.Client, page: str) -> str:
 def test_every_report_fits_every_screen_and_plays_its_motion(
     server: Server, owner: httpx.Client, tmp_path: Path
 ) -> None:
-    names = list(write_every_report(tmp_path))
-    shown = names if is_soak() else names[::REPORT_STEP]
+    shown = list(write_reports(tmp_path, list(REPORTS)[:: 1 if is_soak() else REPORT_STEP]))
     answer = owner.get(f"{stored_evaluation(owner, evaluation_page())}/report")
     assert answer.status_code == 200
     assert len(answer.content) < MOST_PAGE_BYTES

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
@@ -149,26 +149,29 @@ def _runs() -> str:
     return draw_comparison(compared_of(runs, curves, goals={"loss": "lowest"}), "html").decode()
 
 
-def write_every_report(folder: Path) -> Mapping[str, Path]:
-    """Write a page of every kind, with its origin; return the paths by the names of the kinds."""
-    pages = {
-        "evaluation": evaluation_page(),
-        "comparison": _two(),
-        "several": _several(),
-        "model": _model(),
-        "distances": _distances(),
-        "study": _study(),
-        "quality": _quality(folder),
-        "runs": _runs(),
-    }
+REPORTS: dict[str, Callable[[Path], str]] = {
+    "evaluation": lambda _folder: evaluation_page(),
+    "comparison": lambda _folder: _two(),
+    "several": lambda _folder: _several(),
+    "model": lambda _folder: _model(),
+    "distances": lambda _folder: _distances(),
+    "study": lambda _folder: _study(),
+    "quality": _quality,
+    "runs": lambda _folder: _runs(),
+}
+"""Functions that render a report of each kind; the argument is a folder for temporary files."""
+
+
+def write_reports(folder: Path, kinds: Iterable[str] = tuple(REPORTS)) -> Mapping[str, Path]:
+    """Write a report of each of these kinds, with its origin; return the paths by kind."""
     paths = {}
-    for name, page in pages.items():
-        paths[name] = folder / f"{name}.html"
-        paths[name].write_bytes(with_origin(page.encode(), ORIGIN))
+    for kind in kinds:
+        paths[kind] = folder / f"{kind}.html"
+        paths[kind].write_bytes(with_origin(REPORTS[kind](folder).encode(), ORIGIN))
     return MappingProxyType(paths)
 
 
 if __name__ == "__main__":
     Path(sys.argv[1]).mkdir(parents=True, exist_ok=True)
-    for written in write_every_report(Path(sys.argv[1])).values():
+    for written in write_reports(Path(sys.argv[1])).values():
         print(written, written.stat().st_size)

@@ -7,7 +7,7 @@ from tests.support import tiers
 from tests.support.tiers import EXAMPLES, TIERS, examples
 
 
-@pytest.mark.parametrize(("tier", "drawn"), [("check", (10, 10)), ("test", (50, 50)), ("soak", (200, 600))])
+@pytest.mark.parametrize(("tier", "drawn"), [("check", (10, 10)), ("test", (25, 25)), ("soak", (200, 600))])
 def test_only_the_tier_soak_multiplies_the_number_that_is_given_for_it(
     tier: str, drawn: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
