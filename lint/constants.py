@@ -6,7 +6,6 @@ Leading underscores of names do not count, and `1 << 20` and `1048576` are the s
 from __future__ import annotations
 
 import ast
-import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from operator import add, floordiv, lshift, mul, sub, truediv
@@ -18,11 +17,10 @@ _CALCULATIONS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Add: add, ast.Sub: sub, ast.Mult: mul, ast.Div: truediv, ast.FloorDiv: floordiv, ast.Pow: pow,
     ast.LShift: lshift,
 }  # fmt: skip
-_NUMBER = re.compile(r"-?[\d.]+(?:e[-+]?\d+)?")
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Yield the constants that another module declares with the same name and the same literal value."""
+    """Yield the constants that another module declares with the same name and the same value."""
     found: dict[tuple[str, str], list[tuple[Module, int]]] = defaultdict(list)
     for module in house.modules.values():
         for name, value, line in _constants(module.tree):
@@ -54,16 +52,27 @@ def _pairs(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.expr, ast.ex
 
 def _value(node: ast.expr) -> str:
     """Return the value of a literal, or of a calculation with numbers; empty if it is something else."""
+    if (number := _number(node)) is not None:
+        return repr(number)
     match node:
         case ast.Name(id=name) if name.isupper():
             return name
-        case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _CALCULATIONS:
-            a, b = _value(left), _value(right)
-            is_known = _NUMBER.fullmatch(a) and _NUMBER.fullmatch(b)
-            return repr(_CALCULATIONS[type(operator)](ast.literal_eval(a), ast.literal_eval(b))) if is_known else ""
         case ast.Call(func=ast.Name(id="frozenset"), args=[elements]):
             return f"frozenset({known})" if (known := _value(elements)) else ""
     try:
         return repr(ast.literal_eval(node))
     except (ValueError, TypeError):  # TypeError: a list as a key
         return ""
+
+
+def _number(node: ast.expr) -> Any:
+    """Return the number that a literal or a calculation with numbers gives; None if it is something else."""
+    match node:
+        case ast.Constant(value=int() | float() as number):
+            return number
+        case ast.UnaryOp(op=ast.USub(), operand=operand) if (number := _number(operand)) is not None:
+            return -number
+        case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _CALCULATIONS:
+            numbers = _number(left), _number(right)
+            return None if None in numbers else _CALCULATIONS[type(operator)](*numbers)
+    return None
