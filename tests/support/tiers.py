@@ -286,7 +286,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if unset := [name for name in (CLUSTER_VARIABLE, CLUSTER_IMAGE_VARIABLE) if name not in os.environ]:
         reasons = {f"need a Kubernetes cluster ({' and '.join(unset)} not set)": _needs_cluster, **reasons}
     config.stash[ON_DATABASES] = Counter(_without_backend(item) for item in items if backend_of(item))
-    config.stash[CASES] = _cases(items)
+    config.stash[CASES] = cases_of(items)
     kept, gone = [], []
     for item in items:
         reason = next((reason for reason, applies in reasons.items() if applies(item)), None)
@@ -301,7 +301,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = _in_order(kept)
 
 
-def _cases(items: Sequence[pytest.Item]) -> dict[str, list[str]]:
+def cases_of(items: Sequence[pytest.Item]) -> dict[str, list[str]]:
     """Return the names of the cases of each test with the mark `every_nth`, by the name of the test."""
     cases: defaultdict[str, dict[str, None]] = defaultdict(dict)
     for item in items:
