@@ -34,6 +34,7 @@ class Api:
 
     def __init__(self) -> None:
         self.logs = threading.Event()
+        self.asked = threading.Event()
         self.log = b""
         self.uploads = 0
         self.completed: list[CompleteRequest] = []
@@ -43,6 +44,7 @@ class Api:
 
     def append_log(self, offset: int, piece: bytes) -> LogAnswer:
         self.uploads += 1
+        self.asked.set()
         assert self.logs.wait(2 * PATIENCE_S)
         self.log = self.log[:offset] + piece
         return LogAnswer(offset=len(self.log))
@@ -58,10 +60,11 @@ class Api:
 
 
 class Child:
-    """Simulated child that prints for a while, then reads a blob, and then ends."""
+    """Simulated child that prints until its log is being uploaded, then reads a blob, and then ends."""
 
-    def __init__(self, silent_rounds: int) -> None:
-        self.rounds = silent_rounds
+    def __init__(self, rounds: int, uploading: threading.Event) -> None:
+        self.rounds = rounds
+        self.uploading = uploading
         self.asked = 0.0
         self.replies: list[Any] = []
         self.log: Path | None = None
@@ -82,6 +85,7 @@ class Child:
                 file.write(b"a line\n")
             return None
         if not self.asked:
+            assert self.uploading.wait(PATIENCE_S)
             self.asked = time.monotonic()
             return pack(ReadBlob(1, "sha256:0"))
         if self.replies or time.monotonic() - self.asked > PATIENCE_S:
@@ -94,7 +98,8 @@ def test_inputs_are_read_while_the_server_does_not_take_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(attempt, "LOG_EVERY_S", 0.0)
-    api, child = Api(), Child(silent_rounds=20)
+    api = Api()
+    child = Child(20, api.asked)
     cache = InputCache(tmp_path, 1 << 20)
     running = RunningAttempt(cast(AttemptApi, api), LEASE, cache, "here", threading.Event(), threads=1)
     end = running.run(cast(ChildProcess, child))
