@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
 from marey_client.cli.datasets.combining import Decisions, _print_result
+from marey_client.cli.datasets.proposals import _decided
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_schemas.datasets.merges import EntryConflict, MergeAnswer, Resolution, Side
 from marey_schemas.kinds import Kind
 
+if TYPE_CHECKING:
+    from marey_client.handles.proposals import ProposalHandle
+    from marey_client.handles.versions import DatasetHandle
+
 ROUND = 40
 """Greatest number of conflicts in an answer of the pretended server."""
+HEAD = "sha256:" + "2" * 64
 
 
 def conflict(number: int, reason: str = "") -> EntryConflict:
@@ -81,3 +89,36 @@ def test_a_hundred_conflicts_are_a_table_and_a_count(capsys: pytest.CaptureFixtu
 def test_an_unknown_side_is_refused() -> None:
     with pytest.raises(WrongUsage, match="write ours, theirs, base"):
         Decisions([], "mine").complete(lambda _resolutions: answer([]))
+
+
+class Proposed:
+    """Simulated dataset whose first proposal has three conflicts."""
+
+    def __init__(self) -> None:
+        self.conflicts = [conflict(number) for number in range(3)]
+        self.previewed: list[tuple[str, str, bool]] = []
+        self.reads = 0
+
+    def merge(
+        self, version: str, *, into: str, resolutions: Sequence[Resolution] = (), preview: bool = False
+    ) -> MergeAnswer:
+        self.previewed.append((version, into, preview))
+        return left(resolutions, self.conflicts)
+
+    def read(self) -> Any:
+        self.reads += 1
+        return SimpleNamespace(head=HEAD, target="main")
+
+
+def test_the_conflicts_of_the_newest_proposed_commit_are_decided() -> None:
+    on = Proposed()
+    decided, seen = _decided(cast("DatasetHandle", on), cast("ProposalHandle", on), Decisions([], "ours"))
+    assert [(one.path, one.take) for one in decided] == [(one.path, Side.OURS) for one in on.conflicts]
+    assert seen == HEAD
+    assert set(on.previewed) == {(HEAD, "main", True)}
+
+
+def test_decisions_without_others_need_no_look_at_the_proposal() -> None:
+    on = Proposed()
+    assert _decided(cast("DatasetHandle", on), cast("ProposalHandle", on), Decisions([], None)) == ([], None)
+    assert (on.reads, on.previewed) == (0, [])

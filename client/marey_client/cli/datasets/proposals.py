@@ -9,7 +9,9 @@ import typer
 from marey_client.cli.datasets.combining import (
     Base,
     CommitMessage,
+    Decisions,
     Into,
+    Others,
     Ours,
     Theirs,
     conflicts_printed,
@@ -23,6 +25,11 @@ from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Ve
 from marey_schemas.kinds import Kind
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from marey_client.handles.proposals import ProposalHandle
+    from marey_client.handles.versions import DatasetHandle
+    from marey_schemas.datasets.merges import MergeAnswer, Resolution
     from marey_schemas.datasets.proposals import Comment, Proposal, ProposalDetail
 
 proposal = typer.Typer(
@@ -259,6 +266,7 @@ def merge(
     ours: Ours = None,
     theirs: Theirs = None,
     base: Base = None,
+    others: Others = None,
     when_green: Annotated[
         bool,
         typer.Option(
@@ -273,20 +281,39 @@ def merge(
     """Merge a proposal into its target. If the proposal cannot be merged yet, the command lists the reasons.
 
     If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
-    --ours, --theirs or --base, or resolved by a commit to the source. The exit status is 1 while a conflict is left.
+    --ours, --theirs, --base or --others, or resolved by a commit to the source. The exit status is 1 while a conflict
+    is left.
     """
     at = parse(place)
     if withdraw:
-        refuse_ignored(context, "with --withdraw", "message", "commit", "ours", "theirs", "base", "when_green")
+        refuse_ignored(
+            context, "with --withdraw", "message", "commit", "ours", "theirs", "base", "others", "when_green"
+        )
+    choices = Decisions(resolutions_of(ours, theirs, base), others)
     with connect(context) as marey:
-        handle = at.on(marey).proposals.at(number)
+        on = at.on(marey)
+        handle = on.proposals.at(number)
         if withdraw:
             found = handle.withdraw_merge()
         else:
-            resolutions = resolutions_of(ours, theirs, base)
+            resolutions, seen = _decided(on, handle, choices)
             with conflicts_printed(into="the target", as_json=as_json):
-                found = handle.merge(message=message, resolutions=resolutions, when_green=when_green, commit=commit)
+                found = handle.merge(
+                    message=message, resolutions=resolutions, when_green=when_green, commit=commit or seen
+                )
     return print_json(found) if as_json else print_message(_outcome(found))
+
+
+def _decided(on: DatasetHandle, handle: ProposalHandle, choices: Decisions) -> tuple[Sequence[Resolution], str | None]:
+    """Return a decision for each conflict, and the proposed commit whose conflicts were looked at, if they were."""
+    if choices.others is None:
+        return choices.given, None
+    found = handle.read()
+
+    def preview(resolutions: Sequence[Resolution]) -> MergeAnswer:
+        return on.merge(found.head, into=found.target, resolutions=resolutions, preview=True)
+
+    return choices.complete(preview), found.head
 
 
 def _outcome(found: Proposal) -> str:
