@@ -60,6 +60,7 @@ class TestSlurmLauncher(LauncherContract):
         engine.do(launcher.stop((name,)))
         engine.until_ended(name)
 
+    @pytest.mark.soak
     def test_a_worker_that_waits_for_a_node_is_starting_and_never_runs_after_a_stop(self, engine: Engine) -> None:
         names = engine.start(CPUS + 1, key="k12")
         engine.until(lambda: sorted(engine.states()[name] for name in names) == ["running"] * CPUS + ["starting"])
@@ -81,6 +82,7 @@ class TestSlurmLauncher(LauncherContract):
         engine.until_ended(name)
         assert engine.end_of(name).reason == "stopped"
 
+    @pytest.mark.soak
     def test_a_task_that_slurm_runs_again_works_under_the_same_name(
         self, engine: Engine, cluster: SlurmCluster, tmp_path: Path
     ) -> None:
@@ -115,6 +117,7 @@ class TestSlurmLauncher(LauncherContract):
         cluster.start_controller()
         assert engine.states()[name] == "running"
 
+    @pytest.mark.soak
     def test_the_workers_of_a_pool_outlive_their_server_and_work_for_the_next(
         self, cluster: SlurmCluster, tmp_path: Path
     ) -> None:

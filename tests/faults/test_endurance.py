@@ -52,6 +52,7 @@ def trial(tmp_path: Path) -> Trial:
     return run
 
 
+@pytest.mark.soak
 def test_jobs_under_faults_have_the_results_of_a_quiet_run(trial: Trial) -> None:
     done = trial("faults", "--rounds", "10", "--seconds", "8", "--every", "0.7", "--workers", "3")
     assert done.status == 0, done.output[-6000:]

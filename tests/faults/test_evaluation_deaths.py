@@ -119,6 +119,7 @@ def test_a_worker_killed_at_four_fifths_costs_only_the_tasks_it_was_at(
     assert undisturbed.item.revision == 1
 
 
+@pytest.mark.soak
 def test_one_worker_and_two_make_the_same_bytes(
     marey: Marey, lab: ProjectHandle, start_worker: Callable[[str], WorkerProcess]
 ) -> None:
@@ -132,6 +133,7 @@ def test_one_worker_and_two_make_the_same_bytes(
     assert workers_of(marey, lab, job) == {"one", "two"}
 
 
+@pytest.mark.soak
 def test_a_cancelled_evaluation_leaves_nothing_and_is_done_again_from_where_it_was(
     marey: Marey, lab: ProjectHandle, start_worker: Callable[[str], WorkerProcess]
 ) -> None:

@@ -101,6 +101,7 @@ def test_a_hostile_client_is_refused_and_changes_nothing_and_the_server_stays_we
     assert newcomer.get("/projects/lab").status_code == 200
 
 
+@pytest.mark.soak
 def test_two_hundred_hostile_connections_leave_no_fault(attacked: Attacked) -> None:
     outsiders = [shot for shot in shots(attacked.house, OUTSIDERS) if shot.refusal]
     outcomes = asyncio.run(fire_all(attacked.process.url, some(outsiders, SHOTS, SEED), 200))

@@ -100,6 +100,7 @@ def state_of(pod: Document) -> Document | None:
     return next((one["state"] for one in pod["status"].get("containerStatuses", ())), None)
 
 
+@pytest.mark.soak
 def test_workers_survive_the_server_and_a_silent_cluster(
     cluster: StubCluster, server: ServerProcess, tmp_path: Path
 ) -> None:
@@ -122,6 +123,7 @@ def test_workers_survive_the_server_and_a_silent_cluster(
     server.check_database()
 
 
+@pytest.mark.soak
 def test_two_pods_of_one_job_do_its_work_once(cluster: StubCluster, server: ServerProcess, tmp_path: Path) -> None:
     cluster.controllers.duplicates = True
     server.start()
@@ -134,6 +136,7 @@ def test_two_pods_of_one_job_do_its_work_once(cluster: StubCluster, server: Serv
     server.check_database()
 
 
+@pytest.mark.soak
 def test_a_pod_that_exits_with_status_0_has_not_completed_its_job(
     cluster: StubCluster, server: ServerProcess, tmp_path: Path
 ) -> None:

@@ -277,6 +277,7 @@ def test_a_job_of_a_killed_worker_is_finished_by_another_with_one_result(
     server.check_database()
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("place", ["after_claim@2", "before_complete@2"])
 def test_jobs_of_a_worker_killed_while_it_stores_one_and_runs_another_are_published_once(
     server: ServerProcess,
@@ -300,6 +301,7 @@ def test_jobs_of_a_worker_killed_while_it_stores_one_and_runs_another_are_publis
     server.check_database()
 
 
+@pytest.mark.soak
 def test_a_server_killed_while_a_worker_stores_one_job_and_runs_another_publishes_each_once(
     server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
 ) -> None:
@@ -318,6 +320,7 @@ def test_a_server_killed_while_a_worker_stores_one_job_and_runs_another_publishe
     server.check_database()
 
 
+@pytest.mark.soak
 def test_a_worker_that_slept_with_one_job_stored_and_another_running_publishes_neither_again(
     server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
 ) -> None:
@@ -396,6 +399,7 @@ def test_a_lost_answer_to_a_claim_is_asked_for_again(
     server.check_database()
 
 
+@pytest.mark.soak
 def test_a_worker_cut_off_from_the_server_loses_its_job_to_another(
     server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
 ) -> None:

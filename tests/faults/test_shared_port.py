@@ -235,6 +235,7 @@ def keepers_of_workers(server: SharingServer) -> list[psutil.Process | None]:
     return []
 
 
+@pytest.mark.soak
 def test_processes_are_replaced_without_a_failed_request(server: SharingServer) -> None:
     before = {one.pid for one in server.modules(PROGRAM)}
     replaced = server.logged("all server processes are replaced")
@@ -247,6 +248,7 @@ def test_processes_are_replaced_without_a_failed_request(server: SharingServer) 
     assert not after & before
 
 
+@pytest.mark.soak
 def test_processes_that_are_not_forked_share_the_port_and_end_when_their_parent_is_killed(
     tmp_path: Path, postgres_url: URL
 ) -> None:

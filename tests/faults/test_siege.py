@@ -178,6 +178,7 @@ def processes(tmp_path: Path, database_url: str) -> Iterator[tuple[list[ServerPr
         process.stop()
 
 
+@pytest.mark.soak
 def test_two_servers_and_workers_that_are_killed_and_stopped_publish_each_job_once(
     tmp_path: Path, processes: tuple[list[ServerProcess], list[WorkerProcess]]
 ) -> None:

@@ -121,6 +121,7 @@ def test_the_job_of_a_killed_worker_is_done_by_the_next_task(
     wait_until(lambda: "ended: killed, status -9" in server.log.read_text())
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("place", ["claim.after_commit", "complete.before_commit", "complete.after_commit"])
 def test_workers_complete_their_jobs_at_the_server_that_replaces_a_killed_one(
     server: QuickPoolsServer, place: str
@@ -143,6 +144,7 @@ def sleeper_among(marey: Marey, jobs: list[Job]) -> list[tuple[Job, psutil.Proce
     return [(job, worker) for job, worker in running if worker.status() == psutil.STATUS_STOPPED]
 
 
+@pytest.mark.soak
 def test_a_worker_that_slept_through_its_lease_is_refused(
     cluster: SlurmCluster, tmp_path: Path, database_url: str
 ) -> None:
@@ -169,6 +171,7 @@ def test_a_worker_that_slept_through_its_lease_is_refused(
         close(server, cluster)
 
 
+@pytest.mark.soak
 def test_a_worker_that_exits_with_status_0_has_not_completed_its_job(server: QuickPoolsServer, tmp_path: Path) -> None:
     (tmp_path / "lies.py").write_text(LIES)
     first_differs(tmp_path, f'exec {sys.executable} {tmp_path / "lies.py"} "$@"')
@@ -182,6 +185,7 @@ def test_a_worker_that_exits_with_status_0_has_not_completed_its_job(server: Qui
     server.check_database()
 
 
+@pytest.mark.soak
 def test_a_job_goes_on_while_the_node_daemon_is_dead(cluster: SlurmCluster, server: QuickPoolsServer) -> None:
     with started(server) as marey:
         job = submit(marey, seconds=3)
@@ -195,6 +199,7 @@ def test_a_job_goes_on_while_the_node_daemon_is_dead(cluster: SlurmCluster, serv
         check_published_once(server, marey)
 
 
+@pytest.mark.soak
 def test_a_worker_that_dies_without_a_controller_is_replaced_when_there_is_one_again(
     cluster: SlurmCluster, server: QuickPoolsServer
 ) -> None:
@@ -211,6 +216,7 @@ def test_a_worker_that_dies_without_a_controller_is_replaced_when_there_is_one_a
         check_published_once(server, marey)
 
 
+@pytest.mark.soak
 def test_the_job_of_a_suspended_worker_whose_task_slurm_runs_again_is_published_once(
     cluster: SlurmCluster, server: QuickPoolsServer
 ) -> None:

@@ -60,6 +60,7 @@ EXPECTED = (
 """Texts, each of which must occur in a name that a long run counts; otherwise the run would test too little."""
 
 
+@pytest.mark.every_nth(2)
 @pytest.mark.every_database
 def test_nothing_that_several_users_do_on_two_servers_diverges_from_the_model(
     databases: Databases, tmp_path: Path

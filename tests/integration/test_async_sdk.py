@@ -101,6 +101,7 @@ def test_real_takes_become_clips_whose_arrays_are_those_of_the_synchronous_clien
     run(program)
 
 
+@pytest.mark.soak
 @pytest.mark.usefixtures("token")
 def test_two_hundred_reads_at_a_time_give_what_one_after_another_gives(takes: Path) -> None:
     lab = marey.connect().project("lab")

@@ -143,6 +143,7 @@ def test_lists_that_have_no_filter_are_read_to_their_end(shell: Shell, server: S
         assert shell("marey dataset diff lab/gaits@v") == ["lab/gaits@v1"]
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize(
     "line",
     [

@@ -86,6 +86,7 @@ def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(
         assert "</html>" in page.read()
 
 
+@pytest.mark.soak
 def test_a_run_with_other_files_reports_on_these_alone(
     first: tuple[Path, Printed], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

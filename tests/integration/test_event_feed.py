@@ -99,6 +99,7 @@ def test_a_follower_continues_on_a_copy_of_the_database_elsewhere(lab: Lab, tmp_
     assert [one.seq for one in following] == sorted({one.seq for one in following})
 
 
+@pytest.mark.soak
 def test_a_server_on_a_copy_serves_everything_and_its_followers_continue(
     server: Server, database: Database, tmp_path: Path
 ) -> None:

@@ -126,6 +126,7 @@ def test_known_flaws_are_found(collection: Collection) -> None:
     assert "unit-inferred" in codes("rigs/quadruped/dog_run.bvh")
 
 
+@pytest.mark.soak
 def test_written_bvh_puts_every_joint_where_another_loader_saw_it_in_the_original(
     collection: Collection, tmp_path: Path
 ) -> None:

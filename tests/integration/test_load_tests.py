@@ -48,6 +48,7 @@ def test_every_job_is_counted_and_nothing_is_left_behind(marey: Marey) -> None:
     assert left_behind(marey) == []
 
 
+@pytest.mark.soak
 def test_jobs_of_other_projects_are_not_claimed(marey: Marey) -> None:
     with scratch_project(marey) as other:
         waiting = marey.transport.send(
@@ -60,6 +61,7 @@ def test_jobs_of_other_projects_are_not_claimed(marey: Marey) -> None:
         assert (job.state, job.fence) == ("queued", 0)
 
 
+@pytest.mark.soak
 def test_the_scratch_project_is_removed_after_ctrl_c_and_its_jobs_are_cancelled(marey: Marey) -> None:
     jobs: list[str] = []
 

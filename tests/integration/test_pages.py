@@ -217,6 +217,7 @@ def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_pat
     run_vitest("browser", "browser/pages.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
 
 
+@pytest.mark.soak
 @pytest.mark.chromium
 def test_a_page_from_disk_plays_its_motions_without_a_request(
     shown: tuple[Server, httpx.Client], tmp_path: Path
@@ -241,6 +242,7 @@ def test_a_page_from_disk_plays_its_motions_without_a_request(
     run_vitest("browser", "browser/player.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
 
 
+@pytest.mark.soak
 @pytest.mark.chromium
 def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded(
     shown: tuple[Server, httpx.Client], tmp_path: Path

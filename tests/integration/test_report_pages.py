@@ -21,7 +21,7 @@ pytestmark = pytest.mark.timeout(900)
 
 MOST_PAGE_BYTES = 4_000_000
 """Greatest size of the report of the evaluation of a few takes, with the player and two trials."""
-OPENED = ("evaluation", "model", "runs")
+OPENED = ("evaluation",)
 """Reports that the tier `test` opens; the tier `soak` opens all. Each is opened three times."""
 
 

@@ -130,6 +130,7 @@ def restored(database_url: str, data: Path, folder: Path) -> Iterator[Callable[[
         yield restore
 
 
+@pytest.mark.soak
 def test_a_backup_under_load_is_restored_with_everything_that_was_confirmed_before_it(
     database_url: str,
     tmp_path: Path,

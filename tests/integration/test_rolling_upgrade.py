@@ -215,6 +215,7 @@ class Visitors:
             blobs.send_in_pieces(marey.transport, self._file, digest_of_file(self._file))
 
 
+@pytest.mark.soak
 def test_no_client_with_retries_sees_a_failure_while_servers_are_replaced(
     database_url: str, following: NextVersion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -44,8 +44,8 @@ EXAMPLES, STEPS = 100, 50
 """Number of examples that Hypothesis draws, and of steps that a state machine takes, for an effort of 1."""
 SOAK_EFFORT = 4
 """Effort of the tier `soak`, unless `--effort` gives another one."""
-
-
+EVERY_NTH_FAULT = 3
+"""Of the cases of a test in `tests/faults`, all tiers but `soak` run every third, unless the test has `every_nth`."""
 LONGEST_STEPS = 2
 """Greatest factor by which a tier increases `STEPS`; running more state machines finds more than longer runs."""
 
@@ -167,12 +167,15 @@ def _on_other_database(item: pytest.Item) -> bool:
 
 
 def _other_case(item: pytest.Item) -> bool:
-    """Return whether only the tier `soak` runs this case, because its test has the mark `every_nth` and many cases."""
+    """Return whether only the tier `soak` runs this case of a test with several cases."""
+    every = _every_nth(item)
+    return every > 1 and item.config.stash[CASES][function_of(item)].index(_without_backend(item)) % every > 0
+
+
+def _every_nth(item: pytest.Item) -> int:
+    """Return n if all tiers but `soak` run every n-th case of a test, by its mark `every_nth` or as a fault case."""
     marker = item.get_closest_marker("every_nth")
-    return (
-        marker is not None
-        and item.config.stash[CASES][function_of(item)].index(_without_backend(item)) % marker.args[0] > 0
-    )
+    return marker.args[0] if marker else EVERY_NTH_FAULT if _fault(item) else 1
 
 
 TIERS = {
@@ -204,7 +207,7 @@ LEFT_OUT = pytest.StashKey[Counter[str]]()
 ON_DATABASES = pytest.StashKey[Counter[str]]()
 """Key of the number of databases on which a test can run, by its name without the database."""
 CASES = pytest.StashKey[dict[str, list[str]]]()
-"""Key of the names of the cases of each test with the mark `every_nth`, without the database, in their order."""
+"""Key of the names of the cases of each test of which some tiers run a part, without the database, in their order."""
 
 
 def examples(count: int, soak: int | None = None) -> int:
@@ -302,10 +305,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def cases_of(items: Sequence[pytest.Item]) -> dict[str, list[str]]:
-    """Return the names of the cases of each test with the mark `every_nth`, by the name of the test."""
+    """Return the names of the cases of each test of which some tiers run a part, by the name of the test."""
     cases: defaultdict[str, dict[str, None]] = defaultdict(dict)
     for item in items:
-        if item.get_closest_marker("every_nth"):
+        if _every_nth(item) > 1:
             cases[function_of(item)][_without_backend(item)] = None
     return {function: list(names) for function, names in cases.items()}
 

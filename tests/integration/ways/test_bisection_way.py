@@ -80,6 +80,7 @@ def short(commit: Commit) -> str:
     return commit.digest.partition(":")[2][:12]
 
 
+@pytest.mark.soak
 def test_the_version_that_spoiled_the_offset_is_named(
     lab: ProjectHandle, gaits: DatasetHandle, run: CommandLine
 ) -> None:
@@ -123,6 +124,7 @@ def test_the_commands_and_the_program_of_the_page_find_the_version(
     assert told[1] == "Drop the left turns"
 
 
+@pytest.mark.soak
 def test_versions_of_clips_that_were_deleted_since_are_evaluated(
     lab: ProjectHandle, gaits: DatasetHandle, run: CommandLine
 ) -> None:
@@ -148,6 +150,7 @@ def test_clips_are_loops_in_the_versions_that_have_their_tag(
     assert loops == {"v1": [], "main": [clip.path]}
 
 
+@pytest.mark.soak
 def test_a_merged_branch_is_searched_unless_only_first_parents_are_followed(
     lab: ProjectHandle, gaits: DatasetHandle
 ) -> None:
@@ -182,6 +185,7 @@ def test_versions_that_cannot_be_evaluated_are_skipped(gaits: DatasetHandle, run
     assert "skipped: " in done.stderr
 
 
+@pytest.mark.soak
 def test_an_interrupted_search_is_continued_by_the_same_command(
     lab: ProjectHandle, gaits: DatasetHandle, run: CommandLine, marey: Marey
 ) -> None:
@@ -243,6 +247,7 @@ def test_wrong_options_are_refused_before_anything_is_evaluated(
     assert list(lab.jobs()) == []
 
 
+@pytest.mark.soak
 def test_a_change_within_its_interval_is_called_possible_noise(gaits: DatasetHandle, run: CommandLine) -> None:
     spoiled = spoil(gaits)
     # At 1.3 m/s, the fast walk is used by some replicates only.

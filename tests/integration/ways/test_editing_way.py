@@ -106,6 +106,7 @@ def test_a_job_is_repeated_from_its_record_and_its_results_are_compared(
     assert "wrote new revisions of its inputs" in run("job", "rerun", in_place.id, status=2).stderr
 
 
+@pytest.mark.soak
 def test_a_job_whose_clips_were_distributed_over_tasks_is_repeated(
     marey: Marey, lab: ProjectHandle, run: CommandLine, tmp_path: Path
 ) -> None:

@@ -154,6 +154,7 @@ def test_the_normaliser_of_another_evaluation_can_be_used(lab: ProjectHandle) ->
     assert first.id in {edge.item for edge in pinned.lineage().inputs}
 
 
+@pytest.mark.soak
 def test_courses_and_takes_are_simulated_drawn_and_compared(
     lab: ProjectHandle, run: CommandLine, tmp_path: Path
 ) -> None:

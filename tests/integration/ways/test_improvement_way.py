@@ -32,6 +32,7 @@ def evaluated(lab: ProjectHandle, clips: Any = "walks", **options: Any) -> Evalu
     return lab.evaluation(lab.evaluate(clips, **{**SMALL, **options}))
 
 
+@pytest.mark.soak
 def test_without_all_that_can_go_no_trial_changes(lab: ProjectHandle, run: CommandLine, tmp_path: Path) -> None:
     first = evaluated(lab, name="first")
     told = run("suggest", "lab/first", "--removals", 1, "--remove-out", "names.txt", *FEW).stdout
@@ -54,6 +55,7 @@ def test_without_all_that_can_go_no_trial_changes(lab: ProjectHandle, run: Comma
     assert {one["verdict"] for one in found["metrics"]} == {"same"}
 
 
+@pytest.mark.soak
 def test_a_used_clip_that_goes_is_found_to_change_trials(lab: ProjectHandle) -> None:
     first = evaluated(lab, name="first", replicates=3)
     most = max(first.clips(), key=lambda clip: clip["ticks"])["clip"]

@@ -43,6 +43,7 @@ def test_the_capacity_is_computed(run: CommandLine) -> None:
     assert "saturates first" in run(*told("capacity")).stdout
 
 
+@pytest.mark.soak
 def test_a_new_server_is_measured_and_removed(run: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:
     if not is_soak():
         monkeypatch.setattr(calibrating, "FEWEST_JOBS", 6)
@@ -51,6 +52,7 @@ def test_a_new_server_is_measured_and_removed(run: CommandLine, monkeypatch: pyt
     assert "predicted jobs/s" in run(*told("bench", "costs"), "--rounds", "1").stdout
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(600)
 def test_each_fault_happens_and_each_job_has_one_visible_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

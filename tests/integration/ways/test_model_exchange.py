@@ -163,6 +163,7 @@ def test_a_graph_finds_its_models_by_name_and_comes_out_as_it_was(lab: ProjectHa
         graph.put_part("graph", part)
 
 
+@pytest.mark.soak
 def test_what_a_server_stores_is_verified_while_it_runs(
     lab: ProjectHandle, run: CommandLine, server: ServerProcess, tmp_path: Path
 ) -> None:

@@ -161,6 +161,7 @@ def questions_about_jobs(run: CommandLine) -> list[str]:
     ]
 
 
+@pytest.mark.soak
 def test_who_stops_waiting_leaves_the_jobs_running_and_is_told_so(
     lab: ProjectHandle, run: CommandLine, marey: Marey
 ) -> None:

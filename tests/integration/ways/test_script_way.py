@@ -114,6 +114,7 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
         time.sleep(0.1)
 
 
+@pytest.mark.soak
 def test_a_cancelled_run_ends_at_once_and_the_run_of_a_killed_worker_is_repeated(tmp_path: Path) -> None:
     where = {"MAREY_SCRIPT_REPOSITORIES": json.dumps([f"file://{tmp_path}/"])}
     process = ServerProcess(tmp_path, **where, **QUICK_LEASES).start(workers=1)

@@ -40,6 +40,7 @@ def by_speed(project: ProjectHandle, motions: list[str]) -> Floats:
     return np.asarray(np.abs(speeds[:, None] - speeds[None]))
 
 
+@pytest.mark.soak
 def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
     lab: ProjectHandle, run: CommandLine, server: ServerProcess, marey: Marey
 ) -> None:

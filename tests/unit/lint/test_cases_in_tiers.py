@@ -1,4 +1,4 @@
-"""The cases that a tier runs of tests with the mark `every_nth`."""
+"""The cases that a tier runs of tests with many cases."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,19 +11,20 @@ DATABASES = ("sqlite", "postgres")
 LEFT_OUT = "other cases of tests with many"
 
 
-def items(every: int, cases: int) -> list[Any]:
-    """Return items like those of a test that runs each case on both databases."""
+def items(every: int | None, cases: int, file: str = "faults/test_deaths.py") -> list[Any]:
+    """Return items like those of a test that runs each case on both databases, with the mark `every_nth` or without."""
+    marks = {} if every is None else {"every_nth": pytest.mark.every_nth(every).mark}
     config = SimpleNamespace(rootpath=Path("/root"), stash=pytest.Stash())
     made: list[Any] = [
         SimpleNamespace(
             config=config,
-            path=Path("/root/tests/faults/test_deaths.py"),
+            path=Path("/root/tests") / file,
             nodeid=f"test_deaths.py::test_a_death[{database}-{case}]",
             name=f"test_a_death[{database}-{case}]",
             originalname="test_a_death",
             callspec=SimpleNamespace(params={"database_url": database, "case": case}),
             listchain=list,
-            get_closest_marker={"every_nth": pytest.mark.every_nth(every).mark}.get,
+            get_closest_marker=marks.get,
         )
         for database in DATABASES
         for case in range(cases)
@@ -38,6 +39,12 @@ def test_every_third_case_runs_on_each_database_and_the_first_always(tier: str) 
     kept = [item.callspec.params for item in items(3, 7) if not left_out(item)]
     assert kept == [{"database_url": name, "case": case} for name in DATABASES for case in (0, 3, 6)]
     assert [item.callspec.params["case"] for item in items(5, 2) if not left_out(item)] == [0, 0]
+
+
+def test_of_fault_cases_every_third_runs_also_without_a_mark() -> None:
+    left_out = TIERS["test"].leaves_out[LEFT_OUT]
+    assert [item.callspec.params["case"] for item in items(None, 5) if not left_out(item)] == [0, 3, 0, 3]
+    assert not any(map(left_out, items(None, 5, "integration/test_rest_jobs.py")))
 
 
 def test_the_tier_soak_runs_all_cases() -> None:

@@ -293,6 +293,7 @@ def real(bandai: tuple[MatchingDatabase, MatchingDatabase]) -> Suggestions:
     return suggest(bandai[0], evaluated(bandai[0], REAL), collections={"turns": bandai[1]}, options=options)
 
 
+@pytest.mark.soak
 def test_on_real_clips_all_safe_removals_leave_every_record_bit_identical(
     bandai: tuple[MatchingDatabase, MatchingDatabase], real: Suggestions
 ) -> None:

@@ -32,6 +32,7 @@ LOADED.set_forkserver_preload([big.__name__])  # each file needs a process of it
 SIZE = (50 if is_soak() else 15) * big.MEGABYTE
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize(
     ("make", "outcome"),
     [

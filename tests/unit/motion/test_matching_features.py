@@ -53,6 +53,7 @@ def clip_named(name: str) -> Clip:
     return CLIPS[name]()
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("name", CLIPS)
 def test_rows_are_those_of_plain_loops(name: str) -> None:
     clip = clip_named(name)

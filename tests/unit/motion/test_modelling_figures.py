@@ -374,6 +374,7 @@ def many(count: int) -> AlignedSet:
     return replace(aligned, clips=tuple(clips))
 
 
+@pytest.mark.soak
 def test_two_hundred_examples_are_drawn_as_twenty_are() -> None:
     subject = modelled(many(200), QUICK.replace(leave_one_out=False, folds=0))
     drawn = figures_of(subject)

@@ -190,6 +190,7 @@ def test_signs_of_quaternions_do_not_matter() -> None:
     np.testing.assert_allclose(one.spatial.variances, other.spatial.variances, rtol=1e-9)
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("scaling", SCALINGS)
 def test_training_gives_the_same_bytes_every_time_and_on_any_number_of_threads(scaling: Scaling) -> None:
     aligned = walks(12, 30)

@@ -232,6 +232,7 @@ def test_doctor_says_how_far_a_machine_confines_scripts(monkeypatch: pytest.Monk
     assert CliRunner().invoke(app, command).exit_code == 1
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("what", HOSTILE)
 def test_a_script_that_exceeds_a_limit_is_killed_with_all_its_processes(repository: Repository, what: str) -> None:
     text, reason = HOSTILE[what]

@@ -50,6 +50,7 @@ def test_a_model_tells_how_good_it_is_and_what_it_was_made_of(lab: ProjectHandle
     assert listed.id == walk.id
 
 
+@pytest.mark.soak
 def test_the_same_clips_options_and_seed_make_the_same_model(lab: ProjectHandle, walk: ModelHandle) -> None:
     again = lab.model(lab.train_model("aligned", name="walk", into="again", cache="off", **QUICK))
     assert again.item.parts["model"].document == walk.item.parts["model"].document
