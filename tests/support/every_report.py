@@ -45,7 +45,7 @@ from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.perception import DistanceOptions
 from marey_schemas.queue.job_params import QualityParams
 from marey_worker.kinds import quality
-from marey_worker.kinds.evaluate import play_trials
+from marey_worker.kinds.evaluate import play_trials, pose_trials
 
 OPTIONS = EvaluationOptions(
     speeds_m_s=(1.0, 1.75, 2.5), turn_rates_deg_s=(-75.0, 0.0, 75.0), duration_s=12.0, replicates=3
@@ -82,10 +82,15 @@ def evaluated(number: int) -> tuple[MatchingDatabase, EvaluationResult]:
 
 @cache
 def evaluation_page() -> str:
-    """Render the report of an evaluation of real walks, with the motion of two trials."""
+    """Render the report of an evaluation of real walks, with the motion of two trials and poses of each region."""
     database, result = evaluated(0)
-    played = play_trials(database, result)
-    return render_report(result, title="Walks of subject 07", inputs=inputs_of(real_sets()[0]), played=played)
+    return render_report(
+        result,
+        title="Walks of subject 07",
+        inputs=inputs_of(real_sets()[0]),
+        played=play_trials(database, result),
+        posed=pose_trials(database, result),
+    )
 
 
 def _two() -> str:

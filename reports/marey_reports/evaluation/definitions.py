@@ -39,7 +39,10 @@ METRICS = {
     "abs_se_v": Metric("speed error", "m/s", 2, "absolute error of the mean speed of a trial"),
     "abs_se_omega_deg": Metric("turn rate error", "deg/s", 1, "absolute error of the mean turn rate of a trial"),
     "heading_rms_deg": Metric(
-        "heading error", "deg", 1, "root mean square of the angle between the desired and the simulated heading"
+        "heading error",
+        "deg",
+        1,
+        "root mean square of the difference between the desired and the simulated heading; whole turns count",
     ),
     "dse_v": Metric("spread of the speed", "m/s", 2, "standard deviation of the speed about its own mean"),
     "dse_omega_deg": Metric(

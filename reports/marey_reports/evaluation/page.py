@@ -32,6 +32,7 @@ from marey_reports.evaluation.definitions import definitions
 from marey_reports.evaluation.figures import DrawnFigure, draw_figures
 from marey_reports.evaluation.played import PlayedTrial, played_chapter
 from marey_reports.evaluation.provenance import provenance
+from marey_reports.evaluation.region_strips import PosedTrial, region_chapter
 from marey_reports.evaluation.sentences import region_verdicts, verdict
 
 __all__ = ["compared", "render_comparison", "render_report"]
@@ -44,6 +45,7 @@ def render_report(
     figures: Mapping[str, DrawnFigure] | None = None,
     inputs: Sequence[ReportInput] = (),
     played: Sequence[PlayedTrial] = (),
+    posed: Sequence[PosedTrial] = (),
 ) -> str:
     """Render the report of one evaluation as an HTML document.
 
@@ -53,10 +55,12 @@ def render_report(
     figures : figures by name, as returned by `draw_figures`; if None, they are drawn. Missing figures are left out
     inputs : the evaluated revisions, for the head
     played : trials whose motion the page shows
+    posed : trials of which the page shows poses
     """
     drawn = draw_figures(result) if figures is None else figures
     sections = [
         *([played_chapter(played, len(result.trials))] if played else []),
+        *([region_chapter(posed)] if posed else []),
         coverage_chapter(result, drawn),
         error_chapter(result, drawn),
         load_chapter(result, drawn),

@@ -184,6 +184,6 @@ def _draw_strip(one: PlayedTrial) -> Sketch:
     poses = [one.clip.sliced(frame, frame + 1) for frame in frames]
     row = PoseRow("", "", poses, headings_rad=np.zeros(len(poses)))
     times = [f"{frame / one.clip.frame_rate_hz:.1f} s" for frame in frames]
-    figure: Figure = draw_pose_rows([row], ["of the trial"] * len(frames), times)
+    figure: Figure = draw_pose_rows([row], ["after"] * len(frames), times)
     caption = f"{STRIP_POSES} poses at even intervals, each from the front left of the body."
     return Sketch(figure, {"moments": {"frame": frames}}, caption)

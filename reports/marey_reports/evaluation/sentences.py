@@ -36,7 +36,7 @@ _PROBLEMS: dict[Measure, _Wording] = {
     "response": _Wording("it answers a new speed after {}", 1, " s"),
     "speed wobble": _Wording("its speed wavers by {}", 2, " m/s"),
     "turn": _Wording("its turn rate is wrong by {}", 0, " deg/s"),
-    "heading": _Wording("it faces {} away from its direction", 0, " degrees"),
+    "heading": _Wording("its heading is {} off", 0, " degrees"),
     "turn wobble": _Wording("it sways by {}", 0, " deg/s"),
     "skating": _Wording("its feet slide at {} while they should stand", 2, " m/s"),
     "sinking": _Wording("its feet sink {} into the ground", 1, " cm", 100.0),

@@ -26,6 +26,7 @@ from marey_motion.matching.record import TrialRecord
 from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
 from marey_reports.evaluation.page import render_report
 from marey_reports.evaluation.played import PlayedTrial, choose_played
+from marey_reports.evaluation.region_strips import PosedTrial, choose_by_region, poses_of
 from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.documents.references import OutputRef
@@ -198,8 +199,14 @@ def write_report(
     Return the document that refers to these files.
     """
     figures = draw_figures(result)
-    played = play_trials(database, result)
-    page = render_report(result, title=params.name, figures=figures, inputs=inputs_of(context), played=played)
+    page = render_report(
+        result,
+        title=params.name,
+        figures=figures,
+        inputs=inputs_of(context),
+        played=play_trials(database, result),
+        posed=pose_trials(database, result),
+    )
     drawn = [*((None, figure) for figure in figures.values()), *_trial_figures(result, params)]
     return store_report(context, EvaluationReport, params.name, page, drawn)
 
@@ -222,6 +229,14 @@ def play_trials(database: MatchingDatabase, result: EvaluationResult) -> list[Pl
         name = f"{demand(judged.outcome.trial)}, {role} trial"
         played.append(PlayedTrial(role, judged, record, clip, _packed(name, clip, hierarchy)))
     return played
+
+
+def pose_trials(database: MatchingDatabase, result: EvaluationResult) -> list[PosedTrial]:
+    """Return poses of the worst, a typical and the best trial of each region; empty if the trials have no records."""
+    return [
+        PosedTrial(region, role, judged, poses_of(displayed_clip(database, record, result.options.controller)))
+        for region, role, judged, record in choose_by_region(result)
+    ]
 
 
 def _packed(name: str, clip: Clip, hierarchy: dict[str, Any]) -> str:
