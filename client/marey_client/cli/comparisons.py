@@ -10,7 +10,7 @@ import typer
 from marey_client.cli.evaluations import evaluation_at, perceived_text
 from marey_client.cli.improvements import SHOWN, Evaluation, print_findings, submit_and_follow
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import FINDINGS_JOB, Wait
+from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, refuse_without_waiting
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -58,11 +58,7 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Compare two evaluations trial by trial, or compare several evaluations with the first one."""
-    if out is not None and not wait:
-        raise WrongUsage(
-            "--out writes the result of the job, but --no-wait does not wait for the result; leave out one of "
-            "the two options"
-        )
+    refuse_without_waiting(wait, out=out)
     with connect(context) as marey:
         first, *rest = (evaluation_at(marey, place) for place in (before, *others))
         if any(one.project != first.project for one in rest):

@@ -10,7 +10,15 @@ import typer
 from marey_client.cli.addresses import Address, addresses_in_one_project, advice, find_item, require_item
 from marey_client.cli.perception.metrics import MetricName, metric_at
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import JOB, Sources, Wait, clips_at, follow, print_commit
+from marey_client.cli.terminal.following import (
+    JOB,
+    Sources,
+    Wait,
+    clips_at,
+    follow,
+    print_commit,
+    refuse_without_waiting,
+)
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -85,11 +93,7 @@ def evaluate(
     from marey_schemas.queue.job_params import EvaluateParams
 
     addresses = addresses_in_one_project(sources)
-    if out is not None and not wait:
-        raise WrongUsage(
-            "--out writes the result of the job, but --no-wait does not wait for the result; leave out one of "
-            "the two options"
-        )
+    refuse_without_waiting(wait, out=out)
     folder, last = _place_beside(addresses[0].path)
     params.setdefault("name", f"{last}-eval" if last else "evaluation")
     with connect(context) as marey:

@@ -11,7 +11,7 @@ from marey_client.cli.addresses import Address
 from marey_client.cli.evaluations import evaluation_at
 from marey_client.cli.perception.metrics import MetricName, metric_at
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, clips_at, follow
+from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, clips_at, follow, refuse_without_waiting
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -62,16 +62,21 @@ def suggest(
             "path per line."
         ),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "--output",
+            "-o",
+            help="Also write the report, an HTML page with pictures of the clips, to this file.",
+        ),
+    ] = None,
     metric: MetricName = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
     """Find clips that can be removed from an evaluated set, and other clips that would fill gaps in its coverage."""
-    if remove_out is not None and not wait:
-        raise WrongUsage(
-            "--remove-out writes a part of the result, but --no-wait does not wait for the result; leave out "
-            "one of the two options"
-        )
+    refuse_without_waiting(wait, remove_out=remove_out, out=out)
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         places = _places(marey, handle, candidates)
@@ -80,11 +85,15 @@ def suggest(
         if found is None:
             return
         document = found.document()
+        if out is not None:
+            found.save_report(out)
     if remove_out is not None:
         names = [f"{clip['name']}\n" for clip in document["unused"]["clips"]]
         remove_out.write_text("".join(names), encoding="utf-8")
         print_message(f"{counted(len(names), 'clip')} that can be removed: {remove_out}")
     print_findings(found, document, as_json, _print_suggestions)
+    if out is not None and not as_json:
+        print_message(f"report: {out}")
 
 
 def optimise(

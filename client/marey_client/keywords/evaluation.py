@@ -271,6 +271,8 @@ class SuggestKeywords(TypedDict, total=False):
     lost_pose: float
     """With a metric: metres that each second of lost poses adds to the harm of a removal. A pose is lost if it looks
     like no pose of the remaining clips."""
+    report: bool
+    """Write the report, a self-contained HTML page."""
 
 
 class OptimiseKeywords(TypedDict, total=False):

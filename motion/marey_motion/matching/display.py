@@ -48,6 +48,24 @@ def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: Con
     )
 
 
+def posed_rows(database: MatchingDatabase, rows: NDArray[np.int64]) -> Clip:
+    """Make a clip of single rows, without blending: the root of each row is at the origin and faces +Z.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the database
+    rows : (T,) int64    its rows to show
+
+    Returns
+    -------
+    Clip    T frames
+    """
+    places = None if database.translations is None else database.translations[rows]
+    return Clip(
+        database.body.skeleton, database.options.rate_hz, database.poses[rows], places, database.translated_joints
+    )
+
+
 def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: ControllerOptions) -> Floats:
     """Compute the distances between the displayed pose and the next one.
 

@@ -91,8 +91,13 @@ def _section(section: Section) -> Html:
 
 
 def shown(figures: Mapping[str, DrawnFigure], *names: str) -> Html:
-    """Return the HTML of the named figures; names without a figure are skipped."""
-    return joined(_shown(figures[name], f"f{list(figures).index(name)}") for name in names if name in figures)
+    """Return the HTML of the named figures, whose names are unique in the page; names without a figure are skipped."""
+    return joined(_shown(figures[name], _prefix(name)) for name in names if name in figures)
+
+
+def _prefix(name: str) -> str:
+    """Return a beginning of ids for a figure; its name itself may contain signs that ids may not contain."""
+    return f"f{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def _shown(figure: DrawnFigure, prefix: str) -> Html:

@@ -6,7 +6,7 @@ All cells of a column show the same patch of the floor, so that differences betw
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from textwrap import wrap
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -51,6 +51,8 @@ DEEP_M = 0.5
 In some files, height 0 is at the hips; with the floor there, bodies would be drawn tiny.
 """
 
+EVEN_POSES = 6
+"""Number of poses of each motion in a strip of motions of different durations."""
 POSE_CELL_IN = (1.15, 1.7)
 """Width and height of a cell in the strip of a clip, inches."""
 CAMERA_TURN_RAD = np.radians(40.0)  # from where the body faces at first to where it is seen from, to its left
@@ -201,6 +203,19 @@ def draw_pose_rows(
     direction = _camera_direction(drawn[0].bodies[0], body.facing)
     legend = [(ghost, REFERENCE)] if ghost else []
     return draw_strips(body, drawn, moments, direction, cell_in=POSE_CELL_IN, legend=legend, about=about, whole=True)
+
+
+def even_frames(count: int) -> list[int]:
+    """Return `EVEN_POSES` indices of `count` frames at even intervals, from the first to the last frame."""
+    return [round(place) for place in np.linspace(0, count - 1, EVEN_POSES)]
+
+
+def draw_even_poses(rows: Sequence[PoseRow]) -> Figure:
+    """Draw motions of different durations, each by its poses at `even_frames`, which are turned to one heading."""
+    turned = [replace(row, headings_rad=np.zeros(EVEN_POSES)) for row in rows]
+    return draw_pose_rows(
+        turned, ["after"] * EVEN_POSES, [f"{share:.0f} %" for share in np.linspace(0.0, 100.0, EVEN_POSES)]
+    )
 
 
 def _floor_m(points: Floats) -> float:

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from marey_motion.clip import Clip
 from marey_motion.evaluation.judgement import REGIONS, Region, TrialVerdict, judge
 from marey_motion.evaluation.result import EvaluationResult
@@ -16,13 +14,10 @@ from marey_motion.matching.record import TrialRecord
 from marey_reports.drawing.drawn import DrawnFigure, Sketch
 from marey_reports.drawing.markup import element
 from marey_reports.drawing.page import Section, shown
-from marey_reports.drawing.strips import PoseRow, draw_pose_rows
+from marey_reports.drawing.strips import PoseRow, draw_even_poses, even_frames
 from marey_reports.drawing.tables import table
 from marey_reports.evaluation.sentences import failing
 from marey_schemas.documents.worst_first import middle_of
-
-POSES = 6
-"""Number of poses of each trial."""
 
 Role = Literal["worst", "typical", "best", "only"]
 
@@ -36,7 +31,7 @@ class PosedTrial:
     region : region of the trial
     role : why the trial was chosen among those of its region
     verdict : the trial with its checks
-    poses : one frame of the displayed motion for each of `POSES` moments, from the first frame to the last
+    poses : frames of the displayed motion at even intervals, each as a clip of one frame
     """
 
     region: Region
@@ -69,12 +64,8 @@ def _in_roles(ranked: list[TrialVerdict]) -> list[tuple[Role, TrialVerdict]]:
 
 
 def poses_of(clip: Clip) -> tuple[Clip, ...]:
-    """Return `POSES` frames of a clip at even intervals, each as a clip of one frame."""
-    return tuple(clip.sliced(frame, frame + 1) for frame in _frames(clip.frame_count))
-
-
-def _frames(count: int) -> list[int]:
-    return [round(place) for place in np.linspace(0, count - 1, POSES)]
+    """Return frames of a clip at even intervals, each as a clip of one frame."""
+    return tuple(clip.sliced(frame, frame + 1) for frame in even_frames(clip.frame_count))
 
 
 def region_chapter(posed: Sequence[PosedTrial]) -> Section:
@@ -91,12 +82,7 @@ def region_chapter(posed: Sequence[PosedTrial]) -> Section:
 
 
 def _draw(posed: Sequence[PosedTrial]) -> Sketch:
-    rows = [
-        PoseRow(f"{one.region}: {one.role}", one.verdict.outcome.trial.name, one.poses, headings_rad=np.zeros(POSES))
-        for one in posed
-    ]
-    labels = [f"{share:.0f} %" for share in np.linspace(0.0, 100.0, POSES)]
-    figure = draw_pose_rows(rows, ["after"] * POSES, labels)
+    rows = [PoseRow(f"{one.region}: {one.role}", one.verdict.outcome.trial.name, one.poses) for one in posed]
     chosen: dict[str, object] = {
         "region": [one.region for one in posed],
         "role": [one.role for one in posed],
@@ -104,7 +90,7 @@ def _draw(posed: Sequence[PosedTrial]) -> Sketch:
         "worst_measure": [one.verdict.worst.measure for one in posed],
         "strain": [one.verdict.worst.strain for one in posed],
     }
-    return Sketch(figure, {"trials": chosen}, "Each body is seen from its front left.")
+    return Sketch(draw_even_poses(rows), {"trials": chosen}, "Each body is seen from its front left.")
 
 
 def _problem(verdict: TrialVerdict) -> str:

@@ -272,6 +272,8 @@ class QualityParams(QualityOptions):
 class SuggestParams(SuggestionOptions, MetricChoice):
     """Parameters of jobs of the kind `suggest`, which find clips to remove from a set or to add."""
 
+    report: bool = Field(True, description="Write the report, a self-contained HTML page.")
+
 
 class OptimiseParams(OptimisationOptions):
     """Parameters of jobs of the kind `optimise`, which improve a set of clips step by step."""

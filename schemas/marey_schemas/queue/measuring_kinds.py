@@ -143,7 +143,7 @@ SUGGEST = KindDeclaration(
     implementation="marey_worker.kinds.suggest:run",
     version=8,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": METRIC},
-    outputs={"document": "file"},
+    outputs={"document": "file", "report": "file"},
     facets=REMOVAL_FACETS,
 )
 

@@ -10,8 +10,9 @@ from marey_motion.evaluation.judgement import Region, judge
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.scenario import demand
 from marey_motion.gait import generate_gait
+from marey_reports.drawing.strips import EVEN_POSES
 from marey_reports.evaluation.page import render_report
-from marey_reports.evaluation.region_strips import POSES, PosedTrial, choose_by_region, poses_of
+from marey_reports.evaluation.region_strips import PosedTrial, choose_by_region, poses_of
 
 
 def only(result: EvaluationResult, regions: dict[Region, int]) -> EvaluationResult:
@@ -59,7 +60,7 @@ def test_a_result_without_records_has_no_poses() -> None:
 def test_the_page_shows_and_names_each_chosen_trial() -> None:
     result = synthetic_result()
     poses = poses_of(generate_gait(1.3, 0.2, 2.0))
-    assert len(poses) == POSES
+    assert len(poses) == EVEN_POSES
     posed = [PosedTrial(region, role, verdict, poses) for region, role, verdict, _ in choose_by_region(result)]
     page = is_sound(render_report(result, title="t", figures={}, posed=posed))
     for one in posed:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from tests.support.project_in_memory import PARAMS, ProjectInMemory, add_clip
+from tests.support.report_pages import is_sound
 
 from marey_motion.clip import Clip
 from marey_motion.gait import generate_gait
@@ -119,9 +120,10 @@ def test_suggestions_publish_the_harm_of_each_removal(project: LoggedProject) ->
     clips = project.inputs["clips"]
     own = evaluated(project, "first", clips)
     project.inputs, project.facets = {"evaluation": (own,)}, []
-    document = document_of(
-        project, suggest.run(project, SuggestParams(removals=0, estimation_replicates=1, confirmation_replicates=0))
-    )
+    result = suggest.run(project, SuggestParams(removals=0, estimation_replicates=1, confirmation_replicates=0))
+    document = document_of(project, result)
+    page = is_sound(project.blobs[result["report"]["blob"]].decode())
+    assert document["unused"]["clips"][0]["reason"] in page.text
     harms = {one.item: one.values["removal_harm"] for one in project.facets}
     assert harms[clips[3].item] == 0, "no trial needs this clip"
     needed = {removal["source"].split("@")[0]: removal["harm"] for removal in document["redundant"]["clips"]}

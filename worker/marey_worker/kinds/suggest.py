@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
+from marey_motion.clip import Clip
 from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import suggestions_to_tree
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.display import posed_rows
+from marey_reports.drawing.strips import even_frames
+from marey_reports.evaluation.suggestions import render_suggestions, shown_sources
 from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.job_params import SuggestParams
 from marey_worker.context import Context
 from marey_worker.job_io.candidates import read_candidates
 from marey_worker.job_io.chosen_metric import read_metric
-from marey_worker.job_io.evaluated_set import read_evaluated_set, store_document
+from marey_worker.job_io.evaluated_set import read_evaluated_set, store_document, store_file
 from marey_worker.job_io.matching_clips import refusing_motion_errors, split_uid
+from marey_worker.job_io.stored_reports import inputs_of
 
 
 def run(context: Context, params: SuggestParams) -> dict[str, Any]:
-    """Compute suggestions for the evaluated set; the result counts them, and refers to the document that lists them."""
+    """Compute suggestions for the evaluated set; the result counts them, and refers to their document and report."""
     evaluated = read_evaluated_set(context)
     candidates = read_candidates(context, evaluated)
     with refusing_motion_errors():
@@ -31,7 +40,23 @@ def run(context: Context, params: SuggestParams) -> dict[str, Any]:
         )
     context.publish_facets(facets_of(found))
     document = {**suggestions_to_tree(found), "unusable": [one._asdict() for one in candidates.unusable]}
-    return {**_counts(found), "unusable": len(candidates.unusable), "document": store_document(context, document)}
+    result = {**_counts(found), "unusable": len(candidates.unusable), "document": store_document(context, document)}
+    if params.report:
+        (pin,) = context.inputs["evaluation"]
+        poses = poses_of((evaluated.clips.database, *candidates.databases.values()), shown_sources(found))
+        page = render_suggestions(found, poses, title=pin.path, inputs=inputs_of(context))
+        result["report"] = store_file(context, page.encode())
+    return result
+
+
+def poses_of(databases: Iterable[MatchingDatabase], sources: set[str]) -> dict[str, tuple[Clip, ...]]:
+    """Return poses at even intervals of the clips with the uids `sources`, by uid."""
+    return {
+        clip.uid: tuple(posed_rows(database, np.array([clip.start + frame])) for frame in even_frames(clip.frame_count))
+        for database in databases
+        for clip in database.clips
+        if clip.uid in sources
+    }
 
 
 def facets_of(found: Suggestions) -> list[ItemFacets]:

@@ -9,7 +9,7 @@ import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.terminal.failures import Refused, WrongUsage
-from marey_client.cli.terminal.following import FINDINGS_JOB, Sources, Wait, clips_at, follow
+from marey_client.cli.terminal.following import FINDINGS_JOB, Sources, Wait, clips_at, follow, refuse_without_waiting
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_refused, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -166,11 +166,7 @@ def compare(
     """Measure how different clips look to people: distances of all pairs, motion maps and registration curves."""
     from marey_client.handles.metrics import Distances
 
-    if not wait and (out or figures or maps):
-        raise WrongUsage(
-            "--out, --figures and --maps write results of the job, but --no-wait does not wait for them; leave out "
-            "--no-wait"
-        )
+    refuse_without_waiting(wait, out=out, figures=figures, maps=maps)
     addresses = addresses_in_one_project(sources)
     with connect(context) as marey:
         project = marey.project(addresses[0].project)

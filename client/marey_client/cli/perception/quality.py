@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project
-from marey_client.cli.terminal.failures import Refused, WrongUsage
-from marey_client.cli.terminal.following import Sources, Wait, clips_at, follow, input_at
+from marey_client.cli.terminal.failures import Refused
+from marey_client.cli.terminal.following import Sources, Wait, clips_at, follow, input_at, refuse_without_waiting
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_refused, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -74,11 +74,7 @@ def quality(
     from marey_client.handles.findings import Quality
     from marey_schemas.kinds import Kind
 
-    if not wait and (out or csv or figures or against):
-        raise WrongUsage(
-            "--out, --csv, --figures and --against use the result of the job, but --no-wait does not wait for it; "
-            "leave out --no-wait"
-        )
+    refuse_without_waiting(wait, out=out, csv=csv, figures=figures, against=against)
     addresses = addresses_in_one_project([*sources, *(reference or ()), *(contacts or ())])
     with connect(context) as marey:
         project = marey.project(addresses[0].project)

@@ -11,7 +11,7 @@ import typer
 
 from marey_client.cli.studies.conducting import StudyPlace, study, study_at
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, follow
+from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, follow, refuse_without_waiting
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -87,10 +87,7 @@ def analyse(
     """Compute perceived differences, order and groups of the motions, and fit metrics. For maintainers and owners."""
     from marey_client.handles.findings import Findings
 
-    if (out is not None or metric is not None) and not wait:
-        raise WrongUsage(
-            "--out and --metric write results of the job, but --no-wait does not wait for them; leave out --no-wait"
-        )
+    refuse_without_waiting(wait, out=out, metric=metric)
     with connect(context) as marey:
         handle = study_at(marey, place)
         request = handle.analyse_request(**params).model_copy(update=job)

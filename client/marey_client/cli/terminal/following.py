@@ -76,6 +76,16 @@ Wait = Annotated[
 ]
 
 
+def refuse_without_waiting(wait: bool, **options: object) -> None:
+    """Refuse the options that are given, which use results of the job, if the command does not wait for its end."""
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
+    if given and not wait:
+        use = "uses" if len(given) == 1 else "use"
+        raise WrongUsage(
+            f"{' and '.join(given)} {use} results of the job, but --no-wait does not wait for them; leave out --no-wait"
+        )
+
+
 def clips_at(marey: Marey, address: Address) -> ExistingInput:
     """Return the clip, the version of a dataset, or the folder at an address as the input of a job."""
     from marey_schemas.kinds import Kind
