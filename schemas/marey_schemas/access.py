@@ -63,7 +63,7 @@ ScopeText = Annotated[str, StringConstraints(pattern=_SCOPE)]
 
 
 class UserCreate(Request):
-    """Request to create a user. Without a password the user can sign in with tokens only."""
+    """Request to create a user. Without a password, the user signs in with a token or an identity provider."""
 
     name: UserName
     display_name: DisplayName | None = None

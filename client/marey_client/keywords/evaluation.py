@@ -245,15 +245,15 @@ class SuggestKeywords(TypedDict, total=False):
     replicates, which neither the estimate nor the evaluation uses."""
     confirmation_replicates: int
     """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
-    with intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose
-    effect is equal in all replicates, unless the step changes no trial."""
+    with intervals. At least 3, or 0: effects are not confirmed. 3 to 6 are too few to confirm a step of an optimisation
+    whose effect is equal in all replicates, unless the step changes no trial."""
     confirmation_seed: int
     """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
     replicates."""
     removals: int
     """Greatest number of removals to plan, in addition to the clips that no trial uses. Each step removes the clip
-    whose removal harms least per second of data; steps after the first try only the clips again that came first. 0:
-    none."""
+    whose removal harms least per second of data. Steps after the first compare only the clips whose removal harmed
+    least in the steps before. 0: none."""
     simulated_additions: int
     """Number of suggested additions whose effect on the trials is simulated: the first ones that have the skeleton of
     the set. Each simulation takes as long as an evaluation with `confirmation_replicates`."""
@@ -286,8 +286,8 @@ class OptimiseKeywords(TypedDict, total=False):
     replicates, which neither the estimate nor the evaluation uses."""
     confirmation_replicates: int
     """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
-    with intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose
-    effect is equal in all replicates, unless the step changes no trial."""
+    with intervals. At least 3, or 0: effects are not confirmed. 3 to 6 are too few to confirm a step of an optimisation
+    whose effect is equal in all replicates, unless the step changes no trial."""
     confirmation_seed: int
     """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
     replicates."""
@@ -315,8 +315,8 @@ class SweepKeywords(TypedDict, total=False):
     replicates, which neither the estimate nor the evaluation uses."""
     confirmation_replicates: int
     """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
-    with intervals. At least 3, or 0: effects are not confirmed. With 3 to 6, an optimisation confirms no step whose
-    effect is equal in all replicates, unless the step changes no trial."""
+    with intervals. At least 3, or 0: effects are not confirmed. 3 to 6 are too few to confirm a step of an optimisation
+    whose effect is equal in all replicates, unless the step changes no trial."""
     confirmation_seed: int
     """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
     replicates."""

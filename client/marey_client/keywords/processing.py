@@ -160,8 +160,8 @@ class ModelKeywords(TypedDict, total=False):
     """Tags that the results get."""
     criterion: Literal["held_out", "bic", "aic"]
     """Criterion that selects the mixture. held_out: the likelihood of examples of takes that were left out of the fit;
-    bic, aic: an information criterion, among the mixtures that make left-out examples more likely than one normal
-    distribution. Without cross-validation, held_out is replaced by bic."""
+    bic, aic: an information criterion. Mixtures for which left-out examples are no more likely than for one normal
+    distribution are then excluded. Without cross-validation, bic replaces held_out."""
     covariance: Literal["full", "tied", "diagonal"] | None
     """Kind of covariance. full: one for each component, shrunk towards its diagonal; tied: one for all components;
     diagonal: one variance for each component and dimension; absent: the criterion selects it."""
@@ -172,8 +172,8 @@ class ModelKeywords(TypedDict, total=False):
     regularisation: float
     """Regularisation added to variances, as a share of the mean variance."""
     widening: float | None
-    """Factor of the covariances for likelihoods, not for samples; absent: the least factor, 1 to 4, with which about 5%
-    of left-out examples are less likely than 95% of the widened mixture."""
+    """Factor of the covariances for likelihoods, not for samples; absent: the least factor, 1 to 4, with which at most
+    about 5% of the left-out examples are less likely than 95% of the mixture's samples."""
     starts: int
     """Number of starts of expectation maximisation; the best result is used."""
     folds: int

@@ -56,9 +56,9 @@ class ConfirmedEffects(ObjectiveChoice):
         ge=0,
         le=64,
         description="Number of further replicates in which the chosen effects are measured again; these measurements "
-        f"are reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed. With "
-        f"{LEAST_REPLICATES} to 6, an optimisation confirms no step whose effect is equal in all replicates, unless "
-        "the step changes no trial.",
+        f"are reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed. "
+        f"{LEAST_REPLICATES} to 6 are too few to confirm a step of an optimisation whose effect is equal in all "
+        "replicates, unless the step changes no trial.",
     )
     confirmation_seed: int = Field(
         0,
@@ -87,8 +87,8 @@ class SuggestionOptions(ConfirmedEffects):
         ge=0,
         le=1000,
         description="Greatest number of removals to plan, in addition to the clips that no trial uses. Each step "
-        "removes the clip whose removal harms least per second of data; steps after the first try only the clips again "
-        "that came first. 0: none.",
+        "removes the clip whose removal harms least per second of data. Steps after the first compare only the clips "
+        "whose removal harmed least in the steps before. 0: none.",
     )
     simulated_additions: int = Field(
         3,

@@ -27,8 +27,8 @@ class MixtureOptions(Options):
     criterion: Criterion = Field(
         "held_out",
         description="Criterion that selects the mixture. held_out: the likelihood of examples of takes that were left "
-        "out of the fit; bic, aic: an information criterion, among the mixtures that make left-out examples more "
-        "likely than one normal distribution. Without cross-validation, held_out is replaced by bic.",
+        "out of the fit; bic, aic: an information criterion. Mixtures for which left-out examples are no more likely "
+        "than for one normal distribution are then excluded. Without cross-validation, bic replaces held_out.",
     )
     covariance: CovarianceKind | None = Field(
         None,
@@ -57,7 +57,7 @@ class MixtureOptions(Options):
         le=100,
         allow_inf_nan=False,
         description="Factor of the covariances for likelihoods, not for samples; absent: the least factor, 1 to 4, "
-        "with which about 5% of left-out examples are less likely than 95% of the widened mixture.",
+        "with which at most about 5% of the left-out examples are less likely than 95% of the mixture's samples.",
     )
     starts: int = Field(
         5, ge=1, le=100, description="Number of starts of expectation maximisation; the best result is used."

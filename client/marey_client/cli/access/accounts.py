@@ -143,7 +143,8 @@ def create_user(
     without_password: Annotated[
         bool,
         typer.Option(
-            "--without-password", help="Create the user without a password; the user can sign in with tokens only."
+            "--without-password",
+            help="Create the user without a password; the user signs in with a token or an identity provider.",
         ),
     ] = False,
     as_json: AsJson = False,

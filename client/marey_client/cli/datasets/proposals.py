@@ -43,7 +43,7 @@ CommitSeen = Annotated[
     str | None,
     typer.Option(
         "--commit",
-        help="Commit that you have reviewed. The command is refused if the proposal has a newer commit.",
+        help="Newest commit that you have seen. The command is refused if the proposal has a newer commit.",
     ),
 ]
 Number = Annotated[int, typer.Argument(min=1, help="Number of the proposal; `marey proposal ls` lists the numbers.")]

@@ -76,7 +76,9 @@ def create(
         str | None,
         typer.Option(help="Name of the annotation; default: name of the clip, space, name of the layer."),
     ] = None,
-    segment: Annotated[list[str] | None, typer.Option(help="Segment as label=first:end; may be repeated.")] = None,
+    segment: Annotated[
+        list[str] | None, typer.Option(help="Segment as label=first:end, without the frame `end`; may be repeated.")
+    ] = None,
     keyframe: Annotated[list[str] | None, typer.Option(help="Keyframe as label=frame; may be repeated.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -272,16 +274,16 @@ def export_annotation(
         AnnotationForm | None,
         typer.Option(
             help="Layout of the file. labels: the segments of each label. list: one list of all segments, "
-            "without labels. frames: the frames of each label. Default: the imported file, if the "
-            f"annotation is unchanged, else {DEFAULT_FORM}."
+            f"without labels. frames: the frames of each label. Default: {DEFAULT_FORM}, or, without "
+            "--end-index, the layout of the imported file if the annotation is unchanged."
         ),
     ] = None,
     end_index: Annotated[
         EndIndex | None,
         typer.Option(
             help="Meaning of end_idx in the file. inclusive: the last frame of a segment, as in the editor of "
-            "Marey's predecessor. exclusive: the frame after the last frame. Default: the imported file, if "
-            f"the annotation is unchanged, else {DEFAULT_END_INDEX}."
+            f"Marey's predecessor. exclusive: the frame after the last frame. Default: {DEFAULT_END_INDEX}, or, "
+            "without --form, the meaning in the imported file if the annotation is unchanged."
         ),
     ] = None,
 ) -> None:

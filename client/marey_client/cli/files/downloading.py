@@ -60,7 +60,7 @@ def download(
         str | None,
         typer.Option(
             help="With --format predecessor: layout of the file: 2 or 3 for models, database or file for "
-            "skeletons. Default: the imported file, if the item is unchanged; otherwise, database for "
+            "skeletons. Default: the layout of the imported file if the item is unchanged; otherwise, database for "
             "skeletons, and for models the layout that contains the time function exactly, or else 3."
         ),
     ] = None,
