@@ -73,7 +73,7 @@ def plain_reason(fault: Mapping[str, Any], model: type[BaseModel] | None = None)
         return f"there is no field of this name{_suggestion(fault, _fields_at(model, fault['loc'][:-1]))}"
     if kind.endswith(("too_short", "too_long")):
         return _length_reason(kind, fault["ctx"])
-    reason = _REASONS.get(kind, "the value has another form than required").format(**context)
+    reason = _REASONS.get(kind, "the value does not have the required form").format(**context)
     return reason + _suggestion(fault, _QUOTED.findall(context.get("expected", context.get("expected_tags", ""))))
 
 

@@ -68,8 +68,12 @@ def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
     with load.workers(workers, work_s):
         load.await_end(LONGEST_DRAIN_S, begun, lambda _: None)
     if load.errors or len(load.completed) < len(load.planned):
-        why = dict(load.errors) or f"not done after {LONGEST_DRAIN_S:g} s; give a smaller --work-ms, or other --workers"
-        raise MareyError(f"the simulated workers did not complete all jobs of the measurement: {why}")
+        answers = ", ".join(sorted(load.errors))
+        why = f"the server answered: {answers}" if answers else f"they were not done after {LONGEST_DRAIN_S:g} s"
+        raise MareyError(
+            f"the simulated workers did not complete all jobs of the measurement; {why}; give a smaller --work-ms, or "
+            "other --workers"
+        )
     ends = sorted(load.completed.values())
     claims = sorted(load.durations_s["claim"])[: len(ends)]  # the longest are those that waited in vain at the end
     return Drain((len(ends) - 1) / (ends[-1] - ends[0]), tuple(claims), tuple(load.durations_s["complete"]))

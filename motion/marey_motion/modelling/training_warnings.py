@@ -114,8 +114,8 @@ def _of_mixture(report: TrainingReport) -> list[ModelWarning]:
         found.append(
             ModelWarning(
                 "likelihood-too-sure",
-                f"{share:.0%} of the examples are less likely, under a model that was trained without their takes, "
-                "than 95% of what this model expects; unseen motions differ more than the examples show, so add takes",
+                f"{share:.0%} of the examples are less likely than 95% of the samples of a model that was trained "
+                "without their takes; new motions differ more than the examples suggest, so add takes",
             )
         )
     slow = [candidate.components for candidate in report.candidates if not candidate.converged]

@@ -70,8 +70,8 @@ class Component:
         numbers = [self.constant, self.norm, self.exponent, *self.weights.values()]
         if not (np.isfinite(numbers).all() and min(numbers) >= 0 and sum(self.weights.values()) > 0):
             raise MotionError(
-                "constant, norm, exponent and weights must be finite and at least 0, and at least one weight must be "
-                "above 0",
+                "constant, norm and weights must be finite and at least 0, the exponent finite and above 0, and at "
+                "least one weight above 0",
                 where=self.measurement,
             )
         if self.exponent == 0:

@@ -308,7 +308,7 @@ def test_an_input_that_takes_one_thing_refuses_more(desk: Desk) -> None:
     make(desk, maker, "a", "b")
     reason, code, detail = failure_of(desk, job)
     assert (reason, code) == ("error", "one-item")
-    assert f"{maker} made 2" in detail
+    assert f"2 were created by the job {maker}" in detail
 
 
 def test_an_input_that_a_job_can_do_without_is_left_out_where_nothing_was_made(desk: Desk) -> None:

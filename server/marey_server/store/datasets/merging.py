@@ -280,8 +280,8 @@ def _shown(one: MergeConflict, held: Mapping[str, tuple[str, int]]) -> EntryConf
 def _reason(one: MergeConflict) -> str:
     if one.no_way_back is not None:
         return (
-            f"With this resolution, the other entry would go back to {one.no_way_back!r}, but another entry is there. "
-            "Decide differently, or rename an entry before the merge."
+            f"With this resolution, the entry that loses the path would return to {one.no_way_back!r}, but another "
+            "entry has this path. Choose the other side, or rename one of the entries before the merge."
         )
     return one.clash.reason if one.clash else ""
 

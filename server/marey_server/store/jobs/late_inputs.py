@@ -195,8 +195,8 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
         if not chosen and not spec.required:
             continue
         if not spec.many and len(chosen) != 1:
-            sources = ", ".join(entry["job"] for entry in entries if "job" in entry)
-            detail = f"The input {name!r} takes one {spec.kind}; {sources} made {len(chosen)}."
+            sources = ", ".join(f"the job {entry['job']}" for entry in entries if "job" in entry)
+            detail = f"The input {name!r} takes one {spec.kind}, but {len(chosen)} were created by {sources}."
             raise LateInputError("one-item", detail)
         pins[name] = list(chosen.values())
         if len(entries) == 1 and "job" in entries[0]:  # of several makers, items of one name may be in like places
@@ -222,7 +222,10 @@ def _resolved(
         made[source] = _outputs(tx, project_id, source)
     found = [one for one in made[source].pins if one["kind"] == spec.kind]
     if not found and spec.required:
-        detail = f"The input {name!r} needs a {spec.kind} from {source}, which made none that still exists."
+        detail = (
+            f"The input {name!r} needs a {spec.kind} that the job {source} creates, but this job has created none, or "
+            "all of them were deleted."
+        )
         raise LateInputError("no-input", detail)
     return found
 
