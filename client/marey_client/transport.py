@@ -381,7 +381,7 @@ def read_model(answer: type[Model], response: httpx.Response) -> Model:
 
 
 def read_tree(response: httpx.Response) -> Any:
-    """Return the body of `response` as a tree with numpy arrays."""
+    """Return the document in the body of `response`, with numpy arrays."""
     try:
         return decode_tree(response.content, media_type_of(response), max_bytes=MAX_ANSWER_BYTES)
     except CodecError as error:

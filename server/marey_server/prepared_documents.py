@@ -90,7 +90,7 @@ def _of_canonical(schema: str, canonical: bytes, array_of: Callable[[str, Tree],
 
 
 def decoded_tree(content: PreparedDocument) -> Tree:
-    """Return the document with its arrays decoded, as a tree."""
+    """Return the content of a document as dictionaries, lists and values, with decoded arrays."""
     tree: Tree = json.loads(canonical_json(content.body))
     for pointer, (_, data) in content.arrays.items():
         holder, key = place_of(tree, pointer)

@@ -120,7 +120,7 @@ class AttemptApi:
             return [one.result or {} for one in pages(self._transport, TaskResult, f"/jobs/{self._job}/results")]
 
     def read_judgements(self, study: str, revision: int) -> list[dict[str, Any]]:
-        """Return the answers of participants who saw a revision of a study, one tree for each participant."""
+        """Return the answers of participants who saw a revision of a study, one document for each participant."""
         with _dead_token_is_lost_lease():
             path = f"{self._url}/judgements/{study}"
             people = pages(self._transport, JudgingParticipant, path, {"revision": revision})

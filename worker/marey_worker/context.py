@@ -124,7 +124,7 @@ class Context:
     # -- reading --
 
     def document(self, kind: Kind, item: str, revision: int, part: str, *, required: bool = True) -> Any:
-        """Return a part of a revision as a tree, with its arrays as numpy arrays.
+        """Return the document of a part of a revision, with its arrays as numpy arrays.
 
         If the part does not exist, return None if `required` is false; otherwise, raise `NoSuchThing`.
         """

@@ -109,7 +109,10 @@ class ReadResults:
 
 @dataclass(frozen=True)
 class ReadJudgements:
-    """Request for the answers of a study's participants at a revision; the reply has one tree for each participant."""
+    """Request for the answers of the participants who saw a revision of a study.
+
+    The reply has one document for each participant.
+    """
 
     request: int
     item: str

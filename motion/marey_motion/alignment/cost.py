@@ -15,18 +15,20 @@ from marey_schemas.options.alignment import CostOptions
 class CostPoints(NamedTuple):
     """The points of one motion of n frames, prepared for comparison with other motions.
 
-    F is n without a window, and n + W - 1 if costs are averaged over a window of W frames (`CostOptions.window`). For
-    the cost `turned`, horizontal positions are relative to the weighted centre of the points: that of the frame without
-    a window, and the mean centre of the whole motion with a window. For the cost `plain`, they are not centred, and
-    `energies` and `centres` are not used.
+    Costs are averaged over a window of W frames (`CostOptions.window`). The motion is extended to F = n + W - 1 frames
+    by copies of its first and last frames, so that each of its n frames is the middle of a window.
+
+    For the cost `turned`, horizontal positions are relative to a centre. If W is 1, it is the weighted centre of the
+    points of each frame; otherwise, it is the mean of these centres over all frames. For the cost `plain`, positions
+    are not centred, and `energies` and `centres` are not used.
 
     Parameters
     ----------
     rows : (F, P, 3) float64    positions, multiplied by the square root of each point's share of the total weight
     columns : (P, 3, F) float64    the same, transposed
-    energies : (n,) float64    weighted sum of the squared horizontal distances of the points from the weighted centre
-        of each frame's window, over this window
-    centres : (n, 2) float64    horizontal weighted centre of each frame's window; zero if there is no window, or if the
+    energies : (n,) float64    for each window, the weighted sum of the squared horizontal distances of its points from
+        their weighted centre
+    centres : (n, 2) float64    for each window, the horizontal weighted centre of its points; zero if W is 1, or if the
         cost is `plain`
     """
 

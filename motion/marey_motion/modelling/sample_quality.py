@@ -37,7 +37,7 @@ def foot_speeds(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> F
 
     Parameters
     ----------
-    toes : (m, N, k, 3) float64    positions, metres
+    toes : (m, N, k, 3) float64    positions of k toes in m motions at N canonical frames, metres
     time_functions : (m, N) float64    frames of real time at each canonical frame
     frame_rate_hz : float    frames of real time per second
 
@@ -56,7 +56,7 @@ def standing_steps(toes: Floats, time_functions: Floats, frame_rate_hz: float) -
 
     Parameters
     ----------
-    toes : (m, N, k, 3) float64    positions, metres
+    toes : (m, N, k, 3) float64    positions of k toes in m motions at N canonical frames, metres
     time_functions : (m, N) float64    frames of real time at each canonical frame
     frame_rate_hz : float    frames of real time per second
 
@@ -76,7 +76,7 @@ def foot_quality(
 
     Parameters
     ----------
-    toes : (m, N, k, 3) float64    positions, metres
+    toes : (m, N, k, 3) float64    positions of k toes in m motions at N canonical frames, metres
     time_functions : (m, N) float64    frames of real time at each canonical frame
     frame_rate_hz : float    frames of real time per second
     standing : (N - 1, k) bool    result of `standing_steps` for the training examples

@@ -2,7 +2,7 @@
 
 The answers of the provider have limits of time and size, and redirects are not followed. Its discovery document and its
 keys are remembered for an hour. A token that is signed with an unknown key makes the server read the keys again, but at
-most every `REFETCH_S` seconds, so that invented tokens cause few requests.
+most every `REFETCH_S` seconds, so that forged tokens cause few requests.
 """
 
 from __future__ import annotations

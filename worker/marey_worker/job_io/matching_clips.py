@@ -68,7 +68,7 @@ class ClipSet:
     trims: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def as_tree(self) -> dict[str, Any]:
-        """Return the set as a tree, as it is stored with an evaluation."""
+        """Return the set as plain values, which are stored with an evaluation."""
         return {
             "clips": [pin.model_dump(mode="json") for pin in self.clips],
             "rig": None if self.rig is None else self.rig.model_dump(mode="json"),
@@ -78,7 +78,7 @@ class ClipSet:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> ClipSet:
-        """Return the set of clips that a tree of `as_tree` describes."""
+        """Return the set of clips that a result of `as_tree` describes."""
         return cls(
             clips=tuple(map(PinnedInput.model_validate, tree["clips"])),
             rig=None if tree["rig"] is None else PinnedInput.model_validate(tree["rig"]),

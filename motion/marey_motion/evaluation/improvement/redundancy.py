@@ -153,9 +153,10 @@ def plan_removals(
 ) -> tuple[PlannedRemoval, ...]:
     """Plan removals: each step removes the source clip whose removal harms least per second of data saved.
 
-    The first step removes the first of `ranked`. Each later step tries only the `TRIED_AGAIN` sources that came first
-    when each was last tried. Every step is simulated, so the metrics of a step equal the metrics of an evaluation of
-    the remaining clips. The plan ends early if nothing more can be removed. Progress counts steps.
+    The first step removes the first of `ranked`. Each later step tries again the `TRIED_AGAIN` sources whose removal
+    harmed least when it was last tried, and no other sources. Every step is simulated, so the metrics of a step equal
+    the metrics of an evaluation of the remaining clips. The plan ends early if nothing more can be removed. Progress
+    counts steps.
 
     Parameters
     ----------
