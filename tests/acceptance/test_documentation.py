@@ -52,12 +52,19 @@ def test_metrics_that_a_page_names_exist_with_these_labels() -> None:
 
 
 def named_commands() -> list[tuple[str, str]]:
-    """Return (page name, command) for each `marey` command in a shell block of the pages."""
+    """Return (page name, command) for each `marey` command in a shell block or in a sentence of the pages."""
     found = []
     for page in WRITTEN:
-        for block in re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
-            lines = block.replace("\\\n", " ").splitlines()
+        text = page.read_text(encoding="utf-8")
+        for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL):
+            lines = [line.strip() for line in block.replace("\\\n", " ").splitlines()]
             found += [(page.name, line) for line in lines if line.startswith("marey ")]
+        if page.parent.name == "decisions" or page.name == "CHANGELOG.md":
+            continue  # their sentences may name commands that were rejected or removed
+        sentences = re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE)
+        # A group of commands may be named alone, such as `marey dataset`.
+        inline = re.findall(r"`(marey\s+[a-z][a-z-]*\s[^`]+)`", sentences)
+        found += [(page.name, " ".join(command.split())) for command in inline]
     return found
 
 
