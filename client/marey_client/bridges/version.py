@@ -76,7 +76,7 @@ class _Located(NamedTuple):
 
 @dataclass(frozen=True)
 class VersionToExport:
-    """Version of a dataset that may be exported: its clips, and the facts that exported folders name."""
+    """Version of a dataset that may be exported: its clips, and facts that the files of an export state."""
 
     dataset: DatasetToExport
     commit: Commit

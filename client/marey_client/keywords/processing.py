@@ -160,8 +160,8 @@ class ModelKeywords(TypedDict, total=False):
     """Tags that the results get."""
     criterion: Literal["held_out", "bic", "aic"]
     """Criterion that selects the mixture. held_out: the likelihood of examples of takes that were left out of the fit;
-    bic, aic: an information criterion. Mixtures for which left-out examples are no more likely than for one normal
-    distribution are then excluded. Without cross-validation, bic replaces held_out."""
+    bic, aic: an information criterion, which does not select a mixture for which left-out examples are no more likely
+    than for one normal distribution. Without cross-validation, bic replaces held_out."""
     covariance: Literal["full", "tied", "diagonal"] | None
     """Kind of covariance. full: one for each component, shrunk towards its diagonal; tied: one for all components;
     diagonal: one variance for each component and dimension; absent: the criterion selects it."""

@@ -131,7 +131,9 @@ def preview_edit(
     do: Do = None,
     file: From = None,
     saved: With = None,
-    frames: Annotated[str, typer.Option(help="Frames of the result to show, such as 100:200.")] = ":",
+    frames: Annotated[
+        str, typer.Option(help="Frames of the result to show, such as 100:200. Default: all.", show_default=False)
+    ] = ":",
     piece: Annotated[
         int, typer.Option(min=1, help="Number of the result to show if the commands split the clip, counted from 1.")
     ] = 1,
