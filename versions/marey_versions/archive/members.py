@@ -108,7 +108,10 @@ def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
         try:
             header = tarfile.TarInfo.frombuf(block, "utf-8", "strict")
         except (tarfile.TarError, ValueError) as error:
-            raise BadArchive(f"the file is no archive, or was cut off after {position:,} bytes: {error}") from error
+            raise BadArchive(
+                f"the file is not an archive, or its content after {position:,} bytes is damaged or missing ({error}); "
+                "copy or export the archive again"
+            ) from error
         if header.type != tarfile.REGTYPE or header.size < 0:
             raise BadArchive(f"{header.name}: the archive contains something other than a regular file")
         header.offset_data = position + tarfile.BLOCKSIZE
