@@ -506,7 +506,7 @@ def test_an_entry_that_cannot_go_back_to_its_place_stays_in_conflict(
     request = {"version": "trial", "resolutions": take}
     (conflict,) = refused(owner.post(f"{GAITS}/merges", json=request), 409, "merge-conflicts")["context"]["conflicts"]
     assert (conflict["path"], conflict["parts"]) == ("z", ["path"])
-    assert "would go back to 'b'" in conflict["reason"]
+    assert "would return to 'b'" in conflict["reason"]
 
 
 def put_labels(owner: httpx.Client, path: str, *segments: tuple[str, int, int]) -> None:

@@ -232,5 +232,5 @@ def test_a_changed_archive_is_refused_with_the_member(
         told = run("archive", command, file, status=1)
         assert told.stderr.startswith(f"{file}: ")
         assert "Traceback" not in told.stderr
-    assert "no archive" in run("archive", "verify", run.folder / "walk.bvh", status=1).stderr
+    assert "not an archive" in run("archive", "verify", run.folder / "walk.bvh", status=1).stderr
     assert "does not exist" in run("archive", "verify", "none.tar", status=2).stderr

@@ -277,8 +277,8 @@ def link() -> tarfile.TarInfo:
 @pytest.mark.parametrize(
     ("file", "message"),
     [
-        (io.BytesIO(b""), "no archive.json|no archive, or was cut off"),
-        (io.BytesIO(b"GIF89a" * 200), "no archive"),
+        (io.BytesIO(b""), "no archive.json|not an archive, or its content"),
+        (io.BytesIO(b"GIF89a" * 200), "not an archive"),
         (tar_of((tarfile.TarInfo("../evil"), b"x")), "is not a valid name of a member"),
         (tar_of((link(), b"")), "other than a regular file"),
         (tar_of((tarfile.TarInfo(MEMBERS[0].name), b"1"), (tarfile.TarInfo(MEMBERS[0].name), b"1")), "two members"),
