@@ -8,7 +8,10 @@ from typing import NamedTuple
 from marey_motion.clip import Clip
 from marey_motion.evaluation.improvement import reasons
 from marey_motion.evaluation.improvement.duplicates import NearDuplicate
+from marey_motion.evaluation.improvement.filling import Filling
+from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.suggest import Suggestions
+from marey_motion.evaluation.improvement.unused import UnusedClip
 from marey_motion.evaluation.perceived import indistinguishable
 from marey_motion.skeleton import Skeleton
 from marey_reports.drawing.drawn import DrawnFigure, Sketch
@@ -27,7 +30,7 @@ Poses = Mapping[str, tuple[Clip, ...]]
 """Poses of clips by uid: frames at even intervals, each as a clip of one frame."""
 
 
-class Proposal(NamedTuple):
+class ShownSuggestion(NamedTuple):
     """One suggestion: its reason, and the clips that it is about, each with its uid and name."""
 
     reason: str
@@ -35,12 +38,12 @@ class Proposal(NamedTuple):
 
 
 class _Chapter(NamedTuple):
-    """Chapter of the page; `about` describes all its proposals together."""
+    """Chapter of the page; `about` describes all its suggestions together."""
 
     name: str
     title: str
     about: str
-    proposals: tuple[Proposal, ...]
+    suggestions: tuple[ShownSuggestion, ...]
 
 
 def render_suggestions(found: Suggestions, poses: Poses, *, title: str, inputs: Sequence[ReportInput] = ()) -> str:
@@ -53,7 +56,7 @@ def render_suggestions(found: Suggestions, poses: Poses, *, title: str, inputs: 
     title : heading of the page, such as the path of the evaluation
     inputs : the evaluation and the candidates, for the head
     """
-    chapters = [chapter for chapter in _chapters(found) if chapter.proposals]
+    chapters = [chapter for chapter in _chapters(found) if chapter.suggestions]
     sections = [_section(chapter, poses) for chapter in chapters]
     sections.append(Section("provenance", "Provenance", provenance([found.result], ["value"])))
     said = (
@@ -69,7 +72,10 @@ def render_suggestions(found: Suggestions, poses: Poses, *, title: str, inputs: 
 def shown_sources(found: Suggestions) -> set[str]:
     """Return the uids of the clips whose poses the page shows."""
     return {
-        uid for chapter in _chapters(found) for proposal in chapter.proposals[:MOST_DRAWN] for uid, _ in proposal.clips
+        uid
+        for chapter in _chapters(found)
+        for suggestion in chapter.suggestions[:MOST_DRAWN]
+        for uid, _ in suggestion.clips
     }
 
 
@@ -86,7 +92,7 @@ def _numbers(found: Suggestions) -> Html:
 
 
 def _chapters(found: Suggestions) -> tuple[_Chapter, ...]:
-    """Return all chapters in the order of the page, also those without proposals."""
+    """Return all chapters in the order of the page, also those without suggestions."""
     trials = len(found.result.trials)
     look_same = None if found.metric is None else indistinguishable(found.metric)
     confirmed = found.confirmed
@@ -95,38 +101,38 @@ def _chapters(found: Suggestions) -> tuple[_Chapter, ...]:
     return (
         _Chapter(
             "unused", "Clips that no trial uses", unused,
-            tuple(Proposal(reasons.why_unused_clip(one), ((one.source, one.name),)) for one in found.unused.clips),
+            tuple(_about(one, reasons.why_unused_clip(one)) for one in found.unused.clips),
         ),
         _Chapter(
             "ranges", "Ranges that no trial uses", ranges,
-            tuple(Proposal(reasons.why_unused_range(one), ()) for one in found.unused.ranges),
+            tuple(ShownSuggestion(reasons.why_unused_range(one), ()) for one in found.unused.ranges),
         ),
         _Chapter(
             "removals", "Clips to remove, one after another", "Each effect is measured without all clips above it.",
             tuple(
-                Proposal(
-                    reasons.why_redundant(step.removal, trials, step.confirmed),
-                    ((step.removal.source, step.removal.name),),
-                )
-                for step in found.plan
+                _about(step.removal, reasons.why_redundant(step.removal, trials, step.confirmed)) for step in found.plan
             ),
         ),
         _Chapter(
             "duplicates", "Clips with nearly the same motion", "Below each clip stands the one that is like it.",
             tuple(
-                Proposal(reasons.why_duplicate(source, pair, look_same), _both(source, pair))
+                ShownSuggestion(reasons.why_duplicate(source, pair, look_same), _both(source, pair))
                 for source, pair in found.spared
             ),
         ),
         _Chapter(
             "fillings", "Clips that fill gaps in the coverage", "",
-            tuple(Proposal(reasons.why_filling(one), ((one.source, one.name),)) for one in found.fillings),
+            tuple(_about(one, reasons.why_filling(one)) for one in found.fillings),
         ),
         _Chapter(
             "additions", "Order in which to add clips", "",
-            tuple(Proposal(reasons.why_addition(step), ()) for step in found.additions),
+            tuple(ShownSuggestion(reasons.why_addition(step), ()) for step in found.additions),
         ),
     )  # fmt: skip
+
+
+def _about(clip: UnusedClip | Removal | Filling, reason: str) -> ShownSuggestion:
+    return ShownSuggestion(reason, ((clip.source, clip.name),))
 
 
 def _both(source: str, pair: NearDuplicate) -> tuple[tuple[str, str], ...]:
@@ -136,20 +142,20 @@ def _both(source: str, pair: NearDuplicate) -> tuple[tuple[str, str], ...]:
 
 
 def _section(chapter: _Chapter, poses: Poses) -> Section:
-    proposals = chapter.proposals
+    suggestions = chapter.suggestions
     body: list[Html] = [element("p", chapter.about)] if chapter.about else []
-    body.append(element("ol", [element("li", one.reason) for one in proposals]))
-    if any(one.clips for one in proposals) and len(proposals) > MOST_DRAWN:
-        body.append(element("p", f"Poses of the first {MOST_DRAWN} of {counted(len(proposals), 'suggestion')}:"))
+    body.append(element("ol", [element("li", one.reason) for one in suggestions]))
+    if any(one.clips for one in suggestions) and len(suggestions) > MOST_DRAWN:
+        body.append(element("p", f"Poses of the first {MOST_DRAWN} of {counted(len(suggestions), 'suggestion')}:"))
     body.extend(_pictures(chapter, poses))
     return Section(chapter.name, chapter.title, tuple(body))
 
 
 def _pictures(chapter: _Chapter, poses: Poses) -> list[Html]:
-    """Draw the clips of the first proposals: one picture for each skeleton."""
+    """Draw the clips of the first suggestions: one picture for each skeleton."""
     by_skeleton: dict[Skeleton, list[tuple[str, str]]] = {}
-    for proposal in chapter.proposals[:MOST_DRAWN]:
-        for uid, name in proposal.clips:
+    for suggestion in chapter.suggestions[:MOST_DRAWN]:
+        for uid, name in suggestion.clips:
             if uid in poses:
                 by_skeleton.setdefault(poses[uid][0].skeleton, []).append((uid, name))
     figures = {
