@@ -17,7 +17,7 @@ from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_comm
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
 COMPARE = OptionsOf("marey_schemas.queue.job_params:CompareParams")
 PRINTED_METRICS = (
@@ -91,6 +91,18 @@ def _print_several(document: Mapping[str, Any]) -> None:
         columns += [name, ""]
     print_table(columns, rows, right=[columns[1], *names])
     typer.echo(f"Each verdict is about the change from {document['names']['before']}; --out writes a report.")
+    _print_why_unclear([one for each in found for one in each.values()])
+
+
+def _print_why_unclear(metrics: Iterable[Mapping[str, Any]]) -> None:
+    """If changes have no interval because there are too few replicates, print how to get one."""
+    from marey_schemas.documents.replicates import LEAST_REPLICATES
+
+    if any(one["verdict"] == "unclear" and one["replicates"] < LEAST_REPLICATES for one in metrics):
+        typer.echo(
+            "“unclear” changes have no interval, because the evaluations have too few replicates. Evaluate all sets "
+            f"again with --replicates {LEAST_REPLICATES} or more."
+        )
 
 
 def _print_comparison(document: Mapping[str, Any]) -> None:
@@ -113,6 +125,7 @@ def _print_comparison(document: Mapping[str, Any]) -> None:
     ]  # fmt: skip
     columns = ("metric", "before", "after", "change", "95 % interval", "verdict")
     print_table(columns, rows, right=columns[1:5])
+    _print_why_unclear(metrics.values())
     _print_perceived(document)
     if moved:
         from marey_schemas.documents.worst_first import worst_first

@@ -68,11 +68,22 @@ def test_a_comparison_in_which_nothing_changed_says_so(capsys: pytest.CaptureFix
     assert "No trial changed: the results of all 162 trials are identical, bit for bit." in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("replicates", "said"), [(1, True), (8, False)])
+def test_a_change_without_interval_is_printed_with_what_is_missing(
+    replicates: int, said: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lists: dict[str, list[str]] = {name: [] for name in ("changed", "removed", "added", "newly_unused")}
+    change = {"metric": "offset_mean", "before": 0.5, "after": 0.6, "change": 0.1, "low": None, "high": None,
+              "verdict": "unclear", "replicates": replicates}  # fmt: skip
+    _print_comparison({**lists, "metrics": [change], "trials": 162})
+    assert ("--replicates 3 or more" in " ".join(capsys.readouterr().out.split())) is said
+
+
 def test_several_sets_are_printed_beside_each_other_with_their_verdicts(
     script: ScriptedServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def compared(after: str, offset_m: float, verdict: str) -> dict[str, object]:
-        change = {"metric": "offset_mean", "before": 0.5, "after": offset_m, "verdict": verdict}
+        change = {"metric": "offset_mean", "before": 0.5, "after": offset_m, "verdict": verdict, "replicates": 8}
         return {"names": {"before": "union", "after": after}, "metrics": [change]}
 
     _print_several({**compared("walks", 0.25, "better"), "others": [compared("runs", 0.75, "worse")]})
