@@ -28,7 +28,7 @@ from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_la
 from marey_client.cli.datasets import combining, versions
 from marey_client.cli.datasets.combining import resolutions_of
 from marey_client.cli.files import uploading
-from marey_client.cli.files.listing import _items_in
+from marey_client.cli.files.listing import _folders_in, _items_in
 from marey_client.cli.files.uploading import _print_entries
 from marey_client.cli.queue.jobs import _done
 from marey_client.cli.queue.pipelines import _print_shortfalls
@@ -60,9 +60,9 @@ def marey_here(arguments: Iterable[str], env: dict[str, str], cwd: Path | None =
 
 
 NO_OPTIONS = typer.Context(typer.main.get_command(app))
+AT = "2026-01-01T00:00:00Z"
 PROJECT = {
-    "id": "project_1", "name": "lab", "visibility": "private", "created_at": "2026-01-01T00:00:00Z",
-    "updated_at": "2026-01-01T00:00:00Z", "rev": 1,
+    "id": "project_1", "name": "lab", "visibility": "private", "created_at": AT, "updated_at": AT, "rev": 1,
 }  # fmt: skip
 
 
@@ -282,6 +282,14 @@ def test_a_folder_is_shown_without_reading_those_below_it(script: ScriptedServer
     _items_in(script.marey(), Address("lab", "raw"), recursive=False, kinds=None, tag=None)
     assert {request.url.params["directly_in"] for request in script.requests} == {"raw"}
     assert not any("collection" in request.url.params for request in script.requests)
+
+
+def test_each_folder_directly_in_a_folder_is_listed_once(script: ScriptedServer) -> None:
+    below = ("raw/walks/slow", "raw/walks", "raw/runs/fast")
+    listed = [{"id": path, "path": path, "created_at": AT, "updated_at": AT, "rev": 1} for path in below]
+    script.answers = [httpx.Response(200, json={"items": listed, "next_cursor": None})] * 2
+    assert _folders_in(script.marey(), Address("lab", "raw")) == ["runs", "walks"]
+    assert _folders_in(script.marey(), Address("lab", "")) == ["raw"]
 
 
 @pytest.mark.parametrize(("token", "hinted"), [(None, True), ("marey_secret", False)])
