@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import yaml
@@ -13,12 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.version_in_memory import VersionInMemory, tree
 
-from marey_client.bridges import huggingface
+from marey_client.bridges import files, huggingface
 from marey_client.bridges.files import MotionFiles
 from marey_client.bridges.folders import file_names, new_folder
 from marey_client.bridges.huggingface import dataset_card, size_category, write_huggingface
 from marey_client.bridges.sidecars import SidecarWriter, read_sidecar
 from marey_client.errors import BadSidecar, CannotExport, FolderNotEmpty, NothingToUpload
+from marey_client.handles.versions import DatasetHandle
 from marey_client.imports import find_files
 from marey_motion.gait import generate_gait
 from marey_schemas.datasets.exports import ExportedClip, ExportedIdentity, ExportedRecord
@@ -172,6 +173,28 @@ def test_no_folder_of_the_hub_has_too_many_files(tmp_path: Path, monkeypatch: py
     rows = list(csv.DictReader(io.StringIO((tmp_path / "out/metadata.csv").read_text("utf-8"))))
     assert next(iter(rows[0])) == "file_name"
     assert [(tmp_path / "out" / row["file_name"]).read_text() for row in rows] == [row["clip"] for row in rows]
+
+
+def test_the_handle_of_a_dataset_writes_the_folder_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    version = VersionInMemory.of({"walks/slow": generate_gait(1.0, 0.0, 0.2)})
+    asked: list[object] = []
+
+    def found(dataset: object, name: str, path: str, **_: object) -> VersionInMemory:
+        asked.extend((dataset, name, path))
+        return version
+
+    def write(_motions: MotionFiles, one: Any, target: Path) -> str:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(one.clip.path)
+        return CONTENT
+
+    monkeypatch.setattr(files, "version_to_export", found)
+    monkeypatch.setattr(MotionFiles, "_write_one", write)
+    gaits = DatasetHandle(cast(Any, None), "/projects/lab/datasets/gaits")
+    done = gaits.export_huggingface(tmp_path / "out", "v1", path="walks", format="npz")
+    assert asked == [gaits, "v1", "walks"]
+    assert (done.clips, done.folder) == (1, tmp_path / "out")
+    assert {"README.md", "data/00000/walks/slow.npz"} <= tree(tmp_path / "out").keys()
 
 
 def exported_folder(folder: Path, *clips: ExportedClip, **header: Any) -> Path:
