@@ -171,6 +171,9 @@ def with_earlier_facts(info: Mapping[str, Any], earlier: Mapping[str, Any]) -> d
 
     If both revisions state the last day of the consent, the earlier day counts. If both revisions state the purposes of
     the consent, only the purposes that occur in both revisions count.
+
+    The earlier messages of warnings are kept if the same file was imported in the same way, and if nothing but the
+    messages differs. So no revision is added because a newer version of Marey words a warning differently.
     """
     names = [name for name in RecordingFacts.model_fields if info.get(name) is None and earlier.get(name) is not None]
     kept = {**info, **{name: earlier[name] for name in names}}
@@ -178,7 +181,15 @@ def with_earlier_facts(info: Mapping[str, Any], earlier: Mapping[str, Any]) -> d
         kept["consent_until"] = min(info["consent_until"], earlier["consent_until"])
     if info.get("consent_for") is not None and earlier.get("consent_for") is not None:
         kept["consent_for"] = [one for one in info["consent_for"] if one in earlier["consent_for"]]
+    source, checks = info.get("source") or {}, earlier.get("checks")
+    if checks and source.get("file") and source == earlier.get("source") and _findings(info) == _findings(earlier):
+        kept["checks"] = checks
     return kept
+
+
+def _findings(info: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the warnings of the part `info` of a clip without their messages."""
+    return [{name: value for name, value in check.items() if name != "message"} for check in info.get("checks", ())]
 
 
 class ClipInfo(RecordingFacts):

@@ -16,7 +16,7 @@ from tests.support.tiers import examples
 from marey_schemas.items import Staleness
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.store import documents, items, projects
+from marey_server.store import blobs, documents, items, projects
 from marey_server.store.database import prepared
 from marey_server.store.items import Draft, StoredDocument, publishing, references
 from marey_server.store.items.drafts import Published
@@ -66,6 +66,25 @@ def test_other_content_under_a_name_is_its_next_revision(lab: Lab) -> None:
     clip, _ = publish(lab, clip_draft(seed=1, frames=9), rig_draft())
     assert (clip.revision, clip.created) == (2, True)
     assert listed(lab, Kind.CLIP)[0].summary["frames"] == 9
+
+
+def test_a_warning_in_other_words_makes_no_new_revision(lab: Lab) -> None:
+    def take(message: str, angle_deg: float = 83.0, file: bytes = b"take") -> Draft:
+        warning = {"code": "rotation-jump", "message": message, "frames": [0, 2], "values": {"angle_deg": angle_deg}}
+        source = {"file": lab.write(blobs.put_blob, file), "format": "bvh"}
+        info = {"schema": "marey/clip-info@1", "source": source, "checks": [warning]}
+        draft = clip_draft()
+        return replace(draft, parts={**draft.parts, "info": info})
+
+    first, _ = publish(lab, take("one joint jumps"), rig_draft())
+    again, _ = publish(lab, take("a rotation jumps"), rig_draft())
+    assert (again.revision, again.created) == (first.revision, False)
+    kept = lab.read(items.read_part, "lab", Kind.CLIP, first.item, "info").tree
+    assert kept["checks"][0]["message"] == "one joint jumps"
+    assert publish(lab, take("a rotation jumps", angle_deg=90.0), rig_draft())[0].revision == 2
+    assert publish(lab, take("one joint jumps", angle_deg=90.0, file=b"retake"), rig_draft())[0].revision == 3
+    kept = lab.read(items.read_part, "lab", Kind.CLIP, first.item, "info").tree
+    assert kept["checks"][0]["message"] == "one joint jumps"
 
 
 def test_equal_content_is_found_under_any_name_even_after_its_other_parts_were_edited(lab: Lab) -> None:
