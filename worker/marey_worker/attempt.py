@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import platform
 import signal
-import tempfile
 import threading
 import time
 import uuid
@@ -17,7 +16,6 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import accumulate
-from pathlib import Path
 from typing import Any
 
 from marey_client.errors import (
@@ -48,7 +46,7 @@ from marey_schemas.tracing.declared import COMPLETE, COMPUTE
 from marey_schemas.tracing.export import Tracer
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
-from marey_worker.attempt_limits import LogUploader, Stop, Watch, remove_folder
+from marey_worker.attempt_limits import LogUploader, Stop, Watch
 from marey_worker.attempt_trace import AttemptTrace
 from marey_worker.heartbeats import LeaseKeeper
 from marey_worker.job_io.input_cache import InputCache
@@ -72,6 +70,7 @@ from marey_worker.messages import (
     pack,
     unpack,
 )
+from marey_worker.scratch import ScratchFolder
 from marey_worker.texts import storable
 
 LIBRARIES = ("marey", "numpy", "scipy", "numba")
@@ -126,8 +125,8 @@ class RunningAttempt:
         self._server = server
         self._threads = threads
         self._trace = AttemptTrace(lease, tracer)
-        self._scratch = Path(tempfile.mkdtemp(prefix="marey-job-"))
-        self._job_log = LogUploader(api, self._scratch / "log")
+        self._scratch = ScratchFolder()
+        self._job_log = LogUploader(api, self._scratch.path / "log")
         self._keeper = LeaseKeeper(api, lease)
         self._watch = Watch(lease, self._keeper, stopping, self._job_log, time.monotonic())
         self._log_due = time.monotonic() + LOG_EVERY_S
@@ -177,15 +176,15 @@ class RunningAttempt:
         for threads in (self._transfers, self._log_sender):
             threads.shutdown(wait=False, cancel_futures=True)
         try:
-            remove_folder(self._scratch)
+            self._scratch.remove()
         except OSError as error:
-            log.warning("%s: the folder %s cannot be removed: %s", self._lease.job, self._scratch, error)
+            log.warning("%s: the folder %s cannot be removed: %s", self._lease.job, self._scratch.path, error)
 
     def _order(self) -> Run:
         lease = self._lease
         return Run(
             lease.job, lease.kind, lease.params, lease.inputs, lease.seed,
-            lease.resources.memory_limit_mb * MIB, self._job_log.path, self._scratch, self._threads,
+            lease.resources.memory_limit_mb * MIB, self._job_log.path, self._scratch.path, self._threads,
             lease.position, lease.size, lease.into,
         )  # fmt: skip
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import threading
 import time
 from dataclasses import dataclass
@@ -107,29 +105,3 @@ class Watch:
             Stop.MEMORY: f"the job needs more memory than its limit of {resources.memory_limit_mb} MiB",
             Stop.LOG: f"the job's log grew beyond its limit of {LOG_LIMIT_BYTES // MIB} MiB",
         }[stop]
-
-
-def remove_folder(folder: Path) -> None:
-    """Remove a folder with its content, if it exists; links are removed, not followed.
-
-    No process may write to the folder any more. Before a subfolder is emptied, it is moved to the top, because a script
-    can nest folders deeper than a path can be long. Raises `OSError` if something cannot be removed.
-    """
-    prefix = secrets.token_hex(8)
-    waiting, count = [folder] if folder.is_dir() else [], 0
-    while waiting:
-        emptied = waiting.pop()
-        emptied.chmod(0o700)
-        with os.scandir(emptied) as entries:
-            for entry in list(entries):
-                if not entry.is_dir(follow_symlinks=False):
-                    os.unlink(entry.path)
-                    continue
-                os.chmod(entry.path, 0o700)
-                count += 1
-                waiting.append(folder / f"{prefix}-{count}")
-                os.rename(entry.path, waiting[-1])
-        if emptied != folder:
-            emptied.rmdir()
-    if folder.is_dir():
-        folder.rmdir()

@@ -23,6 +23,7 @@ from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE, SCRIPT
 from marey_schemas.sizes import MIB
 from marey_schemas.tracing.export import closing, open_optional_tracer
 from marey_worker.one_job import NamedJob, OneJobWorker
+from marey_worker.scratch import remove_abandoned
 from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache, runnable_kinds
 
 SERVICE = "marey-worker"
@@ -66,6 +67,7 @@ def work(
         slots=slots, kinds=_known_kinds(kinds), labels=labels,
         cache=cache or default_cache(os.environ), **given,
     )  # fmt: skip
+    remove_abandoned()
     tracer = open_optional_tracer(SERVICE, os.environ)
     transport = Transport(credential.url, credential.bearer, retries=BRIEF)
     worker: Supervisor | OneJobWorker

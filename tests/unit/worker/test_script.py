@@ -26,9 +26,9 @@ from marey_schemas.consents import CONSENT_EXPIRED
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.own_pods import IMAGE_VARIABLE
 from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE, ScriptDeclaration, ScriptParams
-from marey_worker.attempt_limits import remove_folder
 from marey_worker.context import JobRefused
 from marey_worker.kinds import script
+from marey_worker.scratch import remove_folder
 from marey_worker.scripts import guard
 from marey_worker.scripts.checkout import FetchFailed
 from marey_worker.scripts.confinement import landlock_version
