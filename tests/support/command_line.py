@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 from tests.support.server_process import ServerProcess
@@ -38,6 +39,14 @@ class CommandLine:
             done = run_here(words, stdin)
         assert done.returncode == status, done.stdout + done.stderr
         return done
+
+    def execute(self, code: str, names: dict[str, Any], origin: str) -> str:
+        """Run Python code as a script that uses and adds `names`; return what it prints. `origin` is where it stands."""
+        told = io.StringIO()
+        surroundings = mock.patch.dict(os.environ, self._environment({}), clear=True)
+        with surroundings, contextlib.chdir(self.folder), contextlib.redirect_stdout(told):
+            exec(compile(code, origin, "exec"), names)
+        return told.getvalue()
 
     def start(self, *arguments: object) -> subprocess.Popen[str]:
         """Start a command in a separate process, and return the process, whose output can be read."""
