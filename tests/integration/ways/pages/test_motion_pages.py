@@ -9,6 +9,7 @@ from tests.support.command_line import CommandLine
 from tests.support.printed_pages import PrintedPage
 from tests.support.short_walks import write_named_walks
 
+from marey_client import Marey
 from marey_client.project import ProjectHandle
 
 Reads = Callable[..., PrintedPage]
@@ -53,3 +54,44 @@ def test_retarget(
     checks = run("show", "lab/on-mixamo/raw/walk").stdout
     assert "feet-kept" in checks
     assert "hands-kept" in checks
+
+
+def test_export_motion(
+    empty_lab: ProjectHandle, marey: Marey, add_walks: AddWalks, reads: Reads, tmp_path: Path
+) -> None:
+    add_walks("raw", "walk", "turn", seconds=2.0)
+    (skeleton,) = empty_lab.skeletons
+    empty_lab.retarget("raw", skeleton.id, into="on-mixamo").wait()
+    empty_lab.align("raw", into="walk/aligned").wait()
+    page = reads("docs/how-to/export-motion.md")
+    page.follow(1)
+    assert (tmp_path / "walk.bvh").read_bytes() == (tmp_path / "recorded" / "raw" / "walk.bvh").read_bytes()
+    assert {file.name for file in (tmp_path / "out").rglob("*.bvh")} == {"walk.bvh", "turn.bvh"}
+    page.follow()
+    assert "on-mixamo/raw/turn 30.0 (60, 2, 4) (60, 3)" in page.printed("from marey_client")
+
+
+def test_edit_motion(
+    empty_lab: ProjectHandle, marey: Marey, add_walks: AddWalks, reads: Reads, run: CommandLine
+) -> None:
+    add_walks("takes", "walk", "run", seconds=10.0)
+    page = reads("docs/how-to/edit-motion.md")
+    page.follow(1)
+    assert "concatenate" in page.printed("marey edit commands")
+    assert "window_s" in page.printed("marey edit commands smooth")
+    assert "240" in page.printed("marey edit preview")
+    page.follow(1)
+    assert [clip.path for clip in empty_lab.clips.list(sort="name", collection="clean")] == [
+        "clean/takes/run", "clean/takes/walk"
+    ]  # fmt: skip
+    walk = empty_lab.clips["takes/walk"]
+    assert (walk.item.revision, empty_lab.clips["takes/walk-mirrored"].frames) == (2, walk.frames)
+    page.follow()
+    assert "(100, 26, 3)" in page.printed("from marey_client")
+    assert "Studio takes 0 trim start=30" in page.printed("marey edit show lab/edits/clean-up")
+    assert "trim" in (run.folder / "clean-up.json").read_text(encoding="utf-8")
+    for job in list(empty_lab.jobs()):
+        assert marey.jobs.wait(job.id).state == "succeeded"
+    assert empty_lab.clips["joined/takes/walk"].frames > 300
+    run("edit", "apply", "lab/takes/walk", "--do", "cut_loop", "--into", "loops", "--tag", "loop")
+    assert empty_lab.clips["loops/takes/walk"].item.tags == ("loop",)
