@@ -41,7 +41,7 @@ class CommandLine:
         return done
 
     def execute(self, code: str, names: dict[str, Any], origin: str) -> str:
-        """Run Python code as a script that uses and adds `names`; return what it prints. `origin` is where it stands."""
+        """Run Python code as a script that shares `names`; return what it prints. `origin` names its file."""
         told = io.StringIO()
         surroundings = mock.patch.dict(os.environ, self._environment({}), clear=True)
         with surroundings, contextlib.chdir(self.folder), contextlib.redirect_stdout(told):

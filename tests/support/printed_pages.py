@@ -80,26 +80,31 @@ class PrintedPage:
     def _type(self, line: str) -> None:
         if self._of(self.left_out, line):
             return
-        command, _, file = self._as_replaced(line).partition(" > ")
+        command = self._as_replaced(line)
+        redirected = re.fullmatch(r"(marey .*) > ([\w./-]+)", command)
+        command, file = redirected.groups() if redirected else (command, None)
         words = self._words(command)
-        if words[0] == "export":
-            self.variables.update(word.split("=", 1) for word in words[1:])
+        if re.match(r"(export )?\w+=", command):
+            self.variables |= dict(word.split("=", 1) for word in words if word != "export")
             return
-        assert words[0] == "marey", f"{self.page}: {line}: leave it out with a reason"
+        if words[0] != "marey":
+            self._printed[line] = self._run_other(command)
+            return
         more = self._of(self.shortened, line) or ()
-        done = self.run(*words[1:], *more, stdin=self._of(self.inputs, line) or "", **self.variables)
+        typed = self._of(self.inputs, line) or ""
+        done = self.run(*words[1:], *more, status=0, stdin=typed, **self.variables)
         if file:
             (self.run.folder / file).write_text(done.stdout, encoding="utf-8")
         self._printed[line] = " ".join((done.stdout + done.stderr).split())
 
     def _words(self, command: str) -> list[str]:
         """Return the words of a command, as bash expands them in the folder of the reader."""
-        home = {"PATH": os.environ["PATH"], "HOME": str(self.run.folder)}
-        script = f"printf '%s\\0' {command}"
-        expanded = subprocess.run(
-            ["bash", "-c", script], cwd=self.run.folder, env=home, capture_output=True, check=True
-        )
-        return expanded.stdout.decode().split("\0")[:-1]
+        return self._run_other(f"printf '%s\\0' {command}").split("\0")[:-1]
+
+    def _run_other(self, command: str) -> str:
+        """Run a command of another program than `marey` in bash, and return what it prints."""
+        home = {"PATH": os.environ["PATH"], "HOME": str(self.run.folder), **self.variables}
+        return subprocess.check_output(["bash", "-ec", command], cwd=self.run.folder, env=home, text=True)
 
     def _of(self, beginnings: Mapping[str, Any], line: str) -> Any:
         """Return the value of the longest beginning of a line, or None, and remember that it was needed."""
