@@ -83,13 +83,13 @@ class PrintedPage:
         command = self._as_replaced(line)
         redirected = re.fullmatch(r"(marey .*) > ([\w./-]+)", command)
         command, file = redirected.groups() if redirected else (command, None)
-        words = self._words(command)
         if re.match(r"(export )?\w+=", command):
-            self.variables |= dict(word.split("=", 1) for word in words if word != "export")
+            self.variables |= dict(word.split("=", 1) for word in self._words(command.removeprefix("export ")))
             return
-        if words[0] != "marey":
+        if not command.startswith("marey "):
             self._printed[line] = self._run_other(command)
             return
+        words = self._words(command)
         more = self._of(self.shortened, line) or ()
         typed = self._of(self.inputs, line) or ""
         done = self.run(*words[1:], *more, status=0, stdin=typed, **self.variables)
