@@ -1,4 +1,4 @@
-"""The pages for programmers, run as printed."""
+"""The pages for programmers and the front page, run as printed."""
 
 import json
 import shutil
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.support.evaluation_takes import write_walks
 from tests.support.printed_pages import ROOT, PrintedPage
 from tests.support.server_process import ServerProcess
 from tests.support.short_walks import write_named_walks
@@ -72,3 +73,25 @@ def test_trace_requests(
     empty_lab.upload(tmp_path / "takes", collection="raw")
     page.follow()
     assert "on-mixamo/raw/walk" in {one.path for one in empty_lab.clips}
+
+
+def test_the_front_page(
+    empty_lab: ProjectHandle, add_walks: AddWalks, name_skeletons: Callable[..., None], reads: Reads, tmp_path: Path
+) -> None:
+    add_walks("rigs", "rig")
+    name_skeletons("mixamo (178 cm)")
+    write_walks(tmp_path / "takes", seconds=4.0)
+    page = reads(
+        "README.md",
+        left_out={
+            "make ": "installs Marey",
+            ". .venv": "changes the shell",
+            "marey project create lab": "a fixture has created the project",
+        },
+        shortened={"marey evaluate": ("--speeds", "1", "--turns", "0", "--duration", 4, "--replicates", 1)},
+    )
+    page.follow()
+    assert len(list(empty_lab.clips.list(collection="walks"))) == 9
+    assert len(list((tmp_path / "retargeted").rglob("*.bvh"))) == 9
+    assert (tmp_path / "walks.html").read_bytes().startswith(b"<!DOCTYPE html>")
+    assert len(list((tmp_path / "samples").glob("*.bvh"))) == 10
