@@ -2,12 +2,22 @@
 
 import re
 import shlex
+from pathlib import Path
 
 from docs.generate import ROOT, files
 from tests.support.named_commands import unknown_options
+from tests.support.printed_pages import blocks
 from tests.support.who_may import table
 
 from marey_server.process.observe import Metrics
+
+NOT_RUN = {
+    "docs/reference/motion-library.md": "generated from docstrings, whose examples tests/unit/motion runs",
+    "docs/explanation/datasets-compared.md": "needs three collections of recorded motion",
+    "docs/how-to/keep-a-project-in-order.md": "its examples belong to different projects",
+    "docs/explanation/twenty-one-walkers.md": "runs a benchmark on recorded motion",
+}
+"""Pages whose blocks no test runs, each with the reason."""
 
 WRITTEN = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 
@@ -79,3 +89,14 @@ def test_every_command_that_a_page_names_exists_with_these_options() -> None:
         else:
             wrong += [f"{page}: {line}: {option}" for option in sorted(unknown)]
     assert wrong == []
+
+
+def test_a_test_runs_the_blocks_of_each_page() -> None:
+    files = [file for file in sorted((ROOT / "tests").rglob("test_*.py")) if file != Path(__file__)]
+    tests = "".join(file.read_text(encoding="utf-8") for file in files)
+    unnamed = set()
+    for page in (one.relative_to(ROOT) for one in WRITTEN):
+        joined = '" / "'.join(page.parts)
+        if blocks(str(page)) and f'"{page}"' not in tests and f'"{joined}"' not in tests:
+            unnamed.add(str(page))
+    assert unnamed == NOT_RUN.keys(), "write a test in tests/integration/ways/pages"
