@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.support.command_line import CommandLine
@@ -232,7 +233,7 @@ def test_write_a_job_kind(sqlite_template: Path, tmp_path: Path) -> None:
         assert "speed_m_s" in submitted
     params = type("SweepParams", (Request,), {})
     stated = {"name": "sweep", "description": "Sweeps.", "params": params, "version": 1, "inputs": {}, "outputs": {}}
-    names = {"KindDeclaration": partial(KindDeclaration, **stated)}
+    names: dict[str, Any] = {"KindDeclaration": partial(KindDeclaration, **stated)}
     exec(compile(sweep.replace("...,", "", 1), page, "exec"), names)
     assert callable(names["SWEEP"].task_count)
 
