@@ -297,9 +297,9 @@ class OptimiseKeywords(TypedDict, total=False):
     max_steps: int
     """Greatest number of steps."""
     max_evaluations: int | None
-    """Greatest number of sets of clips to try; null: no limit."""
+    """Greatest number of sets of clips to try; absent: no limit."""
     max_data_s: float | None
-    """Greatest duration of the set in seconds; no clip is added that would exceed this duration; null: no limit."""
+    """Greatest duration of the set in seconds; no clip is added that would exceed this duration; absent: no limit."""
     consider: int | None
     """Number of removals, and number of additions, to try in each step; null: all."""
 

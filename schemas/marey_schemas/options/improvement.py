@@ -147,7 +147,7 @@ class OptimisationOptions(ConfirmedEffects):
     )
     max_steps: int = Field(50, ge=1, le=10_000, description="Greatest number of steps.")
     max_evaluations: int | None = Field(
-        None, ge=1, le=1_000_000, description="Greatest number of sets of clips to try; null: no limit."
+        None, ge=1, le=1_000_000, description="Greatest number of sets of clips to try; absent: no limit."
     )
     max_data_s: float | None = Field(
         None,
@@ -155,7 +155,7 @@ class OptimisationOptions(ConfirmedEffects):
         le=1e7,
         allow_inf_nan=False,
         description="Greatest duration of the set in seconds; no clip is added that would exceed this duration; "
-        "null: no limit.",
+        "absent: no limit.",
     )
     consider: int | None = Field(
         20,

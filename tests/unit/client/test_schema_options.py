@@ -106,7 +106,7 @@ def test_help_tells_meaning_range_and_default_of_the_schema() -> None:
     assert help_of(EVALUATE, "speeds_m_s").endswith("Above 0, at most 20; a,b,c or first:last:step; default 1:3:0.25.")
     assert help_of(EVALUATE, "baseline").endswith("Default on.")
     assert help_of(CUT, "margin_before_s").endswith("0 to 3600; default 0.")
-    assert help_of(ALIGN, "slope_limit").endswith("0 to 60; none or -1: no limit; default 3.")
+    assert help_of(ALIGN, "slope_limit").endswith("none or -1: no limit. 0 to 60; default 3.")
 
 
 def test_every_command_can_make_its_options_and_explains_each() -> None:
@@ -116,6 +116,8 @@ def test_every_command_can_make_its_options_and_explains_each() -> None:
         assert sorted(spelled) == sorted(set(spelled)), path
         unclear = [option.name for option in command.get_params(context) if not getattr(option, "help", "")]
         assert unclear == [], path
+        untypable = [option.name for option in command.get_params(context) if "null" in (option.help or "")]
+        assert untypable == [], path
         for name, child in getattr(command, "commands", {}).items():
             walk(child, f"{path} {name}")
 

@@ -155,12 +155,13 @@ class _Option:
     def help(self) -> str:
         """Return the help text of an option: description, range, default, and the syntax for several values."""
         meaning = self.schema.get("description", "")
+        if self._form == "number or none":  # nobody can type the null of JSON
+            meaning = meaning.replace("null: ", f"{NONE}{f' or {self.null}' if self.null else ''}: ")
         notes = [
             range_text(self._schema),
             f"names: {', '.join(names)}" if (names := self._schema.get("properties")) else "",
             *(["may be repeated"] if self._form in ("texts", "assignments") else []),
             *(["a,b,c or first:last:step"] if self._form == "numbers" else []),
-            *([f"{NONE}{f' or {self.null}' if self.null else ''}: no limit"] if self._form == "number or none" else []),
             f"default {default}" if (default := default_text(self.schema)) else "",
         ]
         note = "; ".join(filter(None, notes))
