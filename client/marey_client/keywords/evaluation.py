@@ -69,7 +69,7 @@ class ControllerKeywords(TypedDict, total=False):
     character; open_loop: points that the character reaches from its present position with the speed and turn rate of
     the reference."""
     search_every_s: float
-    """Seconds from one search of the database to the next."""
+    """Seconds from one search of the clips for the best frame to the next search."""
     continuing_bias: float
     """Value added to the cost of continuing the current clip; negative values favour continuing."""
     switch_margin: float
@@ -82,8 +82,9 @@ class ControllerKeywords(TypedDict, total=False):
     root_inertialisation: bool
     """Whether the blend after a switch also includes the root's velocity."""
     selection: Literal["features", "pose_distance"]
-    """Cost of the search. features: the weighted features; pose_distance: the published cost, the summed distance of
-    joints in metres."""
+    """Cost that each search minimises. features: the squared distance of the weighted features; pose_distance: the same
+    for the features of the trajectory only, plus the distances between the joints of the two poses in metres, as in
+    Abichequer Sangalli et al. (2022)."""
     root_adjustment: float
     """Rate, per second, at which the character is pulled to the trajectory that it follows: within a second, the
     distance shrinks by the factor exp(-rate). This hides tracking errors. 0: it is not pulled."""
@@ -177,7 +178,7 @@ class EvaluateKeywords(TypedDict, total=False):
     replicates: int
     """Number of replicates of each trial. The first one is the trial itself; each further one has another phase of the
     stride at the start, and an approach that is up to one second longer. Results are means with 95 % intervals. 1: only
-    the trial itself, as in the published method, without intervals."""
+    the trial itself, as in Abichequer Sangalli et al. (2022), without intervals."""
     seed: int
     """Seed of the random differences between the replicates of a trial."""
     window: Literal["circle", "all"]
@@ -186,8 +187,8 @@ class EvaluateKeywords(TypedDict, total=False):
     coverage_least_s: float
     """Seconds of data that a cell of the coverage map (a speed and a turn rate) needs to count as covered."""
     literal_formulas: bool
-    """Also compute errors by the published formulas exactly as they are printed, only to compare results with those of
-    the publication."""
+    """Also compute errors by the formulas of Abichequer Sangalli et al. (2022) exactly as they are printed, only to
+    compare results with those of this publication."""
     database: DatabaseOptions | DatabaseKeywords
     """Options of the database that is built from the clips."""
     controller: ControllerOptions | ControllerKeywords

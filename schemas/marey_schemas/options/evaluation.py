@@ -131,8 +131,8 @@ class EvaluationOptions(Grid):
         le=64,
         description="Number of replicates of each trial. The first one is the trial itself; each further one has "
         "another phase of the stride at the start, and an approach that is up to one second longer. "
-        "Results are means with 95 % intervals. 1: only the trial itself, as in the published "
-        "method, without intervals.",
+        "Results are means with 95 % intervals. 1: only the trial itself, as in Abichequer Sangalli et al. (2022), "
+        "without intervals.",
     )
     seed: int = Field(
         0, ge=0, lt=SEEDS, description="Seed of the random differences between the replicates of a trial."
@@ -152,8 +152,8 @@ class EvaluationOptions(Grid):
     )
     literal_formulas: bool = Field(
         False,
-        description="Also compute errors by the published formulas exactly as they are printed, only to "
-        "compare results with those of the publication.",
+        description="Also compute errors by the formulas of Abichequer Sangalli et al. (2022) exactly as they are "
+        "printed, only to compare results with those of this publication.",
     )
     database: DatabaseOptions = Field(
         DatabaseOptions(), description="Options of the database that is built from the clips."

@@ -122,7 +122,11 @@ class ControllerOptions(Options):
         "position with the speed and turn rate of the reference.",
     )
     search_every_s: float = Field(
-        0.1, gt=0, le=2, allow_inf_nan=False, description="Seconds from one search of the database to the next."
+        0.1,
+        gt=0,
+        le=2,
+        allow_inf_nan=False,
+        description="Seconds from one search of the clips for the best frame to the next search.",
     )
     continuing_bias: float = Field(
         0.0,
@@ -159,8 +163,9 @@ class ControllerOptions(Options):
     )
     selection: Selection = Field(
         "features",
-        description="Cost of the search. features: the weighted features; pose_distance: the published cost, "
-        "the summed distance of joints in metres.",
+        description="Cost that each search minimises. features: the squared distance of the weighted features; "
+        "pose_distance: the same for the features of the trajectory only, plus the distances between the joints of the "
+        "two poses in metres, as in Abichequer Sangalli et al. (2022).",
     )
     root_adjustment: float = Field(
         0.0,
