@@ -1,4 +1,7 @@
-"""Invitations: one-time codes with which people become members of a project, or create their own account."""
+"""Invitations: codes with which people become members of a project, or create their own account.
+
+A code can be used a limited number of times, by default once.
+"""
 
 from __future__ import annotations
 
