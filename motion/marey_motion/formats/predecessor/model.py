@@ -228,7 +228,7 @@ def _basis(part: Document, what: str, file: str) -> SplineBasis:
     degree = part.get("degree", DEGREE)
     if isinstance(degree, bool) or not isinstance(degree, int) or not 1 <= degree < 10:
         raise FormatError(
-            f"{what}: the degree of the spline is {degree!r}, but must be a small whole number", file=file
+            f"{what}: the degree of the spline is {degree!r}, but must be a whole number from 1 to 9", file=file
         )
     basis = SplineBasis(knots, degree)
     _check_size(basis.frame_count, basis.count, what, file)
