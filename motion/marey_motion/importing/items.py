@@ -48,7 +48,8 @@ class FileToImport:
     options : import options given by the user
     notes, notes_digest : bytes and digest of the file with the annotation or alignment of the motion
     skeleton : stored skeleton that the clips must use
-    sibling_axis : upward axis of other files with this skeleton; None in the first look at a file
+    sibling_axis : upward axis of other files with this skeleton, if the file is read a second time because it does not
+        clearly show its own axis; otherwise None
     """
 
     planned: PlannedFile

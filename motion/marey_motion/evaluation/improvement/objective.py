@@ -75,7 +75,7 @@ def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
 def measure_headlines(
     trial: Trial, reference: Reference, record: TrialRecord, options: EvaluationOptions
 ) -> TrialResult:
-    """Compute only the headline metrics of a trial, which is faster than `metrics.measure_trial`.
+    """Compute only the headline metrics of a trial, which is faster than computing all of them.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def measure_headlines(
 
     Returns
     -------
-    TrialResult    the values that `metrics.measure_trial` computes, to the last bit; without regimes
+    TrialResult    the headline metrics of the whole trial; each equals the value of `metrics.measure_trial` bit for bit
     """
     series = trial_series(trial, reference, record)
     window = np.full(len(series.times_s), True) if options.window == "all" else series.pieces >= 0
