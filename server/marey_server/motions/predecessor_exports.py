@@ -1,4 +1,8 @@
-"""Export of items other than clips to the file formats of Marey's predecessor, and unchanged files of any item."""
+"""Export of items to the file formats of Marey's predecessor.
+
+An item that is unchanged since its import is exported as the imported file. Otherwise, a new file is written, except
+for the motion of clips and for records, of which no new file can be written.
+"""
 
 from __future__ import annotations
 
