@@ -1,4 +1,4 @@
-"""Import of folders that an export wrote: the clips get the paths, take records and tags from before the export."""
+"""Import of folders that an export wrote: the clips get back their paths, tags and records of takes."""
 
 from __future__ import annotations
 
