@@ -116,7 +116,7 @@ it("offers no player in a page into which none was inserted", async () => {
 });
 
 it("jumps to a chapter without motion for people who want none", async () => {
-  const page = await opened("runs", 390);
+  const page = await opened("evaluation", 390);
   const behaviour = () => page.evaluate(() => getComputedStyle(document.documentElement).scrollBehavior);
   expect(await behaviour()).toBe("smooth");
   await page.emulateMedia({ reducedMotion: "reduce" });
