@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from sqlalchemy import func, select
+from tests.support.rest_server import noted_memory
 
 from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import array_digest, document_digest
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_server.access.principal import SYSTEM
-from marey_server.process.memory import Holding
 from marey_server.store.database.connections import Database
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import revision
@@ -133,14 +133,7 @@ def test_a_difference_that_expands_to_gigabytes_is_refused(client: httpx.Client)
 def test_differences_and_bases_take_from_the_memory_of_requests(
     client: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    taken: list[int] = []
-    grow = Holding.grow
-
-    def noted(holding: Holding, more: int) -> None:
-        taken.append(more)
-        grow(holding, more)
-
-    monkeypatch.setattr(Holding, "grow", noted)
+    taken = noted_memory(monkeypatch)
     sent = difference(poses(9), poses())
     assert send(client, clip(poses(9), sent)).status_code == 200
     assert {poses().nbytes, 9 * 7 * 4} <= set(taken)

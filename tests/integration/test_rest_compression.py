@@ -5,9 +5,9 @@ from __future__ import annotations
 import httpx
 import pytest
 import zstandard
+from tests.support.rest_server import noted_memory
 
 from marey_schemas.encoding.compression import compress
-from marey_server.process.memory import Holding
 
 CONTENTS = "/projects/lab/contents"
 ABSENT = b"sha256:" + b"2" * 64
@@ -55,14 +55,7 @@ def test_a_body_that_is_not_one_zstd_frame_is_refused(owner: httpx.Client, body:
 def test_the_content_of_a_compressed_body_counts_as_memory(
     owner: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    taken: list[int] = []
-    grow = Holding.grow
-
-    def noted(holding: Holding, more: int) -> None:
-        taken.append(more)
-        grow(holding, more)
-
-    monkeypatch.setattr(Holding, "grow", noted)
+    taken = noted_memory(monkeypatch)
     assert owner.post(CONTENTS, content=compress(BODY), headers=COMPRESSED).status_code == 200
     assert {len(BODY), len(compress(BODY))} <= set(taken)
 

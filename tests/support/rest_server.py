@@ -19,6 +19,7 @@ from marey_schemas.encoding.digests import digest_of
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.app import Application, create_app, listening
 from marey_server.process.children import Children
+from marey_server.process.memory import Holding
 from marey_server.process.settings import PREFIX, Settings
 from marey_server.store import members, projects, users
 from marey_server.store.credentials import tokens
@@ -28,6 +29,19 @@ ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 USER_SCOPES = ("read", "write", "jobs")
 SCRIPTS_AT = "https://git.invalid/"
 """Address below which the servers of tests allow the repositories of scripts."""
+
+
+def noted_memory(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list to which each later request adds the numbers of bytes that it takes from the memory of requests."""
+    taken: list[int] = []
+    grow = Holding.grow
+
+    def noted(holding: Holding, more: int) -> None:
+        taken.append(more)
+        grow(holding, more)
+
+    monkeypatch.setattr(Holding, "grow", noted)
+    return taken
 
 
 def stored_file(client: httpx.Client, content: bytes) -> dict[str, Any]:
