@@ -36,7 +36,7 @@ CHROMIUM_VARIABLE = "MAREY_TEST_CHROMIUM"
 NODE_PACKAGES = PAGE_SOURCES / "node_modules"
 SLURM_DAEMONS = ("munged", "slurmctld", "slurmd")
 SLURM_PROGRAMS = (*SLURM_DAEMONS, "sbatch")
-PROGRAMS = ("kubectl", "zsh", "fish")
+PROGRAMS = ("kubectl", "zsh", "fish", "curl")
 """Programs that some tests need, which are marked with the name of the program."""
 SYSTEM_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
 """Folders in which daemons are looked for, also by users whose `PATH` does not contain them."""

@@ -14,11 +14,11 @@ LEFT_OUT = "other cases of tests with many"
 def items(every: int | None, cases: int, file: str = "faults/test_deaths.py") -> list[Any]:
     """Return items like those of a test that runs each case on both databases, with the mark `every_nth` or without."""
     marks = {} if every is None else {"every_nth": pytest.mark.every_nth(every).mark}
-    config = SimpleNamespace(rootpath=Path("/root"), stash=pytest.Stash())
+    config = SimpleNamespace(rootpath=Path("project"), stash=pytest.Stash())
     made: list[Any] = [
         SimpleNamespace(
             config=config,
-            path=Path("/root/tests") / file,
+            path=Path("project", "tests") / file,
             nodeid=f"test_deaths.py::test_a_death[{database}-{case}]",
             name=f"test_a_death[{database}-{case}]",
             originalname="test_a_death",

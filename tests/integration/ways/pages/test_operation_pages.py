@@ -263,7 +263,7 @@ def test_contributing() -> None:
     assert [name for name in sorted(variables) if name not in known] == []
 
 
-@pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
+@pytest.mark.curl
 def test_answer_an_alert(server: ServerProcess, reads: Reads, tmp_path: Path) -> None:
     with server.client() as marey:
         lab = marey.create_project(ProjectCreate(name="lab"))

@@ -1,7 +1,6 @@
 """The pages for programmers and the front page, run as printed."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,7 +25,7 @@ pytestmark = [
 ]
 
 
-@pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
+@pytest.mark.curl
 def test_use_rest(
     empty_lab: ProjectHandle, server: ServerProcess, add_walks: AddWalks, reads: Reads, tmp_path: Path
 ) -> None:
