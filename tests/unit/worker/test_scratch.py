@@ -1,7 +1,6 @@
 """Folders for the files of attempts, and their removal after a worker was killed."""
 
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -24,7 +23,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def aged(folder: Path) -> Path:
     """Let a folder look as old as one that a killed worker has left."""
     long_ago = time.time() - YOUNG_S - 1.0
-    os.utime(folder, (long_ago, long_ago))
+    os.utime(folder, (long_ago, long_ago), follow_symlinks=False)
     return folder
 
 
@@ -53,11 +52,13 @@ def test_the_folder_of_a_killed_worker_is_removed_by_the_next_one(temporary: Pat
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as worker:
         assert worker.stdout is not None
-        folder = aged(Path(worker.stdout.readline().strip()))
-        assert folder.parent == temporary
-        remove_abandoned()
-        assert folder.is_dir()
-        worker.send_signal(signal.SIGKILL)
+        try:
+            folder = aged(Path(worker.stdout.readline().strip()))
+            assert folder.parent == temporary
+            remove_abandoned()
+            assert folder.is_dir()
+        finally:
+            worker.kill()
     remove_abandoned()
     assert not folder.exists()
 
@@ -68,21 +69,27 @@ def test_only_old_folders_with_the_name_of_scratch_folders_are_removed(temporary
     young.mkdir()
     file = temporary / f"{PREFIX}c"
     file.write_bytes(b"")
+    aged(file)
     remove_abandoned()
     assert not gone.exists()
     assert all(one.exists() for one in (other, young, file))
 
 
-def test_links_are_not_followed_and_folders_of_other_users_are_left(
-    temporary: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    elsewhere = left(temporary / "elsewhere")
-    (temporary / f"{PREFIX}link").symlink_to(elsewhere)
+def test_links_are_not_followed(temporary: Path, caplog: pytest.LogCaptureFixture) -> None:
+    elsewhere, link = left(temporary / "elsewhere"), temporary / f"{PREFIX}link"
+    link.symlink_to(elsewhere)
+    aged(link)
+    remove_abandoned()
+    assert (elsewhere / "deep" / "motion.npz").is_file()
+    assert link.is_symlink()
+    assert not caplog.records, "a link is nothing that a worker has left"
+
+
+def test_folders_of_other_users_are_left(temporary: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = left(temporary / f"{PREFIX}a")
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     remove_abandoned()
-    assert (elsewhere / "deep" / "motion.npz").is_file()
-    assert folder.is_dir()
+    assert (folder / "deep" / "motion.npz").is_file()
 
 
 def test_a_folder_that_cannot_be_removed_is_reported_and_the_others_are_removed(
