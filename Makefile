@@ -20,7 +20,7 @@ PROCESSES ?= 4
 PAGES_IF_POSSIBLE := command -v npm > /dev/null && $(BIN)/python hatch_build.py || true
 
 .DEFAULT_GOAL := help
-.PHONY: help installed web web-test demo check slow-tests test soak lint format dev bench docs pins audit bom clean
+.PHONY: help installed web web-test demo check slow-tests test soak lint types rules format dev bench docs pins audit bom clean
 
 help: ## Show what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 22
@@ -83,7 +83,12 @@ soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases;
 lint: $(VENV)/.installed-dev ## Style, types, and which package may import which
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	@$(MAKE) --no-print-directory -j 2 types rules
+
+types: $(VENV)/.installed-dev
 	$(BIN)/pyrefly check --python-interpreter-path $(BIN)/python
+
+rules: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
 	$(BIN)/python -m lint
 

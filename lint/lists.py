@@ -18,7 +18,7 @@ def find(house: House) -> Iterator[Offence]:
     """Yield literal collections that repeat the words of another module."""
     vocabularies, lists = dict(_vocabularies(house)), dict(_named_lists(house))
     for module in house.modules.values():
-        for node in () if module.is_generated else ast.walk(module.tree):
+        for node in () if module.is_generated else module.nodes:
             words = _words(node)
             if not isinstance(node, ast.expr) or len(words) < FEWEST_WORDS:
                 continue

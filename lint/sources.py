@@ -26,6 +26,7 @@ GENERATED = f"<!-- {WRITTEN_BY}"
 """Beginning of pages that are generated from texts in the code."""
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+_WITH_STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)
 
 
 class Offence(NamedTuple):
@@ -52,6 +53,11 @@ class Module:
         return ast.parse(self.text)
 
     @cached_property
+    def nodes(self) -> list[ast.AST]:
+        """All nodes of the syntax tree; several rules read them, and searching the tree takes long."""
+        return list(ast.walk(self.tree))
+
+    @cached_property
     def lines(self) -> int:
         """The number of lines of the module."""
         return len(self.text.splitlines())
@@ -68,12 +74,17 @@ class Module:
 
 
 def _definitions(node: ast.AST, prefix: str) -> Iterator[tuple[str, Definition]]:
-    for child in ast.iter_child_nodes(node):
+    for child in statements_in(node):
         if isinstance(child, Definition):
             yield prefix + child.name, child
             yield from _definitions(child, f"{prefix}{child.name}.")
         else:
             yield from _definitions(child, prefix)
+
+
+def statements_in(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the statements directly in a node, and the handlers and cases that contain further statements."""
+    return (child for child in ast.iter_child_nodes(node) if isinstance(child, _WITH_STATEMENTS))
 
 
 @dataclass(frozen=True)
@@ -100,7 +111,7 @@ class House:
 
 
 def _imported(module: Module, known: dict[str, Module]) -> Iterator[str]:
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if isinstance(node, ast.ImportFrom) and node.module:
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"

@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 
-from lint.sources import Definition, House, Module, Offence
+from lint.sources import Definition, House, Module, Offence, statements_in
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -64,15 +64,16 @@ def _variables(tree: ast.Module) -> Iterator[list[ast.Name]]:
 
 def _unused_locals(module: Module, name: str, outer: Function) -> Iterator[Offence]:
     """Yield the local functions of `outer` that `outer` does not name."""
-    named = {node.id for node in ast.walk(outer) if isinstance(node, ast.Name)}
-    for node in _locals(outer):
+    inner = list(_locals(outer))
+    named = {node.id for node in ast.walk(outer) if isinstance(node, ast.Name)} if inner else set()
+    for node in inner:
         if node.name not in named and not node.decorator_list:
             yield Offence(module.path, node.lineno, f"{module.name}.{name}.{node.name}", f"{node.name} is not used")
 
 
 def _locals(node: ast.AST) -> Iterator[Function]:
     """Yield the functions that are defined directly in a function, not those inside a local function or local class."""
-    for child in ast.iter_child_nodes(node):
+    for child in statements_in(node):
         if isinstance(child, Function):
             yield child
         elif not isinstance(child, ast.ClassDef):
@@ -112,7 +113,7 @@ def _named(house: House) -> Counter[str]:
 
 
 def _mentions(module: Module) -> Iterator[str]:
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if isinstance(node, ast.Name | ast.Attribute):
             if not isinstance(node.ctx, ast.Store):
                 yield _last_name(node)

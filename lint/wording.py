@@ -70,7 +70,7 @@ def _in_module(module: Module) -> Iterator[Offence]:
     for name, node in module.definitions:
         if node.name in OLD_NAMES:
             yield Offence(module.path, node.lineno, name, f"{name} is called {OLD_NAMES[node.name]} now")
-    for part in ast.walk(module.tree):
+    for part in module.nodes:
         match part:
             case ast.Expr(value=ast.Constant(value=str(text))) if _CLAUSE.match(text.lstrip()):
                 first = text.lstrip().splitlines()[0]
