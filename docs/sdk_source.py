@@ -56,8 +56,13 @@ class Member:
 
     name: str
     node: Function | ast.AnnAssign
-    doc: str | None
-    """Source of the docstring, with its quotes."""
+    docstring: ast.stmt | None
+    source: Source
+
+    @property
+    def doc(self) -> str | None:
+        """Source of the docstring, with its quotes."""
+        return None if self.docstring is None else self.source.text_of(self.docstring)
 
     @property
     def is_property(self) -> bool:
@@ -159,13 +164,13 @@ def members(source: Source, node: ast.ClassDef) -> Iterator[Member]:
         if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
             following = node.body[place + 1] if place + 1 < len(node.body) else None
             text = following if isinstance(following, ast.Expr) else None
-            member = Member(one.target.id, one, None if text is None else source.text_of(text))
+            member = Member(one.target.id, one, text, source)
             types = ast.unparse(one.annotation)
             if not member.name.startswith("_") and types != CONNECTION and not types.startswith("type["):
                 yield member
         elif isinstance(one, Function):
             text = one.body[0] if ast.get_docstring(one) is not None else None
-            member = Member(one.name, one, None if text is None else source.text_of(text))
+            member = Member(one.name, one, text, source)
             public = not one.name.startswith("_") or one.name in ("__iter__", "__getitem__")
             if (public and not member.is_constructor) or (member.sends_nothing and not member.is_property):
                 yield member

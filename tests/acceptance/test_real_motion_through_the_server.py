@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tests.support.another_loader import files_to_compare, positions_by_another_loader
 from tests.support.present import present
 from tests.support.server_process import serving
+from tests.support.tiers import is_soak
 
 from marey_client import Marey
 from marey_client.handles.clips import ClipHandle
@@ -58,7 +59,7 @@ def test_originals_come_back_byte_for_byte(uploaded: Uploaded, tmp_path: Path) -
 
 def test_bvh_files_put_every_joint_where_the_clip_has_it(uploaded: Uploaded, tmp_path: Path) -> None:
     assert len(uploaded.clips) > 40
-    for name, clip in uploaded.clips.items():
+    for name, clip in list(uploaded.clips.items())[:: 1 if is_soak() else 4]:
         written = positions_by_another_loader(clip.export(tmp_path, format="bvh")) * 0.01
         assert np.abs(written - positions_of(uploaded.lab, clip)).max() < 1e-4, name
 

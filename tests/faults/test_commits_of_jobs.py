@@ -76,7 +76,7 @@ def dies(desk: Desk, url: str, work: str, fault: str) -> bool:
     return StoreWriter(url, present(desk.user.user_id), "ann").run(work, f"{fault}:kill") != 0
 
 
-@pytest.mark.every_nth(4)
+@pytest.mark.every_nth(8)
 @pytest.mark.parametrize("place", [*BEFORE, *AFTER])
 @pytest.mark.parametrize("way", ["main", "own-branch", "fan-out"])
 def test_a_server_that_dies_at_a_completion_leaves_all_or_nothing(

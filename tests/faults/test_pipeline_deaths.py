@@ -98,7 +98,7 @@ def assert_made_once(lab: ProjectHandle, run: PipelineRun, takes: list[LocalFile
     assert all(not clip.staleness().stale for clip in lab.clips.list(collection="again"))
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.every_nth(4)
 @pytest.mark.parametrize("nth", ["@1", "@2"])
 @pytest.mark.parametrize("place", ["late_inputs.before_commit", "late_inputs.after_commit"])
 def test_a_server_killed_where_a_job_gets_its_inputs_goes_on_with_all_of_them_or_none(
@@ -145,7 +145,7 @@ def test_a_server_killed_where_a_pipeline_is_handed_in_has_all_of_it_or_nothing(
     server.check_database()
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.every_nth(4)
 @pytest.mark.parametrize("place", ["after_claim", "after_blob", "before_complete", "after_complete"])
 def test_a_worker_killed_under_a_pipeline_is_replaced_and_nothing_is_there_twice(
     server: ServerProcess,

@@ -108,6 +108,7 @@ def running_worker(marey: Marey, job: Job) -> psutil.Process:
     return worker
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("place", ["after_claim", "after_blob", "before_complete", "after_complete"])
 def test_the_job_of_a_killed_worker_is_done_by_the_next_task(
     server: QuickPoolsServer, tmp_path: Path, place: str

@@ -61,7 +61,6 @@ EXPECTED = (
 
 
 @pytest.mark.every_nth(2)
-@pytest.mark.every_database
 def test_nothing_that_several_users_do_on_two_servers_diverges_from_the_model(
     databases: Databases, tmp_path: Path
 ) -> None:

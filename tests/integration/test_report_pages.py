@@ -10,7 +10,7 @@ import httpx
 import pytest
 from tests.support.every_report import ORIGIN, REPORTS, evaluation_page, write_reports
 from tests.support.rest_server import Server, stored_file
-from tests.support.tiers import chromium, is_soak
+from tests.support.tiers import chromium
 from tests.support.vitest_runs import run_vitest
 
 from marey_reports.drawing.page import scripts_of
@@ -21,8 +21,6 @@ pytestmark = pytest.mark.timeout(900)
 
 MOST_PAGE_BYTES = 4_000_000
 """Greatest size of the report of the evaluation of a few takes, with the player and two trials."""
-OPENED = ("evaluation",)
-"""Reports that the tier `test` opens; the tier `soak` opens all. Each is opened three times."""
 
 
 def stored_evaluation(owner: httpx.Client, page: str) -> str:
@@ -40,11 +38,12 @@ def stored_evaluation(owner: httpx.Client, page: str) -> str:
     return f"/projects/lab/evaluations/{made.json()['id']}"
 
 
+@pytest.mark.soak
 @pytest.mark.chromium
 def test_every_report_fits_every_screen_and_plays_its_motion(
     server: Server, owner: httpx.Client, tmp_path: Path
 ) -> None:
-    shown = list(write_reports(tmp_path, REPORTS if is_soak() else OPENED))
+    shown = list(write_reports(tmp_path, REPORTS))
     answer = owner.get(f"{stored_evaluation(owner, evaluation_page())}/report")
     assert answer.status_code == 200
     assert len(answer.content) < MOST_PAGE_BYTES

@@ -136,6 +136,7 @@ def test_versions_of_clips_that_were_deleted_since_are_evaluated(
     assert found.first_bad == spoiled
 
 
+@pytest.mark.soak
 def test_clips_are_loops_in_the_versions_that_have_their_tag(
     lab: ProjectHandle, gaits: DatasetHandle, run: CommandLine
 ) -> None:
@@ -170,6 +171,7 @@ def test_a_merged_branch_is_searched_unless_only_first_parents_are_followed(
         lab.bisect("gaits", spoiled.digest, metric="clips", first_parent=True, **GRID)
 
 
+@pytest.mark.soak
 def test_versions_that_cannot_be_evaluated_are_skipped(gaits: DatasetHandle, run: CommandLine) -> None:
     clips = [one.path for one in gaits.entries("v1") if one.kind is Kind.CLIP]
     gone = [gaits.commit("Move all clips away", changes=[one for path in clips for one in moved(path, f"away/{path}")])]
@@ -219,6 +221,7 @@ def wait_for_job(lab: ProjectHandle) -> str:
     raise AssertionError("the third evaluation was not submitted")
 
 
+@pytest.mark.soak
 def test_ends_that_do_not_fit_are_refused_with_their_values(gaits: DatasetHandle, run: CommandLine) -> None:
     gaits.commit("Rename a walk", changes=moved("raw/walk 1 0", "raw/slow"))
     assert "no value is half-way between them" in run(*BISECT, status=1).stderr

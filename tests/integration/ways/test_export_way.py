@@ -256,6 +256,7 @@ def test_a_changed_table_is_not_used_and_the_command_that_applies_it_is_named(
     assert clip(project, "walk", "copies/raw").info().licence == "CC0"
 
 
+@pytest.mark.every_nth(2)
 @pytest.mark.parametrize("layout", ["files", "huggingface"])
 def test_other_formats_come_back(
     run: CommandLine,

@@ -30,6 +30,7 @@ def told(*words: str) -> list[str]:
     return shlex.split(found)[1:]
 
 
+@pytest.mark.soak
 def test_a_running_server_is_measured_and_keeps_no_scratch_project(run: CommandLine, marey: Marey) -> None:
     shown = run(*told("bench", "load", "--rate", "10,50,100"), *SHORT)
     assert "cycles/s" in shown.stdout

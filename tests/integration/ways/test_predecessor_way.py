@@ -184,6 +184,7 @@ OWNERS = {
 """Kind and name of the item that is exported as each file, for files whose names do not give both."""
 
 
+@pytest.mark.every_nth(2)
 @pytest.mark.parametrize("way", get_args(Way))
 def test_a_folder_with_one_of_each_goes_in_at_once_and_out_byte_for_byte(
     way: Way, lab: ProjectHandle, marey: Marey, run: CommandLine, server: ServerProcess, folder: Path, tmp_path: Path

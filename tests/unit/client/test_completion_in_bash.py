@@ -136,6 +136,7 @@ def bash(tmp_path: Path) -> Bash:
 ODD = "x;touch harm&touch harm|`touch harm`$(touch harm)>harm #\"'!t !! \\ *~{a,b}"
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize(
     "keys",
     [
@@ -150,6 +151,7 @@ def test_names_of_others_run_no_command(bash: Bash, keys: str) -> None:
     assert not (bash.folder / "harm").exists()
 
 
+@pytest.mark.every_nth(4)
 @pytest.mark.parametrize("quote", ["", '"', "'"])
 @pytest.mark.parametrize(
     "name", ["!t", "'", '"', "!", "a!", "a'", 'a"', "a\\", "'!;touch harm", '";touch harm;"', "$x`"]

@@ -302,6 +302,7 @@ def beyond_their_cells(figure: Figure) -> list[str]:
     return found
 
 
+@pytest.mark.every_nth(2)
 @pytest.mark.parametrize("moments", [6, 12])
 def test_no_pose_no_floor_and_no_arrow_leaves_its_cell(
     walk: Clip, monkeypatch: pytest.MonkeyPatch, moments: int

@@ -67,8 +67,6 @@ pytestmark = DRAWN_EVALUATIONS
 ONE_TRIAL = [name for name, kind in FIGURES.items() if kind.trials == "one"]
 SMALL_MULTIPLES_APART_IN = 0.26
 SWITCHING = "switching v=2 w=50"
-ARRANGED = ("points", "usage", "clip-graph")
-"""Figures that select or arrange their contents by both of two compared results."""
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +79,7 @@ def other() -> EvaluationResult:
     return changed()
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.every_nth(6)
 @pytest.mark.parametrize("name", DEFAULT_FIGURES)
 def test_a_figure_has_the_same_bytes_each_time(name: str, result: EvaluationResult) -> None:
     first, second = is_sound_svg(figure_of(name)), draw_figure(name, result)
@@ -96,14 +94,14 @@ def test_a_figure_of_two_results_is_sound(name: str) -> None:
     is_sound_svg(drawn_both()[name])
 
 
-@pytest.mark.parametrize("name", DEFAULT_FIGURES if is_soak() else ARRANGED)
+@pytest.mark.soak
+@pytest.mark.parametrize("name", DEFAULT_FIGURES)
 def test_a_figure_of_two_results_is_the_same_drawing_each_time(
     name: str, result: EvaluationResult, other: EvaluationResult
 ) -> None:
     first, second = drawn_both()[name], draw_figure(name, result, other=other, labels=("old", "new"))
     assert (first.svg, first.data) == (second.svg, second.data)
-    if is_soak():
-        assert is_sound(first).png == second.png
+    assert is_sound(first).png == second.png
 
 
 def test_threads_draw_the_same_figures_at_once(result: EvaluationResult) -> None:
@@ -482,7 +480,7 @@ def test_evaluations_of_little_are_drawn(name: str) -> None:
         is_sound(figure) if is_soak() else is_sound_svg(figure)
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.every_nth(6)
 @pytest.mark.parametrize("name", [name for name in LITTLE if name not in ALONE])
 def test_evaluations_of_little_are_compared(name: str) -> None:
     assert drawn_beside_little(name)

@@ -183,6 +183,7 @@ def test_digests_and_options_are_there_to_repeat_it(page: Page, result: Evaluati
     assert result.provenance.clips[result.clips[3].uid] in page.text
 
 
+@pytest.mark.soak
 def test_a_report_of_a_thousand_clips_stays_small() -> None:
     big = synthetic_result(clips=1_000, frames=300, unused=300)
     drawn = None if is_soak() else {name: draw_figure(name, big) for name in NAMING}
@@ -193,6 +194,7 @@ def test_a_report_of_a_thousand_clips_stays_small() -> None:
     is_sound(source)
 
 
+@pytest.mark.every_nth(2)
 @pytest.mark.parametrize("name", ["no records", "nothing used", "no trials", "no numbers"])
 def test_reports_are_made_of_little(name: str, result: EvaluationResult) -> None:
     assert drawn_of_little(name)

@@ -304,6 +304,7 @@ def test_on_real_clips_all_safe_removals_leave_every_record_bit_identical(
     assert same_to_the_bit(database, real.result.records, less, simulated(less, REAL))
 
 
+@pytest.mark.soak
 def test_on_real_clips_ten_removals_do_what_was_predicted(
     bandai: tuple[MatchingDatabase, MatchingDatabase], real: Suggestions
 ) -> None:

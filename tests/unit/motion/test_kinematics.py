@@ -45,6 +45,7 @@ def reference(clip: Clip) -> tuple[Floats, Floats]:
     return positions, rotations
 
 
+@pytest.mark.every_nth(5)
 @pytest.mark.parametrize("frames", [1, BLOCK - 1, BLOCK, BLOCK + 1])
 @pytest.mark.parametrize("translated", [(), (3, 9, 21), tuple(range(1, 22))])
 def test_positions_and_rotations_agree_with_a_plain_reference(

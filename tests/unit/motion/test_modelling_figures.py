@@ -82,6 +82,7 @@ def test_all_figures_of_the_same_model_have_the_same_bytes(
         assert figure.files() == figures[name].files(), name
 
 
+@pytest.mark.soak
 def test_threads_draw_the_same_figures_at_once(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
     with ThreadPoolExecutor(3) as pool:
         drawn = list(pool.map(lambda _: draw_alignment_figures(subject.examples), range(3)))
@@ -344,7 +345,7 @@ ODD_SHOWS = {
 """Names of the figures that show the unusual property of each model in `ODD`."""
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.every_nth(6)
 @pytest.mark.parametrize("odd", ODD)
 def test_odd_models_are_drawn_and_nothing_is_cut_off(odd: str) -> None:
     subject = ODD[odd]()

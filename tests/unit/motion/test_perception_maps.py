@@ -117,6 +117,7 @@ def joint_difference(
     return float(np.linalg.norm(a.positions[i, p] - b.positions[j, p])) / metric.length_unit_m
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize(("measurement", "shaping"), KINDS)
 def test_maps_are_those_of_the_formulas(measurement: Measurement, shaping: Shaping) -> None:
     a, b = (clip.at(np.arange(0.0, 40.0, 5.5)) for clip in walks())

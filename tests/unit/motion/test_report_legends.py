@@ -59,6 +59,7 @@ def test_no_legend_of_an_odd_evaluation_covers_data(name: str) -> None:
     assert_free(drawn_of_little(name))
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("count", [1, 6, 7, MANY])
 def test_no_legend_covers_data_with_any_number_of_clips(count: int) -> None:
     result = synthetic_result(clips=count, unused=0, frames=120)
@@ -67,11 +68,13 @@ def test_no_legend_covers_data_with_any_number_of_clips(count: int) -> None:
     assert cut_off(figures["points"].sketch.figure) == []
 
 
+@pytest.mark.soak
 def test_no_legend_covers_data_in_a_comparison() -> None:
     assert_free(drawn_both())
     assert_free(draw_shared_figures([usual(), changed(), usual()], ["a", "b", "c"]))
 
 
+@pytest.mark.soak
 def test_no_legend_of_other_reports_covers_data() -> None:
     assert_free(figures_of_walks())
     analysis = analysis_of(8)

@@ -60,6 +60,7 @@ def test_the_mean_wait_is_that_of_erlang_c(workers: int, load: float) -> None:
     require_mean(means, expected)
 
 
+@pytest.mark.soak
 def test_waits_by_priority_are_those_of_cobham() -> None:
     means: dict[int, list[float]] = {0: [], 1: []}
     for seed in range(REPLICATES):

@@ -249,6 +249,7 @@ CONVERTED = ("rate", "duration", "joints", "shoot_day", "consent_until")
 """Fields whose values in the summary the database converts to numbers or days; a value may be impossible to convert."""
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("value", ODD, ids=str)
 def test_odd_values_in_a_summary_break_no_query(queried: QueriedLab, value: object) -> None:
     names = ("frame_rate_hz", "duration_s", "joints", "warnings", "subject", "shoot_day", "consent_until", "action")
