@@ -43,13 +43,13 @@ def run(context: Context, params: SuggestParams) -> dict[str, Any]:
     result = {**_counts(found), "unusable": len(candidates.unusable), "document": store_document(context, document)}
     if params.report:
         (pin,) = context.inputs["evaluation"]
-        poses = poses_of((evaluated.clips.database, *candidates.databases.values()), shown_sources(found))
+        poses = poses_by_clip((evaluated.clips.database, *candidates.databases.values()), shown_sources(found))
         page = render_suggestions(found, poses, title=pin.path, inputs=inputs_of(context))
         result["report"] = store_file(context, page.encode())
     return result
 
 
-def poses_of(databases: Iterable[MatchingDatabase], sources: set[str]) -> dict[str, tuple[Clip, ...]]:
+def poses_by_clip(databases: Iterable[MatchingDatabase], sources: set[str]) -> dict[str, tuple[Clip, ...]]:
     """Return poses at even intervals of the clips with the uids `sources`, by uid."""
     return {
         clip.uid: tuple(posed_rows(database, np.array([clip.start + frame])) for frame in even_frames(clip.frame_count))
