@@ -72,7 +72,7 @@ async def serve_together(settings: Settings, order: StartOrder, control: socket.
     following = asyncio.create_task(_follow(reader, stop, keep_workers))
     if order.first:
         keep_workers.set()
-    elif settings.pools:
+    else:
         find_launcher(settings.launcher)
     async with AsyncExitStack() as stack:
         database = open_database(own, while_serving=not order.first)

@@ -81,6 +81,22 @@ def literal_address(host: str) -> str | None:
         return None
 
 
+def read_network(text: object) -> Network:
+    """Return the network that a text names, such as 10.1.0.0/16.
+
+    Raises `ValueError` if the text names none, or if it names an address in a network instead.
+    """
+    try:
+        return ip_network(str(text))
+    except ValueError:
+        pass
+    try:
+        network = ip_network(str(text), strict=False)
+    except ValueError:
+        raise ValueError(f"{str(text)!r} is not a network, such as 10.1.0.0/16") from None
+    raise ValueError(f"{text} is an address in a network; the network is {network}")
+
+
 def is_protected(url: str) -> bool:
     """Return whether a URL is safe from eavesdropping: https, or http with an address of this machine."""
     try:

@@ -48,11 +48,12 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     server finds them. Raises `LauncherUnusable` if the launcher does not exist, or its options are invalid.
     """
     settings = services.settings
+    make = find_launcher(settings.launcher)
     port = urlsplit(address).port or settings.port  # the setting is 0 for any free port
     controllers: list[WorkerController] = [
         PoolKeeper(
             pool,
-            _launcher_of(pool, services, address, port),
+            _launcher_of(pool, make, services, address, port),
             services.database,
             [other for other in settings.pools if other.name != pool.name],
         )
@@ -126,9 +127,8 @@ def _load(found: EntryPoint) -> Any:
         raise LauncherUnusable(f"launcher: the launcher {found.name!r} cannot be loaded: {error}") from error
 
 
-def _launcher_of(pool: WorkerPool, services: Services, address: str, port: int) -> Launcher:
+def _launcher_of(pool: WorkerPool, make: MakeLauncher, services: Services, address: str, port: int) -> Launcher:
     settings = services.settings
-    make = find_launcher(settings.launcher)
     file = worker_token_file(settings.data, pool.name)
     token = keep_pool_token(services.database, settings, port, pool.name, pool.labels, file)
     return make(

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlsplit
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SETTINGS_FILE
 from marey_schemas.names import form
 from marey_schemas.sizes import KIB, MIB
+from marey_server.access.network_addresses import Network, read_network
 from marey_server.process.secret_files import read_secret
 from marey_server.process.setting_groups.blob_settings import BlobSettings
 from marey_server.process.setting_groups.identity_settings import IdentitySettings
@@ -251,7 +251,7 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
         description="Greatest number of bytes of the descriptions, comments, reviews and checks of all proposals of a "
         "project; a quarter is reserved for maintainers.",
     )
-    webhook_networks: tuple[IPv4Network | IPv6Network, ...] = Field(
+    webhook_networks: tuple[Annotated[Network, BeforeValidator(read_network)], ...] = Field(
         (),
         description='Networks to which webhooks may be sent although they are not public, such as ["10.1.0.0/16"].',
     )

@@ -101,7 +101,7 @@ def test_servers_at_free_ports_of_one_machine_keep_the_tokens_of_each_others_wor
 
 def test_a_launcher_that_does_not_exist_is_an_error_in_one_line(tmp_path: Path) -> None:
     file = tmp_path / "marey.toml"
-    file.write_text('launcher = "slrum"\n[[pools]]\nname = "gpu"\nmost = 1\n')
+    file.write_text('launcher = "slrum"\n')  # without pools, which would use it
     serve = [sys.executable, "-m", "marey_client.cli", "serve", "--port", "0"]
     done = subprocess.run(serve, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1

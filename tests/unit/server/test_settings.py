@@ -133,6 +133,11 @@ def test_workers_on_this_machine_send_traces_to_the_same_collector(monkeypatch: 
     [
         ("# ours\nport = 'abc'\n", "invalid setting: marey.toml, line 2: port: the value must be a whole number"),
         ("[server]\nport = 1\n", "invalid setting: marey.toml, line 1: server: there is no setting of this name"),
+        (
+            "webhook_networks = ['10.0.0.1/8']\n",
+            "line 1: webhook_networks.0: 10.0.0.1/8 is an address in a network; the network is 10.0.0.0/8",
+        ),
+        ("webhook_networks = ['lab']\n", "line 1: webhook_networks.0: 'lab' is not a network, such as 10.1.0.0/16"),
         ("data = 'x'\nport ==\n", "marey.toml cannot be read as TOML: Invalid value (at line 2"),
     ],
 )
