@@ -41,7 +41,8 @@ class LineageOptions(Options):
         MOST_REVISIONS,
         ge=1,
         le=MOST_REVISIONS,
-        description="Greatest number of jobs between the start of the graph and any of its revisions.",
+        description="Greatest number of jobs between the revision whose lineage is shown and any other revision of the "
+        "graph.",
     )
 
 

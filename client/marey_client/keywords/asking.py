@@ -19,7 +19,7 @@ class ImportKeywords(TypedDict, total=False):
     """Folder of the project that receives the clips."""
     skeleton: str | None
     """Item id of the skeleton that the clips must use. `marey upload` also accepts its address (project/folder/name),
-    and Python its path. Absent: an equal skeleton of the project is used, or a new skeleton is created."""
+    and Python its path. Absent: the skeleton of the file is used; it is created if the project does not have it."""
     unit: Literal["mm", "cm", "inch", "cmu", "dm", "ft", "m"] | None
     """Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."""
     unit_scale_m: float | None
@@ -70,7 +70,7 @@ class LineageKeywords(TypedDict, total=False):
     """`inputs`: the revisions from which the revision was made; `results`: the revisions that were made from it;
     `both`: inputs and results."""
     depth: int
-    """Greatest number of jobs between the start of the graph and any of its revisions."""
+    """Greatest number of jobs between the revision whose lineage is shown and any other revision of the graph."""
 
 
 class EditPreviewKeywords(TypedDict, total=False):

@@ -43,8 +43,8 @@ class DatabaseKeywords(TypedDict, total=False):
     copies alone."""
     end_policy: Literal["clamp", "trim", "loop"]
     """Handling of the end of a clip, where its future trajectory is unknown. clamp: the last frame is repeated, and the
-    last 1/3 s is not selected; trim: frames from which the last of `horizons_s` is beyond the end are not selected;
-    loop: the beginning of the clip follows, for clips marked as loops, and others are treated as by clamp."""
+    last 1/3 s is not selected; trim: frames after which the clip ends before the last of `horizons_s` are not selected;
+    loop: in clips that are marked as loops, the beginning follows the end; other clips are treated as by clamp."""
     root_mode: Literal["simulated", "bone"]
     """Source of the character's motion on the ground. simulated: the smoothed position and heading of the body; bone:
     the root joint, for data whose root joint moves as the character does."""
@@ -83,8 +83,8 @@ class ControllerKeywords(TypedDict, total=False):
     """Whether the blend after a switch also includes the root's velocity."""
     selection: Literal["features", "pose_distance"]
     """Cost that each search minimises. features: the squared distance of the weighted features; pose_distance: the same
-    for the features of the trajectory only, plus the distances between the joints of the two poses in metres, as in
-    Abichequer Sangalli et al. (2022)."""
+    for the features of the trajectory only, plus the distances, in metres, between the joints of the current pose and
+    those of the pose to which the character would switch, as in Abichequer Sangalli et al. (2022)."""
     root_adjustment: float
     """Rate, per second, at which the character is pulled to the trajectory that it follows: within a second, the
     distance shrinks by the factor exp(-rate). This hides tracking errors. 0: it is not pulled."""
@@ -247,7 +247,8 @@ class SuggestKeywords(TypedDict, total=False):
     confirmation_replicates: int
     """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
     with intervals. At least 3, or 0: effects are not confirmed. 3 to 6 are too few to confirm a step of an optimisation
-    whose effect is equal in all replicates, unless the step changes no trial."""
+    that has the same effect in every replicate: for three candidates, the sign test needs 7. A step that changes no
+    trial needs no confirmation."""
     confirmation_seed: int
     """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
     replicates."""
@@ -288,7 +289,8 @@ class OptimiseKeywords(TypedDict, total=False):
     confirmation_replicates: int
     """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
     with intervals. At least 3, or 0: effects are not confirmed. 3 to 6 are too few to confirm a step of an optimisation
-    whose effect is equal in all replicates, unless the step changes no trial."""
+    that has the same effect in every replicate: for three candidates, the sign test needs 7. A step that changes no
+    trial needs no confirmation."""
     confirmation_seed: int
     """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
     replicates."""
@@ -317,7 +319,8 @@ class SweepKeywords(TypedDict, total=False):
     confirmation_replicates: int
     """Number of further replicates in which the chosen effects are measured again; these measurements are reported,
     with intervals. At least 3, or 0: effects are not confirmed. 3 to 6 are too few to confirm a step of an optimisation
-    whose effect is equal in all replicates, unless the step changes no trial."""
+    that has the same effect in every replicate: for three candidates, the sign test needs 7. A step that changes no
+    trial needs no confirmation."""
     confirmation_seed: int
     """Seed of the replicates for confirmation. With another seed, the same choices are confirmed in different
     replicates."""

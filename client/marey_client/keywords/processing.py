@@ -78,11 +78,12 @@ class AlignKeywords(TypedDict, total=False):
     """Weight of each joint in the cost, by its own or its standard name; default 1, and 0 for joints that move no part
     of the body."""
     keep_height: bool
-    """Keep the heights above the floor; false: the body begins at height 0 in every clip."""
+    """Keep the heights above the floor; false: the height of the body in the first frame is subtracted from all heights
+    of a clip."""
     layer: str | None
     """Layer of the annotations to use; required if a clip has annotations of several layers."""
     labels: list[str] | tuple[str, ...]
-    """Labels whose segments and keyframes cut the clips; empty: all labels."""
+    """Labels of the segments and keyframes at which clips are divided; empty: all."""
     mirroring: Literal["none", "add"]
     """Mirrored copies of the clips. none: only the clips themselves are aligned; add: each clip and its mirrored
     copy."""
@@ -160,8 +161,8 @@ class ModelKeywords(TypedDict, total=False):
     """Tags that the results get."""
     criterion: Literal["held_out", "bic", "aic"]
     """Criterion that selects the mixture. held_out: the likelihood of examples of takes that were left out of the fit;
-    bic, aic: an information criterion, which does not select a mixture for which left-out examples are no more likely
-    than for one normal distribution. Without cross-validation, bic replaces held_out."""
+    bic, aic: an information criterion; a mixture of several normal distributions is rejected if left-out examples are
+    no more likely under it than under a single one. Without cross-validation, bic replaces held_out."""
     covariance: Literal["full", "tied", "diagonal"] | None
     """Kind of covariance. full: one for each component, shrunk towards its diagonal; tied: one for all components;
     diagonal: one variance for each component and dimension; absent: the criterion selects it."""
@@ -208,8 +209,8 @@ class ModelKeywords(TypedDict, total=False):
     report: bool
     """Write the report and its figures."""
     search_check: bool
-    """For the report, test searches: leave out every fifth example, train a model on the others, and search for
-    positions that the hands and feet of the left-out examples reached."""
+    """For the report, test searches: leave out every fifth take, train a model on the other takes, and search for
+    positions that the hands and feet reach in the left-out takes."""
 
 
 class TreeKeywords(TypedDict, total=False):

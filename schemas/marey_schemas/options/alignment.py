@@ -77,5 +77,7 @@ class AlignOptions(CostOptions):
         "joints that move no part of the body.",
     )
     keep_height: bool = Field(
-        True, description="Keep the heights above the floor; false: the body begins at height 0 in every clip."
+        True,
+        description="Keep the heights above the floor; false: the height of the body in the first frame is subtracted "
+        "from all heights of a clip.",
     )

@@ -32,8 +32,8 @@ class ImportOptions(Options):
     skeleton: str | None = Field(
         None,
         description="Item id of the skeleton that the clips must use. `marey upload` also accepts its address "
-        "(project/folder/name), and Python its path. Absent: an equal skeleton of the project is used, or a new "
-        "skeleton is created.",
+        "(project/folder/name), and Python its path. Absent: the skeleton of the file is used; it is created if "
+        "the project does not have it.",
     )
     unit: LengthUnit | None = Field(
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."

@@ -57,8 +57,8 @@ class ConfirmedEffects(ObjectiveChoice):
         le=64,
         description="Number of further replicates in which the chosen effects are measured again; these measurements "
         f"are reported, with intervals. At least {LEAST_REPLICATES}, or 0: effects are not confirmed. "
-        f"{LEAST_REPLICATES} to 6 are too few to confirm a step of an optimisation whose effect is equal in all "
-        "replicates, unless the step changes no trial.",
+        f"{LEAST_REPLICATES} to 6 are too few to confirm a step of an optimisation that has the same effect in every "
+        "replicate: for three candidates, the sign test needs 7. A step that changes no trial needs no confirmation.",
     )
     confirmation_seed: int = Field(
         0,

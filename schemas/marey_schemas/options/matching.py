@@ -52,9 +52,9 @@ class DatabaseOptions(Options):
     end_policy: EndPolicy = Field(
         "clamp",
         description="Handling of the end of a clip, where its future trajectory is unknown. clamp: the last frame is "
-        "repeated, and the last 1/3 s is not selected; trim: frames from which the last of `horizons_s` is beyond the "
-        "end are not selected; loop: the beginning of the clip follows, for clips marked as loops, and others are "
-        "treated as by clamp.",
+        "repeated, and the last 1/3 s is not selected; trim: frames after which the clip ends before the last of "
+        "`horizons_s` are not selected; loop: in clips that are marked as loops, the beginning follows the end; other "
+        "clips are treated as by clamp.",
     )
     root_mode: RootMode = Field(
         "simulated",
@@ -164,8 +164,9 @@ class ControllerOptions(Options):
     selection: Selection = Field(
         "features",
         description="Cost that each search minimises. features: the squared distance of the weighted features; "
-        "pose_distance: the same for the features of the trajectory only, plus the distances between the joints of the "
-        "two poses in metres, as in Abichequer Sangalli et al. (2022).",
+        "pose_distance: the same for the features of the trajectory only, plus the distances, in metres, between the "
+        "joints of the current pose and those of the pose to which the character would switch, as in Abichequer "
+        "Sangalli et al. (2022).",
     )
     root_adjustment: float = Field(
         0.0,

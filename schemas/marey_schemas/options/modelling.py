@@ -27,9 +27,9 @@ class MixtureOptions(Options):
     criterion: Criterion = Field(
         "held_out",
         description="Criterion that selects the mixture. held_out: the likelihood of examples of takes that were left "
-        "out of the fit; bic, aic: an information criterion, which does not select a mixture for which left-out "
-        "examples are no more likely than for one normal distribution. Without cross-validation, bic replaces "
-        "held_out.",
+        "out of the fit; bic, aic: an information criterion; a mixture of several normal distributions is rejected "
+        "if left-out examples are no more likely under it than under a single one. Without cross-validation, bic "
+        "replaces held_out.",
     )
     covariance: CovarianceKind | None = Field(
         None,

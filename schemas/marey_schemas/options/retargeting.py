@@ -27,7 +27,7 @@ class RetargetOptions(Options):
         description="Centre and factor by which keep_hands scales the positions of the hands. shoulders: from the "
         "middle of the shoulders, by the ratio of the arm lengths or less, so that all positions are within "
         "reach; world: from the origin, by the scale of the root's path, for hands on objects or on the floor. "
-        "An arm that is too short is stretched.",
+        "An arm that is too short to reach is straightened towards the position.",
     )
 
     @model_validator(mode="after")

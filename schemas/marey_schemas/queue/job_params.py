@@ -56,7 +56,7 @@ class AlignParams(AlignOptions, MetricChoice, SuffixedResults):
         None, description="Layer of the annotations to use; required if a clip has annotations of several layers."
     )
     labels: tuple[Label, ...] = Field(
-        (), max_length=1000, description="Labels whose segments and keyframes cut the clips; empty: all labels."
+        (), max_length=1000, description="Labels of the segments and keyframes at which clips are divided; empty: all."
     )
     mirroring: Literal["none", "add"] = Field(
         "none",
@@ -71,7 +71,7 @@ _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
 class AnnotateParams(TaggedResults):
     """Parameters of jobs of the kind `annotate`, which propose segments and keyframes of clips."""
 
-    proposal: Proposal = Field(description="Method that proposes segments and keyframes, with its options.")
+    proposal: Proposal = Field(description="Method that proposes segments and keyframes.")
     layer: LayerName | None = Field(None, description="Name of the layer; default: the name of the method.")
 
 
@@ -295,8 +295,8 @@ class ModelParams(ModelOptions, TaggedResults):
     report: bool = Field(True, description="Write the report and its figures.")
     search_check: bool = Field(
         True,
-        description="For the report, test searches: leave out every fifth example, train a model on the "
-        "others, and search for positions that the hands and feet of the left-out examples reached.",
+        description="For the report, test searches: leave out every fifth take, train a model on the other takes, and "
+        "search for positions that the hands and feet reach in the left-out takes.",
     )
 
 
