@@ -154,9 +154,8 @@ def marey(
     token_file: Annotated[
         Path | None,
         typer.Option(
-            help="File that contains a token and nothing else. Default: "
-            "MAREY_TOKEN, else the token of `marey login`, else "
-            "that of a server on this machine."
+            help="File that contains a token and nothing else. Default: the token in the variable MAREY_TOKEN, else "
+            "the token of `marey login`, else the token in admin.token in the data folder of a server on this machine."
         ),
     ] = None,
     verbose: Annotated[

@@ -42,6 +42,7 @@ EVALUATE = OptionsOf(
         "mirroring": "--mirror",
     },
     without=("loops", "trims", "metric"),
+    defaults={"name": "the name of the first folder or clip, followed by -eval; of a whole project, evaluation"},
 )
 
 Loops = Annotated[

@@ -29,6 +29,7 @@ MODEL = OptionsOf(
         "most_temporal_components": "--time-components",
         "mixture_components": "--mixture",
     },
+    defaults={"name": "the name of the first folder or clip; of a whole project, model"},
 )
 
 

@@ -109,6 +109,14 @@ def test_help_tells_meaning_range_and_default_of_the_schema() -> None:
     assert help_of(ALIGN, "slope_limit").endswith("none or -1: no limit. 0 to 60; default 3.")
 
 
+@pytest.mark.parametrize(("command", "told"), [("evaluate", "followed by -eval"), ("model", "folder or clip")])
+def test_help_tells_the_default_that_the_command_sets_instead_of_that_of_the_schema(command: str, told: str) -> None:
+    found = COMMANDS.commands[command]
+    (name,) = (option for option in found.get_params(typer.Context(found)) if "--name" in option.opts)
+    assert told in name.help
+    assert name.help.count("efault") == 1
+
+
 def test_every_command_can_make_its_options_and_explains_each() -> None:
     def walk(command: Any, path: str) -> None:
         context = typer.Context(command, info_name=path)

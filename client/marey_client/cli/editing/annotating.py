@@ -274,16 +274,16 @@ def export_annotation(
         AnnotationForm | None,
         typer.Option(
             help="Layout of the file. labels: the segments of each label. list: one list of all segments, "
-            f"without labels. frames: the frames of each label. Default: {DEFAULT_FORM}, or, without "
-            "--end-index, the layout of the imported file if the annotation is unchanged."
+            "without labels. frames: the frames of each label. Default: the layout of the imported file if the "
+            f"annotation is unchanged and --end-index is not given; otherwise {DEFAULT_FORM}."
         ),
     ] = None,
     end_index: Annotated[
         EndIndex | None,
         typer.Option(
             help="Meaning of end_idx in the file. inclusive: the last frame of a segment, as in the editor of "
-            f"Marey's predecessor. exclusive: the frame after the last frame. Default: {DEFAULT_END_INDEX}, or, "
-            "without --form, the meaning in the imported file if the annotation is unchanged."
+            "Marey's predecessor. exclusive: the frame after the last frame. Default: the meaning in the imported "
+            f"file if the annotation is unchanged and --form is not given; otherwise {DEFAULT_END_INDEX}."
         ),
     ] = None,
 ) -> None:

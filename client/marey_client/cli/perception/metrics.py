@@ -33,8 +33,8 @@ MetricName = Annotated[
     str | None,
     typer.Option(
         "--metric",
-        help="Perceptual metric: the name of a built-in one, such as published/sigmoid (`marey metric ls` lists them), "
-        "or project/folder/name.",
+        help="Perceptual metric that compares motions: the name of a built-in one, such as published/sigmoid (`marey "
+        "metric ls` lists them), or project/folder/name.",
     ),
 ]
 Shown = Annotated[

@@ -54,6 +54,8 @@ class OptionsOf:
     without : fields that get no option, because the command sets them
     only : fields that get an option; all fields if empty
     nulls : a text that means null in addition to `none`, by the name of the field
+    defaults : description of a default that the command sets instead of the default of the model, by the name of the
+        field
     """
 
     model: str
@@ -61,6 +63,7 @@ class OptionsOf:
     without: tuple[str, ...] = ()
     only: tuple[str, ...] = ()
     nulls: Mapping[str, str] = field(default_factory=dict)
+    defaults: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def options(self) -> tuple[_Option, ...]:
@@ -101,7 +104,8 @@ class OptionsOf:
             elif "properties" in schema and not _holds_numbers(schema):
                 yield from self._made(schema["properties"], path)
                 continue
-            yield _Option(path, schema, _several(self.short.get(path[-1], ())), self.nulls.get(name))
+            short = _several(self.short.get(path[-1], ()))
+            yield _Option(path, schema, short, self.nulls.get(name), self.defaults.get(name))
 
     def _spelled(self, place: tuple[int | str, ...]) -> str:
         """Return the beginning of an error text: the option for the field that has this path in the model."""
@@ -118,6 +122,7 @@ class _Option:
     schema: Schema
     short: tuple[str, ...]
     null: str | None
+    default: str | None
 
     @property
     def key(self) -> str:
@@ -162,7 +167,8 @@ class _Option:
             f"names: {', '.join(names)}" if (names := self._schema.get("properties")) else "",
             *(["may be repeated"] if self._form in ("texts", "assignments") else []),
             *(["a,b,c or first:last:step"] if self._form == "numbers" else []),
-            f"default {default}" if (default := default_text(self.schema)) else "",
+            f"default: {self.default}" if self.default else "",
+            f"default {default}" if not self.default and (default := default_text(self.schema)) else "",
         ]
         note = "; ".join(filter(None, notes))
         return f"{meaning} {note[:1].upper()}{note[1:]}.".strip() if note else meaning
