@@ -11,7 +11,7 @@ from marey_client.cli.evaluations import evaluation_at, perceived_text
 from marey_client.cli.improvements import SHOWN, Evaluation, print_findings, submit_and_follow
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, refuse_without_waiting
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, output_option
 from marey_client.cli.terminal.output import print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.wording import counted
@@ -50,9 +50,7 @@ def compare(
     job: Chosen,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "--output", "-o", help="Also write the report of the comparison, an HTML page, to this file."
-        ),
+        output_option("Also write the report of the comparison, an HTML page, to this file."),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,

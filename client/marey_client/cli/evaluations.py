@@ -19,7 +19,7 @@ from marey_client.cli.terminal.following import (
     print_commit,
     refuse_without_waiting,
 )
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, output_option
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.terminal.typed_values import is_frame
@@ -83,9 +83,7 @@ def evaluate(
     metric: MetricName = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "--output", "-o", help="Also write the report of the evaluation, an HTML page, to this file."
-        ),
+        output_option("Also write the report of the evaluation, an HTML page, to this file."),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
@@ -143,9 +141,7 @@ def _place_beside(path: str) -> tuple[str, str]:
 def report(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="An evaluation or a model: project/folder/name, or project/id.")],
-    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="File that receives the report.")] = Path(
-        "report.html"
-    ),
+    out: Annotated[Path, output_option("File that receives the report.")] = Path("report.html"),
     figures: Annotated[
         Path | None,
         typer.Option(help="Also write every figure to this folder, as PNG and SVG, with its data as JSON and CSV."),

@@ -12,7 +12,7 @@ from marey_client.cli.evaluations import evaluation_at
 from marey_client.cli.perception.metrics import MetricName, metric_at
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, clips_at, follow, refuse_without_waiting
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, output_option
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.wording import counted
@@ -64,11 +64,8 @@ def suggest(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "--output",
-            "-o",
-            help="Also write the report, an HTML page with pictures of the clips, to this file.",
+        output_option(
+            "Also write the report, an HTML page with pictures of the clips, to this file.",
         ),
     ] = None,
     metric: MetricName = None,

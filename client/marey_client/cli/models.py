@@ -10,7 +10,7 @@ import typer
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import SEEDED_JOB, Wait, follow, input_at, print_commit
-from marey_client.cli.terminal.invocation import AsJson, connect, refuse_ignored
+from marey_client.cli.terminal.invocation import AsJson, connect, output_option, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.formats import DEFAULT_FORMAT, SAMPLE_FORMATS
@@ -76,9 +76,7 @@ def sample(
         int, typer.Option(min=0, help="Seed of the random numbers; the same seed gives the same motions.")
     ] = 0,
     format: Annotated[str, typer.Option(help=f"Format of the files: {one_of(SAMPLE_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
-    out: Annotated[
-        Path | None, typer.Option("--out", "--output", "-o", help="Folder of the files; default: the current folder.")
-    ] = None,
+    out: Annotated[Path | None, output_option("Folder of the files; default: the current folder.")] = None,
     into: Annotated[
         str | None, typer.Option(help="Create clips in this folder of the model's project, instead of files.")
     ] = None,

@@ -21,7 +21,7 @@ from marey_client.cli.terminal.following import (
     follow,
     print_ended,
 )
-from marey_client.cli.terminal.invocation import AsJson, connect, refuse_ignored
+from marey_client.cli.terminal.invocation import AsJson, connect, output_option, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.terminal.typed_values import read_json
@@ -137,11 +137,8 @@ def search(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "--output",
-            "-o",
-            help="File or folder to which the motion is written. Default: the motion is not written, only described.",
+        output_option(
+            "File or folder to which the motion is written. Default: the motion is not written, only described.",
         ),
     ] = None,
     format: Annotated[str, typer.Option(help=f"Format of the file: {one_of(MOTION_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002

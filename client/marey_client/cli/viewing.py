@@ -17,7 +17,7 @@ from marey_client.cli.addresses import addresses_in_one_project
 from marey_client.cli.difference.diff import PICTURES
 from marey_client.cli.revisions import RevisionNumber, at_revision, require_revision
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.invocation import connect, refuse_ignored
+from marey_client.cli.terminal.invocation import connect, output_option, refuse_ignored
 from marey_client.cli.terminal.output import print_message
 from marey_schemas.kinds import Kind
 
@@ -70,11 +70,8 @@ def view(
     browser: InBrowser = False,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "--output",
-            "-o",
-            help="Draw poses to this file, which ends in .png or .svg; or write a page that plays the motion without a "
+        output_option(
+            "Draw poses to this file, which ends in .png or .svg; or write a page that plays the motion without a "
             "server or network, if it ends in .html.",
         ),
     ] = None,

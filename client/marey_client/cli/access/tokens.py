@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.invocation import AsJson, connect, credential_of, refuse_ignored
+from marey_client.cli.terminal.invocation import AsJson, connect, credential_of, output_option, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_schemas.sizes import DAY_S, LONGEST_TOKEN_DAYS
 from marey_schemas.wording import counted
@@ -62,11 +62,8 @@ def create_token(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "--out",
-            "-o",
-            help="Write the secret to this new file, which only you can read, instead of the screen.",
+        output_option(
+            "Write the secret to this new file, which only you can read, instead of the screen.",
         ),
     ] = None,
     as_json: AsJson = False,

@@ -10,7 +10,7 @@ import typer
 
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, imported, parse, short
 from marey_client.cli.terminal.failures import Refused
-from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
+from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect, output_option
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs
 from marey_client.progress import progress
 from marey_schemas.wording import counted
@@ -98,7 +98,7 @@ def verify(file: ArchivePath, as_json: AsJson = False) -> None:
 @archive.command("extract")
 def extract(
     file: ArchivePath,
-    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
+    output: Annotated[Path, output_option("Folder to write to.")] = Path(),
     as_json: AsJson = False,
 ) -> None:
     """Write the version in an archive to files: each entry as JSON, each clip also as the file that was imported.

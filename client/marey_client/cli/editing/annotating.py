@@ -11,7 +11,7 @@ from marey_client.cli.addresses import Address, addresses_in_one_project, requir
 from marey_client.cli.clip_jobs import print_labelled
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import JOB, Sources, Wait, clips_at, follow, print_ended
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, output_option
 from marey_client.cli.terminal.output import print_json, print_pairs, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.terminal.typed_values import assignment, is_frame, json_or_text
@@ -269,7 +269,7 @@ def import_annotation(
 def export_annotation(
     context: typer.Context,
     place: Place,
-    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
+    output: Annotated[Path, output_option("Folder to write to.")] = Path(),
     form: Annotated[
         AnnotationForm | None,
         typer.Option(

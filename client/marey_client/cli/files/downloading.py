@@ -11,7 +11,7 @@ import typer
 from marey_client.cli.addresses import Address, advice
 from marey_client.cli.revisions import RevisionNumber, at_revision, find_revision, find_version
 from marey_client.cli.terminal.failures import Refused, WrongUsage
-from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
+from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect, output_option
 from marey_client.cli.terminal.output import print_json, print_message
 from marey_client.progress import progress
 from marey_schemas.formats import EXPORT_FORMATS
@@ -47,7 +47,7 @@ def download(
         str, typer.Option(help=f"Format of the files: {one_of(EXPORT_FORMATS)}.")
     ] = "original",
     revision: RevisionNumber = None,
-    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
+    output: Annotated[Path, output_option("Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m. Default: cm.")] = None,
     part: Annotated[
         str | None,

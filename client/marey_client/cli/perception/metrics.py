@@ -10,7 +10,7 @@ import typer
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.following import FINDINGS_JOB, Sources, Wait, clips_at, follow, refuse_without_waiting
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, output_option
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_refused, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.terminal.typed_values import read_json
@@ -148,9 +148,7 @@ def compare(
     metric: MetricName = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "--output", "-o", help="Also write the report of the comparison, an HTML page, to this file."
-        ),
+        output_option("Also write the report of the comparison, an HTML page, to this file."),
     ] = None,
     figures: Annotated[
         Path | None,

@@ -10,7 +10,7 @@ import typer
 from marey_client.cli.addresses import Address, addresses_in_one_project
 from marey_client.cli.terminal.failures import Refused
 from marey_client.cli.terminal.following import Sources, Wait, clips_at, follow, input_at, refuse_without_waiting
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, output_option
 from marey_client.cli.terminal.output import print_json, print_message, print_refused, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 
@@ -58,9 +58,7 @@ def quality(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "--output", "-o", help="Also write the report of the measurement, an HTML page, to this file."
-        ),
+        output_option("Also write the report of the measurement, an HTML page, to this file."),
     ] = None,
     csv: Annotated[Path | None, typer.Option(help="Also write one row for each clip to this file, as CSV.")] = None,
     figures: Annotated[

@@ -12,7 +12,7 @@ import typer
 from marey_client.cli.studies.conducting import StudyPlace, study, study_at
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, follow, refuse_without_waiting
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, output_option
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 
@@ -41,7 +41,7 @@ def add_to(_app: typer.Typer) -> None:
 def export(
     context: typer.Context,
     place: StudyPlace,
-    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="File that receives the judgements.")],
+    out: Annotated[Path, output_option("File that receives the judgements.")],
     form: Annotated[
         ExportForm,
         typer.Option(
@@ -74,9 +74,7 @@ def analyse(
     job: Chosen,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "--output", "-o", help="Also write the report of the analysis, an HTML page, to this file."
-        ),
+        output_option("Also write the report of the analysis, an HTML page, to this file."),
     ] = None,
     metric: Annotated[
         Path | None, typer.Option(help="Also write the best fitted metric to this file, as JSON.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
 
 import typer
@@ -37,6 +37,11 @@ AllowExpiredConsent = Annotated[
         "the role maintainer.",
     ),
 ]
+
+
+def output_option(help: str) -> Any:  # noqa: A002
+    """Return the option that names the file or folder to write, which all commands spell alike."""
+    return typer.Option("--out", "--output", "-o", help=help)
 
 
 @dataclass(frozen=True)
