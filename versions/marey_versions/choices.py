@@ -20,7 +20,7 @@ class Choice(NamedTuple):
 
 
 class Choices:
-    """Resolutions that are left. Each decides only one conflict, because its author has seen no other conflict."""
+    """Resolutions that were not used yet. Each decides only one conflict, because its author saw no other conflict."""
 
     def __init__(self, resolutions: Iterable[Choice], used: set[str]) -> None:
         self._left: defaultdict[str, deque[Choice]] = defaultdict(deque)
@@ -50,5 +50,5 @@ class Choices:
         return self._left[key].popleft()
 
     def left(self) -> list[Choice]:
-        """Return the resolutions that are left: by key, and those with the same key in their order."""
+        """Return the resolutions that were not used, sorted by key; those with the same key keep their order."""
         return [one for key in sorted(self._left) for one in self._left[key]]

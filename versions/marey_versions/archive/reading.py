@@ -148,7 +148,10 @@ class Archive:
             raise BadArchive(f"{member.name}: the content of the member is not a list of changes: {error!r}") from error
 
     def facets(self) -> dict[str, dict[str, float]]:
-        """Return the facets of revisions by content digest; newer values replace those of an interrupted export."""
+        """Return the facets (numbers that jobs have published about revisions) by content digest of the revision.
+
+        If an interrupted export has written facets of the same revision before, the newer facets are returned.
+        """
         found: dict[str, dict[str, float]] = {}
         for member in self.members:
             if member.kind is MemberKind.FACETS:
