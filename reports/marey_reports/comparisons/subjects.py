@@ -1,4 +1,8 @@
-"""Content of the charts of a comparison: names of settings, and the numbers of fields."""
+"""Content of the charts of a comparison: names of settings, and the numbers of fields.
+
+A setting consists of the runs with the same command, inputs and parameters. Of several runs with the same seed, only
+the newest is counted.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ ratios stay finite.
 
 
 class Point(NamedTuple):
-    """Values of one field in one setting: index of the setting, summary, and the number of each counted run."""
+    """Values of one field in one setting: index of the setting, summary, and the field's value in each counted run."""
 
     setting: int
     summary: FieldSummary
@@ -51,19 +55,23 @@ class ComparedSubject:
 
     @cached_property
     def varied(self) -> tuple[ComparedColumn, ...]:
-        """The inputs, parameters and commits that differ."""
+        """The inputs, the parameters and the commit, as far as they differ between the runs."""
         return tuple(column for column in self.comparison.columns if column.of != "field" and column.differs)
 
     @cached_property
     def fields(self) -> tuple[ComparedColumn, ...]:
-        """The fields with means: first those with a goal, then those that differ."""
+        """The fields with means, sorted.
+
+        Fields with a goal come before fields without a goal. In each of these two groups, fields whose values differ
+        come first.
+        """
         own = {name for setting in self.comparison.settings for name in setting.fields}
         found = [column for column in self.comparison.columns if column.of == "field" and column.name in own]
         return tuple(sorted(found, key=lambda column: (column.goal is None, not column.differs)))
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """The name of each setting: the values that differ between settings. Equal names get a number."""
+        """The name of each setting: the values of the columns `varied` in its first run. Equal names get a number."""
         titles = self.comparison.titles(self.varied)
         named = [
             shortened(", ".join(_parts(self.first_run(place), self.varied, titles)) or "all runs", LONGEST_LABEL)
@@ -87,7 +95,7 @@ class ComparedSubject:
         return [*sorted(known, key=known.__getitem__), *(set(range(len(settings))) - known.keys())]
 
     def left_out(self, field: str) -> list[str]:
-        """Return the names of settings in which a run gave no number for a field that can be drawn."""
+        """Return the names of the settings for which `points` returns no point."""
         drawn = {point.setting for point in self.points(field)}
         return [name for place, name in enumerate(self.labels) if place not in drawn]
 
@@ -96,7 +104,7 @@ class ComparedSubject:
         return self.comparison.runs[self.comparison.settings[setting].runs[0]]
 
     def points(self, field: str) -> list[Point]:
-        """Return a point for each setting whose runs all have a number for `field` that can be drawn.
+        """Return a point for each setting in which all counted runs have a number for `field` of at most `LARGEST`.
 
         The points are in the order of `order_of`.
         """
