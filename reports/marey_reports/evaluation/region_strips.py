@@ -43,7 +43,8 @@ class PosedTrial:
 def choose_by_region(result: EvaluationResult) -> list[tuple[Region, Role, TrialVerdict, TrialRecord]]:
     """Choose the worst, the middle and the best trial of each region; none without records.
 
-    The middle trial is the one in the middle of the others. A region with two trials has no middle one.
+    The middle trial is the one in the middle of the order from worst to best. A region with two trials has no middle
+    trial, and the role of the only trial of a region is "only".
     """
     if not result.records:
         return []

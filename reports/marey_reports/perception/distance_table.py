@@ -1,4 +1,4 @@
-"""Table of perceptual distances as a picture, ordered so that similar clips are neighbours (figure 4)."""
+"""Table of perceptual distances as a picture, with similar clips as neighbours (figure 4 of Pražák et al.)."""
 
 from __future__ import annotations
 

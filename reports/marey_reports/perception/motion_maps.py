@@ -1,4 +1,7 @@
-"""Motion maps of two clips: with the period and the registration curve (figure 1), and by component (figure 6)."""
+"""Motion maps of two clips: with the period and the registration curve, and by component.
+
+The figures follow figures 1 and 6 of Pražák et al.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +57,9 @@ def draw_registration(
     recorded: NamedClip | None = None,
     rate_hz: float | None = None,
 ) -> Sketch:
-    """Draw two motion maps (figure 1): of a clip and itself, with its period, and of two clips, with their curve.
+    """Draw two motion maps: of a clip and itself, with its period, and of two clips, with their registration curve.
+
+    The figure follows figure 1 of Pražák et al.
 
     `recorded` is the clip in which the period was found, by default the clip `one`. Without a period, only the map of
     the two clips is drawn. `rate_hz` is the frame rate of period and curve, by default the frame rate of the clip
@@ -101,7 +106,7 @@ def _draw_period(panel: Axes, own: NamedClip, period: Period, rate: float) -> No
 
 
 def draw_components(one: NamedClip, other: NamedClip, metric: PerceptualMetric) -> Sketch:
-    """Draw the motion map of each component of a metric, and of the whole metric (figure 6)."""
+    """Draw the motion map of each component of a metric, and of the whole metric (figure 6 of Pražák et al.)."""
     maps = [component_map(one.clip, other.clip, metric, component) for component in metric.components]
     maps.append(motion_map(one.clip, other.clip, metric))
     titles = [component.measurement for component in metric.components] + ["all together"]

@@ -1,4 +1,7 @@
-"""Report of a study: order and groups of the motions (figure 3), the table (figure 4), and the fits (figure 5)."""
+"""Report of a study: order and groups of the motions, the table of perceived differences, and the fitted metrics.
+
+These are the contents of figures 3, 4 and 5 of Pražák et al.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +79,10 @@ def render_study_report(
 
 
 def draw_groups(order: MotionOrder, names: Sequence[str]) -> Sketch:
-    """Draw the membership of each motion in both groups, along the order of the first component (figure 3)."""
+    """Draw the membership of each motion in both groups, along the order of the first component.
+
+    The figure follows figure 3 of Pražák et al.
+    """
     count = len(names)
     side = max(_LEAST_SIDE, _PER_MOTION * count)
     figure = new_figure(_LEFT + side + 0.4, _BOTTOM + 2.4 + _TOP)
@@ -107,7 +113,7 @@ def draw_groups(order: MotionOrder, names: Sequence[str]) -> Sketch:
 
 
 def draw_table(analysis: StudyAnalysis, names: Sequence[str]) -> Sketch:
-    """Draw the table of perceived differences in the order of the first component (figure 4)."""
+    """Draw the table of perceived differences in the order of the first component (figure 4 of Pražák et al.)."""
     count, order = len(names), analysis.order
     places = np.arange(count) if order is None else order.order
     side = max(_LEAST_SIDE, _PER_MOTION * count)

@@ -1,6 +1,7 @@
-"""Figure 10: each clip as a circle of dots, one per range of frames, and transitions between clips as lines.
+"""Figure 10 of Abichequer Sangalli et al. (2022): the displayed clips, and the transitions between them.
 
-Dots are larger for frames that are displayed more often.
+Each clip is a circle of dots, one dot per range of frames. Transitions between clips are lines. Dots are larger for
+frames that are displayed more often.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Layout of clips, frames and transitions in figure 10: circles on a ring, so that no line crosses a circle."""
+"""Layout of the graph of clips (`clip_graph`): circles on a ring, so that no line crosses a circle."""
 
 from __future__ import annotations
 

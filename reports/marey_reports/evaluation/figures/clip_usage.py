@@ -1,4 +1,4 @@
-"""Figure 9: use of each clip, and number of transitions."""
+"""Figure 9 of Abichequer Sangalli et al. (2022): use of each clip, and number of transitions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figure 1: the speeds and turn rates of every clip.
+"""Figure 1 of Abichequer Sangalli et al. (2022): the speeds and turn rates of every clip.
 
 Up to `MOST_COLOURED` clips differ by colour and marker in one panel. More clips get a small panel each, with
 the name above it, because a reader cannot match more colours with a legend.

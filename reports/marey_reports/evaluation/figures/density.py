@@ -1,4 +1,7 @@
-"""Figure 6: density of the data in seconds, over turn rate and speed, and over sideways and forward speed."""
+"""Figure 6 of Abichequer Sangalli et al. (2022): density of the data in seconds, over turn rate and speed.
+
+A further figure shows the density over sideways and forward speed.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Figure 8: histograms of the errors of speed and turn rate, with one and two fitted normal distributions."""
+"""Figure 8 of Abichequer Sangalli et al. (2022): histograms of the errors of speed and turn rate.
+
+One normal distribution, and a mixture of two, are fitted to the errors.
+"""
 
 from __future__ import annotations
 

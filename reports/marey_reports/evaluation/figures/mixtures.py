@@ -1,4 +1,4 @@
-"""One and two normal distributions fitted to errors, for figure 8."""
+"""One and two normal distributions fitted to errors, for figure 8 of Abichequer Sangalli et al. (2022)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Figure 5: distance of the character from the desired path, over the grid of speeds and turn rates."""
+"""Figure 5 of Abichequer Sangalli et al. (2022): distance of the character from the desired path.
+
+The figure shows the distances over the grid of speeds and turn rates.
+"""
 
 from __future__ import annotations
 

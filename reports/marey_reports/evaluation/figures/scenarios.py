@@ -1,6 +1,6 @@
-"""Figures 4a and 4b: a trial seen from above with numbered sections, and the path of the character.
+"""Figures 4a and 4b of Abichequer Sangalli et al. (2022): a trial and the path of the character from above.
 
-Trials of families that the paper does not have are drawn in the same way.
+The sections of the trial are numbered. Trials of families that the paper does not have are drawn in the same way.
 """
 
 from __future__ import annotations

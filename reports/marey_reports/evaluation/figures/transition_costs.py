@@ -1,4 +1,7 @@
-"""Figure 7: speeds during a trial in the upper panel, and costs of transitions in the lower panel."""
+"""Figure 7 of Abichequer Sangalli et al. (2022): speeds and costs of transitions during a trial.
+
+The speeds are in the upper panel, and the costs in the lower panel.
+"""
 
 from __future__ import annotations
 
