@@ -348,7 +348,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=1, help="number of parallel processes; default: 1")
     arguments = parser.parse_args()
     if unknown := set(arguments.stages) - set(STAGES):
-        parser.error(f"no stage {', '.join(sorted(unknown))}; there are {', '.join(STAGES)}")
+        parser.error(f"unknown stages: {', '.join(sorted(unknown))}; the stages are {', '.join(STAGES)}")
     if not arguments.stages and kernels_are_compiled():
         return
     discard_outdated_kernels()

@@ -360,7 +360,8 @@ def _teleports(clip: Clip) -> CheckWarning | None:
     fastest = int(speeds.argmax())
     return CheckWarning(
         "teleport",
-        f"the root jumps {jumps.size} times, at {speeds[fastest]:.0f} m/s from frame {fastest} to {fastest + 1}",
+        f"the root jumps {counted(jumps.size, 'time')}; the fastest jump, at {speeds[fastest]:.0f} m/s, is from frame "
+        f"{fastest} to {fastest + 1}",
         joints=clip.skeleton.joint_names[:1],
         frames=(int(jumps[0]), int(jumps[-1]) + 2),
         values={"speed_m_s": float(speeds[fastest]), "frame": fastest + 1, "count": int(jumps.size)},

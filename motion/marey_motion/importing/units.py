@@ -246,8 +246,9 @@ def _look_for_mirroring(source: SourceMotion, body: BodyMeasures, options: Impor
         body.warnings.append(
             CheckWarning(
                 "left-handed",
-                f"the left side of the body is on its right (mean cosine {cosine:.2f}): the file may be left-handed; "
-                "if so, import it with the option handedness=left",
+                "seen in the direction in which the feet point, the left leg is on the right (mean cosine of the angle "
+                f"between the body's left and the line from the right to the left leg: {cosine:.2f}); the file may be "
+                "left-handed; if so, import it with the option handedness=left",
                 values={"cosine": cosine},
             )
         )

@@ -159,7 +159,7 @@ def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], warn: _W
     for warning in warnings:
         if warning.code == "rest-pose-frame" and warning.frames is not None:
             if warning.frames == (0, clip.frame_count):
-                warn("only-a-rest-pose", "all of it is a rest pose; it was kept")
+                warn("only-a-rest-pose", "the whole clip is a rest pose, so no frame was left out")
                 return 0, clip.frame_count
             if warning.frames[0] == 0:
                 start = warning.frames[1]
@@ -167,7 +167,8 @@ def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], warn: _W
                 stop = warning.frames[0]
     if stop - start < clip.frame_count:
         ending = clip.frame_count - stop
-        warn("rest-pose-dropped", f"a rest pose takes {counted(start, 'frame')} at its start and {ending} at its end")
+        left_out = f"{counted(start, 'frame')} at the start and {ending} at the end of the clip"
+        warn("rest-pose-dropped", f"a rest pose was left out: {left_out}")
     return start, stop
 
 
@@ -179,11 +180,11 @@ def _closed(motion: Motion, warn: _Warn) -> Motion:
     steps = quaternions.angle_between(inner[1:], inner[:-1]).max(axis=1)
     gap = float(quaternions.angle_between(inner[-1], inner[0]).max())
     if gap < REPEATED_STEPS * float(np.median(steps)):
-        warn("loop-end-repeated", "its last frame repeats its first one and was left out")
+        warn("loop-end-repeated", "the last frame of the loop repeats the first one and was left out")
         return motion.at_frames(np.arange(motion.frame_count - 1))
     if gap > OPEN_STEPS * max(float(steps.max()), STILL_RAD):
         warn(
             "loop-does-not-close",
-            f"it is marked as a loop, but a joint turns {np.degrees(gap):.0f}° from its last frame to its first one",
+            f"the clip is marked as a loop, but a joint turns {np.degrees(gap):.0f}° from the last frame to the first",
         )
     return motion

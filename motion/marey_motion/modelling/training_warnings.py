@@ -123,7 +123,8 @@ def _of_mixture(report: TrainingReport) -> list[ModelWarning]:
         found.append(
             ModelWarning(
                 "not-converged",
-                f"the fit of a mixture of {', '.join(map(str, slow))} normal distributions did not converge",
+                "the fits of some tried mixtures did not converge, so these mixtures may fit worse than they could "
+                f"(numbers of normal distributions: {', '.join(map(str, slow))})",
             )
         )
     return found

@@ -243,7 +243,7 @@ class TestFrames:
         assert trimmed.clips[0].first_s == 12 / WALK.frame_rate_hz
         assert built(clip, frames=(4, 180)).clips[0].first_s == 12 / WALK.frame_rate_hz
         (note,) = trimmed.notes
-        assert str(note) == "one: a rest pose takes 12 frames at its start and 5 at its end"
+        assert str(note) == "one: a rest pose was left out: 12 frames at the start and 5 at the end of the clip"
         assert built(clip, DatabaseOptions(keep_rest_poses=True)).row_count == 197
 
     def test_walking_on_the_spot_as_on_a_treadmill_is_flagged(self) -> None:
