@@ -1,7 +1,8 @@
 """Joint positions and their motion: forward kinematics, velocities, heading, contacts.
 
-Right-handed, Y up, metres, seconds, radians. Heading theta is about +Y: a body that faces +z has heading 0 and its left
-at +x. The forward direction is (sin theta, cos theta) in (x, z), so an increasing heading is a left turn.
+Coordinates are right-handed with Y up; units are metres, seconds and radians. Heading theta is about +Y: a body that
+faces +z has heading 0 and its left at +x. The forward direction is (sin theta, cos theta) in (x, z), so an increasing
+heading is a left turn.
 """
 
 from __future__ import annotations

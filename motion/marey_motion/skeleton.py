@@ -1,6 +1,6 @@
 """The joint hierarchy that clips move: names, parents, offsets and rest pose.
 
-Right-handed, Y up, metres; quaternions are (w, x, y, z).
+Coordinates are right-handed with Y up, in metres; quaternions are (w, x, y, z).
 """
 
 from __future__ import annotations

@@ -67,7 +67,9 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
 
 def align_cyclic(costs: ArrayLike, *, max_run: int) -> tuple[Alignment, int]:
-    """Find the path with the least mean cost if the second motion is cyclic, so that it may start at any of its frames.
+    """Find the path with the least mean cost if the second motion is cyclic.
+
+    A cyclic motion continues with its first frame after its last one, so the path may start at any of its frames.
 
     Parameters
     ----------
@@ -191,8 +193,9 @@ def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_p
 
     One motion is divided into runs of `frames_per_box` frames, and each run is enclosed in a bounding box per point.
     Every frame of the other motion is on the warping path at least once and costs at least its distance from the
-    nearest box. The bound is the largest of four numbers: the sum of these distances, the same sum with the motions
-    exchanged, and the costs of the first and the last cell, which are on every path.
+    nearest box. The bound is the largest of four numbers, divided by the number of frames of the longer motion: the sum
+    of these distances, the same sum with the motions exchanged, and the costs of the first and the last cell, which are
+    on every path.
 
     Parameters
     ----------

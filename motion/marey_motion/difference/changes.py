@@ -174,8 +174,8 @@ def whole_move(before: Floats, after: Floats) -> Move | None:
 
     Returns
     -------
-    Move or None    None if the paths are equal, or if more than the share `UNEXPLAINED` of the mean distance of the
-        paths remains after the movement
+    Move or None    None if the paths are equal, or if the mean distance between them after the movement is more than
+        `UNEXPLAINED` times the mean distance before it
     """
     change = np.linalg.norm(after - before, axis=1)
     if not len(change) or CM_PER_M * change.max() <= NOISE_CM:

@@ -50,7 +50,9 @@ class Matching(NamedTuple):
 
 
 def match_frames(before: Poses, after: Poses, *, search: bool = True) -> Matching:
-    """Match the frames of two clips in which the motion advances equally far from one frame to the next.
+    """Match the frames of two clips whose motions are equally fast, counted in frames.
+
+    If the new clip was resampled or re-timed, `timing.compare_timing` first samples the old clip at the new speed.
 
     Parameters
     ----------

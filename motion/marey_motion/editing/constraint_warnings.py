@@ -148,7 +148,10 @@ def missed(constraints: Sequence[Constraint], residuals: Sequence[Floats]) -> It
 def jumps(
     skeleton: Skeleton, before: Motion, after: Motion, constraints: Sequence[Constraint], blend_frames: int
 ) -> Iterator[str]:
-    """Describe joints that move faster between two frames than in the unedited motion, beyond what the blend needs.
+    """Describe joints that jump: between two frames, they move farther than `limb_smoothing.allowed_steps` allows.
+
+    The allowed distance depends on the largest step of the joint in the unedited motion, on the distance by which the
+    constraints move the joint, and on `blend_frames`.
 
     Parameters
     ----------

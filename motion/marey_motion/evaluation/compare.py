@@ -101,10 +101,11 @@ class MetricChange:
 
 @dataclass(frozen=True)
 class TrialChange:
-    """A trial whose simulation differs between two evaluations: the first tick that differs, and both mean offsets.
+    """A trial whose simulation differs between two evaluations.
 
-    The first replicates are compared tick by tick; the offsets, in metres, are means over all replicates. `same_motion`
-    is true if only the names of displayed clips differ and all numbers are equal.
+    `first_tick` is the first tick that differs; for this, the first replicates are compared tick by tick. The offsets
+    before and after are the mean distances from the desired positions in the two evaluations, in metres, over all
+    replicates. `same_motion` is true if only the names of displayed clips differ and all numbers are equal.
     """
 
     trial: str

@@ -53,7 +53,7 @@ def take_trials(database: MatchingDatabase, options: EvaluationOptions) -> tuple
     Raises
     ------
     MotionError    if no clip is long enough and travels far enough (clips of walking in place do not count), or if the
-        set has no other clip
+        set does not contain two different clips
     """
     if "takes" not in options.families:
         return ()

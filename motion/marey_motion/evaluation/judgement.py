@@ -3,9 +3,9 @@
 A trial counts as followed if the character keeps the desired place, speed and heading, and looks right: its feet stand
 while they are in contact, it steps as often as the clips, and its poses follow each other smoothly. Each measure is
 divided by its limit; the result is the *strain*. The share of followed trials gives the grade: from 75 % very good,
-from 55 % good, from 30 % usable in part, below that poor. The best grade can be reached, but hardly surpassed: with
-clips generated for every cell of the default grid, 76 % of the trials are followed: 97 % of the circles, and 57 % of
-the trials with changes of speed. In tight turns, motion matching does not respond to many of these changes.
+from 55 % good, from 30 % usable in part, below that poor. A share much above 75 % can hardly be reached. With clips
+generated for every cell of the default grid, 76 % of the trials are followed (97 % of the circles, and 57 % of the
+trials with changes of speed). In tight turns, motion matching does not respond to many of these changes.
 """
 
 from __future__ import annotations

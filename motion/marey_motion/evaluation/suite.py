@@ -237,9 +237,8 @@ def evaluate_baseline(
 ) -> EvaluationResult:
     """Evaluate the baseline: the same trials over clips generated for every cell of the grid.
 
-    The result contains no simulated ticks; the last result is cached. The baseline runs in as many replicates as the
-    evaluation, because chance affects its metrics, too, but in at most as many as a confidence interval needs, because
-    differences from the baseline are not tested.
+    The result contains no simulated ticks; the last result is cached. The baseline has as many replicates as
+    `baseline_replicates` returns, because chance affects its metrics, too. Trials along takes are left out.
 
     Parameters
     ----------
@@ -278,7 +277,8 @@ def baseline_replicates(options: EvaluationOptions) -> int:
 
     Returns
     -------
-    int    that of the evaluation, but at most as many as a confidence interval needs
+    int    the number of replicates of the evaluation, but at most `LEAST_REPLICATES`, the number that a confidence
+        interval needs. More are not needed, because differences from the baseline are not tested
     """
     return min(options.replicates, LEAST_REPLICATES)
 

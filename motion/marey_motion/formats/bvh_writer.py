@@ -81,7 +81,7 @@ def with_folded_positions(clip: Clip) -> Clip:
 
     Returns
     -------
-    Clip    F frames without translations; its skeleton has other offsets if several joints were translated
+    Clip    F frames without translations; its skeleton contains the constant offsets
     """
     if clip.translations is None:
         return clip

@@ -1,6 +1,7 @@
 """npz: a clip or skeleton as plain numpy arrays without rounding, for scripts.
 
-A zip archive of .npy members, never pickled; the same clip always gives the same bytes. Members:
+The file is a zip archive of .npy members, which are never pickled. The same clip always gives the same bytes. The
+members are:
 
     format            "marey/clip-npz@1"
     joint_names, display_names    (J,) text

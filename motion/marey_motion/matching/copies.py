@@ -38,8 +38,8 @@ def index_of(database: MatchingDatabase) -> SearchIndex:
 def searchable(database: MatchingDatabase, removed: Flags | None = None) -> Flags:
     """Mark the rows that a search may choose.
 
-    Of several clips with equal rows, only the one with the lowest uid is searched, among the clips that still have rows
-    in the set.
+    Clips of which all rows were removed are ignored. Of several other clips with equal rows, only the clip with the
+    lowest uid is searched.
 
     Parameters
     ----------

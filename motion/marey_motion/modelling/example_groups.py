@@ -23,7 +23,7 @@ class ExampleGroups:
 
     Parameters
     ----------
-    takes : (m,) int64    number of each example's take; steps from one take have the same number, and so have an
+    takes : (m,) int64    number of each example's take; examples from one take have the same number, and so have an
         example and its mirrored copy
     subjects : (m,) int64 or None    number of each example's performer; None if the performer of any example is
         unknown, or if there are fewer than three performers

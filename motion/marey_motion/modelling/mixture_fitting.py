@@ -128,9 +128,11 @@ def fit_mixture(
 ) -> FittedMixture:
     """Fit a mixture to latent vectors.
 
-    Mixtures with three kinds of covariance and up to 10 components are compared by `options.criterion`. Of mixtures
-    whose held-out likelihoods differ by less than their standard error, the one with the fewest parameters is taken. A
-    mixture is excluded if one of its components has fewer than 5 examples.
+    Mixtures with the kinds of covariance and the numbers of components that `options` allow are compared by
+    `options.criterion`. If the criterion is "held_out", the mixture with the fewest parameters is chosen among the
+    mixtures whose held-out likelihood is at most one standard error lower than that of the best mixture. Unless the
+    options set the number of components, a mixture of several components is excluded if the weight of a component
+    corresponds to fewer than 5 examples.
 
     Parameters
     ----------
@@ -145,7 +147,8 @@ def fit_mixture(
 
     Raises
     ------
-    ModelError    if a latent vector is not finite, or if all latent vectors are equal
+    ModelError    if a latent vector is not finite, or if all latent vectors are equal; vectors without dimensions are
+        accepted
     """
     examples, dimensions = latents.shape
     wanted = options or MixtureOptions()

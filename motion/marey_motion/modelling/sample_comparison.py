@@ -23,8 +23,8 @@ class SampleComparison:
 
     Parameters
     ----------
-    duration_gap : greatest difference, 0 to 1, of the shares of samples and of examples up to any duration (the
-        statistic of Kolmogorov and Smirnov)
+    duration_gap : statistic of Kolmogorov and Smirnov for the durations, 0 to 1: the greatest difference, over all
+        durations d, between the share of the samples and the share of the examples that last at most d
     nearest_cm : median distance of a sample from the nearest example
     nearest_example_cm : median distance of an example from the nearest example of another take; None if all examples
         come from one take

@@ -101,10 +101,10 @@ def solve(
     limb : TwoBoneLimb, optional    a limb that may turn; it is ignored if `freedom.joints` lacks one of its joints
     solver : str    "auto", "ccd", "two_bone" or "least_squares". "auto" uses the two-bone solver if a limb is given,
         joints have no limits, and the targets are a position of the limb's end in all axes and, optionally, an
-        orientation of this end. Otherwise, "auto" uses least squares. It also uses least squares if the limb is too
-        short in any frame, and other joints or the root may move. If all targets are orientations of the limb's end,
-        this end turns first. Other joints turn, too, only in frames in which the end alone cannot reach the targets,
-        for example because of its limits.
+        orientation of this end. Otherwise, "auto" uses least squares. If the two-bone solver misses the targets in any
+        frame, for example because the limb is too short, and other joints or the root may move, "auto" uses least
+        squares instead. If all targets are orientations of the limb's end, this end turns first. Other joints turn,
+        too, only in frames in which the end alone cannot reach the targets, for example because of its limits.
     options : SolverOptions    tolerances and iterations
     neighbours : Neighbours, optional    order of the frames in time; None solves each frame alone
     damping_zone_rad : float    damping of stretching limbs, as in `solve_two_bone`

@@ -1,7 +1,7 @@
 """Inputs of inverse kinematics: targets of joints, limits of joints, and the joints that may turn.
 
-Right-handed, Y up, metres, radians; quaternions (w, x, y, z). Targets are in the world, offsets and limits in a
-joint's own frame.
+Coordinates are right-handed with Y up, in metres; angles are in radians, and quaternions are (w, x, y, z). Targets are
+in the world, offsets and limits in a joint's own frame.
 """
 
 from __future__ import annotations

@@ -34,7 +34,8 @@ class Effect:
         with amounts of data
     headlines : change of each headline metric, by name, in its unit
 
-    Changes that were computed from trials are `RepeatedChange`, with an interval for repetitions.
+    Changes that were computed from trials are `RepeatedChange`; they also have an interval that contains most changes
+    measured with other seeds.
     """
 
     objective: MetricChange

@@ -1,17 +1,18 @@
 """Intervals for repetitions: where the same measurement of an effect lies if it is repeated with another seed.
 
-The confidence interval of a mean is not enough for two reasons. A repetition varies by chance as well, so the
-difference of two measurements has twice the variance of one. And a removed clip changes few runs, each of them by a
-jump, because motion matching then follows another sequence of frames. The values of eight replicates are then mostly 0,
-and their standard deviation is too small whenever the sample contains fewer jumps than the repetition will.
+A run is one replicate of a trial. The confidence interval of the mean change over the replicates is not enough, for two
+reasons. A repetition varies by chance as well, so the difference of two measurements has twice the variance of one
+measurement. And a removed clip changes few runs, each of them by a jump, because motion matching then follows another
+sequence of frames. So the changes of most runs are 0. If the measured runs contain fewer jumps than the repetition, the
+standard deviation of the changes is too small.
 
-So the variance is computed from single runs, within each trial, because the runs of different trials are independent.
-If not all runs changed, one changed run more is counted than was observed. Its jump is as large as those observed, but
-at least as large as the difference of two replicates of one trial, since a run that continues in another sequence of
-frames is like another replicate.
+Therefore, the variance is computed from the changes of the runs within each trial, because the runs of different trials
+are independent. If some runs did not change, the variance is increased as if one more run had changed. The jump of this
+additional run is as large as the observed jumps, but at least as large as the difference of two replicates of one
+trial, because a run that continues in another sequence of frames is like another replicate.
 
-If a change affects single runs, but these by far more than chance does, the observed runs may contain none of them. So
-`again_percent` is lower if few runs changed.
+If a change affects only a few runs, but these by much more than chance does, the measurement may contain none of the
+affected runs. Therefore, `again_percent` is lower if few runs changed.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ class RepeatedChange(MetricChange):
     ----------
     again_low, again_high : bounds between which the change lies in `again_percent` or more of 100 repetitions with
         another seed and as many replicates; None if there are too few replicates
-    again_percent : `PERCENT`, or `PERCENT_OF_FEW` if fewer than `FEW_RUNS` runs changed, but not all; None without
-        bounds
+    again_percent : `PERCENT`, or `PERCENT_OF_FEW` if fewer than `FEW_RUNS` runs changed and at least one run did not
+        change; None without bounds
     """
 
     again_low: float | None = None

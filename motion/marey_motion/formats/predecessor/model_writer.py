@@ -1,9 +1,9 @@
 """Writer of motion primitives in layouts 3 and 2 of Marey's predecessor.
 
-The documents are right-handed, with lengths in centimetres and times in canonical frames. The spatial
-part is written exactly. A time function that was read from a document of the predecessor, and that the document can
-contain, is written as it was read; other time functions are converted (see `time_functions`). Layout 2 contains both
-forms of time functions, layout 3 only the form `coefficients`.
+The documents are right-handed, with lengths in centimetres and times in canonical frames. The spatial part is written
+exactly. A document of layout 2 can contain both forms of time functions (see `time_functions`), a document of layout 3
+only the form `coefficients`. A time function that was read from a document of the predecessor is written as it was read
+if the layout can contain its form. Other time functions are converted.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Cluster trees of Marey's predecessor: samples of a model in nested nodes. Conversion from and to Marey's trees.
+"""Conversion of cluster trees (samples of a model in nested nodes) between Marey's predecessor and Marey.
 
-A document holds `data` (samples), `features`, `options` and `root`; a node is `{mean, indices, children}`, and the
-`indices` of a node with children, such as the root, may be null. Marey's tree
+A document of the predecessor holds `data` (samples), `features`, `options` and `root`; a node is
+`{mean, indices, children}`, and the `indices` of a node with children, such as the root, may be null. Marey's tree
 contains the samples in the order of the tree, in single precision; Marey computes the means from the samples.
 """
 

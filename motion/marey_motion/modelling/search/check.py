@@ -54,7 +54,8 @@ def check_search(
 ) -> SearchCheck | None:
     """Train a model without every fifth take, and search for the positions of hands and feet in these takes.
 
-    If at least three performers are known, also train a model without each performer, and search for their positions.
+    If at least three performers are known, the same is done for each performer: a model is trained without the examples
+    of this performer, and the positions of hands and feet in these examples are searched for.
 
     Parameters
     ----------

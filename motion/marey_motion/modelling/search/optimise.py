@@ -74,7 +74,7 @@ class LeastSquares(Protocol):
 def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:
     """Improve latent vectors; the cost of the result is never above the cost of the start.
 
-    If `options` gives no weight of the likelihood, the sum of the squared errors does not increase, either.
+    If `options.likelihood_weight` is None, the sum of the squared errors does not increase, either.
 
     Parameters
     ----------
