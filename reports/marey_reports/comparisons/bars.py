@@ -33,7 +33,7 @@ _SIGN = 0.068
 
 
 def draw_bars(subject: ComparedSubject, column: ComparedColumn) -> Sketch | None:
-    """Draw the mean of a field for each setting; return None if no setting has a mean.
+    """Draw the mean of a field for each setting that has one, up to `MOST_BARS_DRAWN`; return None if there are none.
 
     If the axis does not contain zero (it is logarithmic, or the values are close together), dots replace the bars,
     because the lengths of bars would be misleading.

@@ -53,7 +53,7 @@ def draw_comparison(
 
     Raises
     ------
-    ValueError    if the runs have no values for the wanted chart
+    ValueError    if the runs have no values for the wanted chart, or no parameter of the given name
     """
     subject = ComparedSubject(comparison, log)
     if file_type == "html":

@@ -1,4 +1,4 @@
-"""Head of a report: what it is, by which version of Marey, and from which inputs."""
+"""Head of a report: its subject, the version of Marey that made it, and its inputs."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Camera:
     tilt_rad: float
 
     def seen(self, points: AnyFloats) -> AnyFloats:
-        """Convert points (..., 3) to (right, up, towards the viewer) as the camera sees them, in metres, (..., 3)."""
+        """Convert points (..., 3) to the camera's axes (right, up, towards the viewer), in metres; shape (..., 3)."""
         turn, tilt = self.direction_rad, self.tilt_rad
         right = points[..., 0] * np.cos(turn) - points[..., 2] * np.sin(turn)
         near = points[..., 0] * np.sin(turn) + points[..., 2] * np.cos(turn)

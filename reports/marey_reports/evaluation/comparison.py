@@ -133,7 +133,7 @@ def metric_chapter(
 def trial_chapter(
     before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, figures: Figures
 ) -> Section:
-    """Write the chapter on the trials that became better or worse, those that became worse most first."""
+    """Write the chapter on the trials that became better or worse, beginning with the one that became worse most."""
     pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
     pairs = worst_first(pairs, lambda pair: _shift(*pair), lambda pair: pair[0].trial.name)
     changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
