@@ -27,7 +27,8 @@ def changes_at(reader: ChunkReader, before: str, after: str, path: str) -> Itera
 def path_after(reader: ChunkReader, before: str, after: str, key: str, *, most: int) -> str | None:
     """Return the path to which an entry of one tree was moved in another, or None if it was removed.
 
-    An entry also counts as removed if the trees differ in more than `most` entries.
+    `key` is the key of an entry that the tree `before` has and the tree `after` does not have. The entry also counts as
+    removed if the trees differ in more than `most` entries.
     """
     changes = list(islice(difference(reader, before, after), most + 1))
     if len(changes) > most:
