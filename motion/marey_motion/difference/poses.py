@@ -88,9 +88,9 @@ def rotation_changes_deg(before: Poses, after: Poses, pairs: AnyInts) -> NDArray
 def frame_costs(before: Poses, after: Poses, pairs: AnyInts) -> Floats:
     """Compute the cost of matching the two frames of each pair.
 
-    Each joint costs min(angle / `FAR_DEG`, 1), and the root costs min(distance / `FAR_M`, 1) in addition. This limits
-    the contribution of a joint that was edited a lot. If the mean m of these costs is not 0, the cost of the pair is
-    `UNEQUAL` + (1 - `UNEQUAL`)·m.
+    Each joint costs min(angle / `FAR_DEG`, 1), to within 0.002, and the root costs min(distance / `FAR_M`, 1) in
+    addition. This limits the contribution of a joint that was edited a lot. If the mean m of these costs is not 0, the
+    cost of the pair is `UNEQUAL` + (1 - `UNEQUAL`)·m.
 
     Parameters
     ----------

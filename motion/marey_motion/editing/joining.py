@@ -38,8 +38,9 @@ stance lasts longer than this time would be in the wrong place for too long.
 def concatenate(take: Take, command: Concatenate) -> Take:
     """Append another clip of the same skeleton, resampled to the frame rate of the take.
 
-    If the root is a static reference and the hips below it are translated, the travel of the hips is merged into the
-    travel of the root.
+    A rest pose at the end of the take or at the start of the other clip is left out if the body jumps into or out of
+    it. If the root is a static reference and the hips below it are translated, the travel of the hips is merged into
+    the travel of the root.
 
     Parameters
     ----------
@@ -65,7 +66,8 @@ def concatenate(take: Take, command: Concatenate) -> Take:
         take = take.with_finding(EditFinding("concatenate", left_out))
     if command.blend_s * take.frame_rate_hz > min(before.frame_count, after.frame_count):
         take = take.with_warning(
-            "concatenate", f"the blend of {command.blend_s:g} s is longer than one of the two clips"
+            "concatenate",
+            f"the blend of {command.blend_s:g} s is longer than one of the two clips; choose a shorter blend",
         )
     if command.place == "keep" and count == 0:
         return take.with_motion(_in_a_row(first, second))

@@ -160,7 +160,8 @@ def pose_errors(
     -------
     dict of str to float or None    metres: `pose_error_mean` and `pose_error_p95`, compared with the pose of the take
         at the same time; and `pose_error_nearest`, the mean of the errors compared with the nearest pose of the take at
-        most `PHASE_S` earlier or later. Empty if the trial is not along a take; None if no step counts
+        most `PHASE_S` earlier or later. The dict is empty if the trial is not along a take; its values are None if no
+        step counts
     """
     if not trial.left_out:
         return {}

@@ -64,7 +64,8 @@ def read_motion(
     ------
     UnknownFormat    if no reader knows the file
     AmbiguousUnits    if the unit of length or the upward axis cannot be determined and must be given in `options`
-    FormatError    if the file is invalid; the error names file, line and joint
+    FormatError    if the file is invalid (the error names file, line and joint), or if it contains neither a motion nor
+        a skeleton
 
     Examples
     --------

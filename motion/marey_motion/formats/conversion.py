@@ -1,4 +1,4 @@
-"""Conversion of a file's unit and axes to metres, right-handed, Y up."""
+"""Conversion of a file's unit and axes to metres and right-handed axes with Y up."""
 
 from __future__ import annotations
 

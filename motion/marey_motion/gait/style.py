@@ -172,7 +172,7 @@ def landing_pitch_rad(speed_m_s: AnyFloats, travel_angle_rad: AnyFloats) -> AnyF
 
 
 def leaving_pitch_rad(speed_m_s: AnyFloats, travel_angle_rad: AnyFloats) -> AnyFloats:
-    """Compute the pitch of the foot when it leaves the floor: off the ball going forward, off the heel going backward.
+    """Compute the pitch of the foot when its ball (going forward) or its heel (going backward) leaves the floor.
 
     Parameters
     ----------

@@ -401,7 +401,7 @@ def _dead_joints(clip: Clip, tracks: Tracks) -> CheckWarning | None:
     if not dead or (rotations == rotations[0]).all():
         return None
     names = tuple(clip.skeleton.joint_names[joint] for joint in dead)
-    message = f"no joint of one or more limbs ever turns ({counted(len(names), 'joint')})"
+    message = f"in at least one limb, no joint ever turns ({counted(len(names), 'joint')} in all)"
     return CheckWarning("dead-joints", message, joints=names)
 
 

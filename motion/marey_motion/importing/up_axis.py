@@ -55,11 +55,12 @@ def choose_up_axis(
 
     Returns
     -------
-    str    axis, with a sign if it points down
+    str    axis, with a sign if it points down; "y", with a warning, if no feet were found in the file
 
     Raises
     ------
-    AmbiguousUnits    if the body does not determine the axis; the error names the option to set, and candidates
+    AmbiguousUnits    if the body does not determine the axis although its feet were found; the error names the option
+        to set, and candidates
     ContradictedOption    if the body clearly stands along another axis than the given one
     """
     if options.up_axis is not None:

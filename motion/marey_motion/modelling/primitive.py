@@ -297,7 +297,7 @@ class MotionPrimitive:
             if passed[-1] > MOST_FRAMES:
                 raise MotionError(
                     f"the motion would last {passed[-1] / self.frame_rate_hz:.3g} s, far longer than the "
-                    "motions that the model was trained on",
+                    "motions that the model was trained on; choose less extreme latent vectors",
                     code="motion-too-long",
                 )
             steps = max(1, round(float(passed[-1])))

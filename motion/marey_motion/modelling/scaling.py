@@ -52,7 +52,7 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
 
     Returns
     -------
-    (3 + 4·J,) float64    metres per unit of each channel
+    (3 + 4·J,) float64    metres per unit of each channel: 1 for the root axes, at least `LEAST_WEIGHT_M` for rotations
     """
     rotations = quaternions.normalise(poses[:, 3:].reshape(len(poses), -1, 4)).reshape(len(poses), -1)
     joints = kinematics.forward_kinematics(skeleton, np.concatenate((poses[:, :3], rotations), axis=1))

@@ -56,7 +56,7 @@ def limb_ending_at(
 
     Returns
     -------
-    TwoBoneLimb or None    None if the joint is neither a wrist nor an ankle
+    TwoBoneLimb or None    None if the joint is not the wrist or ankle of a limb whose three joints are mapped
     """
     for side in SIDES:
         for root, middle, end in LIMBS:

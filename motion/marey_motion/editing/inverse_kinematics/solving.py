@@ -194,7 +194,7 @@ def solve_ccd(
 
     Raises
     ------
-    EditError    if a target is invalid; the error names it
+    EditError    if a target is invalid (the error names it), or if `freedom.root_moves` is True
     """
     from marey_motion.editing.inverse_kinematics import ccd_kernels
 

@@ -1,4 +1,4 @@
-"""Confirmation of suggestions: their effects are measured in replicates that were not used to choose them."""
+"""Confirmation of suggestions: replicates that did not serve to choose the suggestions measure their effects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Intervals for repetitions: where the same measurement of an effect lies if it is repeated with another seed.
+"""Intervals that contain most results of a measurement of an effect if it is repeated with other seeds.
 
 A run is one replicate of a trial. The confidence interval of the mean change over the replicates is not enough, for two
 reasons. A repetition varies by chance as well, so the difference of two measurements has twice the variance of one
@@ -36,7 +36,7 @@ FEW_RUNS = 8
 
 @dataclass(frozen=True)
 class RepeatedChange(MetricChange):
-    """Change of one metric, with the interval in which a repetition of the measurement will lie.
+    """Change of one metric, with an interval that contains most repetitions of the measurement.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Clips that a suite of trials never needs, and unneeded ranges of clips that are used elsewhere.
+"""Clips that a suite of trials never needs, and ranges of the other clips that it never needs.
 
 Removing these clips and ranges from the database leaves every trial bit-identical, as long as the normaliser stays the
 same; `resimulation` explains why for whole clips. The needed frames are those that a trial displayed or chose. A frame

@@ -131,6 +131,10 @@ def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
     Returns
     -------
     (N,) float64    strictly increasing from 0 to the last frame of the source
+
+    Raises
+    ------
+    FormatError    if a source frame is beyond the last frame of the source
     """
     if frames.max() >= source_frames:
         message = f"the time function contains frame {int(frames.max())}, but the source has {source_frames} frames"
