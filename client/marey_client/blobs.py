@@ -96,7 +96,7 @@ class Blobs:
         return target
 
     def fetch_into(self, digest: str, file: BufferedRandom) -> None:
-        """Download a blob into an empty file that is open for reading and writing; the file is then at its end."""
+        """Download a blob into an empty file that is open for reading and writing; its position is then at the end."""
 
         def once() -> None:
             start = file.tell()

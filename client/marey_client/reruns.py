@@ -44,10 +44,10 @@ class ComparedOutput:
 def rerun_request(job: Job, kind: JobKind, tasks: Iterable[Job] = (), *, into: str | None = None) -> JobCreate:
     """Return the request that repeats a job with the same revisions, parameters and seed, without cached results.
 
-    `tasks` are the tasks of the job; if an input was distributed over tasks, the items of the input are read from their
-    records. The results are stored in the folder `into`, by default `reruns/ID` with the id of the job. Raises
-    `CannotRerun` for a job that has not succeeded, for a task of another job, and for a job that wrote new revisions of
-    its inputs.
+    `tasks` are the tasks of the job; if an input was distributed over tasks, the items of the input are read from the
+    records of the tasks. The results are stored in the folder `into`, by default `reruns/ID` with the id of the job.
+    Raises `CannotRerun` for a job that has not succeeded, for a task of another job, and for a job that wrote new
+    revisions of its inputs.
     """
     if job.state is not JobState.SUCCEEDED:
         raise CannotRerun(f"the job {job.id} has no result to repeat; its state is {job.state.value}")

@@ -57,8 +57,8 @@ def find_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tupl
 def find_version(marey: Marey, address: Address) -> DatasetInput | None:
     """Return the version of a dataset, or the folder in a version, that an address names.
 
-    Returns None if the address has no `@`, or is the path of a folder of the project. Raises `WrongUsage` if any
-    other address does not have the form of a version.
+    Returns None if the address has no `@`, or is the path of a folder of the project. For every other address, raises
+    `WrongUsage` unless the address has the form of a version.
     """
     from marey_schemas.queue.jobs import DatasetInput
 

@@ -1,4 +1,4 @@
-"""Command `view`: shows clips in a browser, or draws poses to a file; and addresses of pages."""
+"""Command `view`, which shows clips in a browser or draws poses to a file, and functions for addresses of pages."""
 
 from __future__ import annotations
 

@@ -65,12 +65,11 @@ class Distances(Findings):
     def maps(self) -> dict[str, NDArray[Any]]:
         """Return the motion maps and registration curves of the only pair, or of the nearest and the farthest pair.
 
-        The result contains arrays by name.
+        The result maps names to arrays. The names begin with `pair0_` or `pair1_`, and end as follows:
 
-        The names begin with `pair0_` or `pair1_`. The name of a map ends with the measurement or with `combined`; rows
-        are frames of the first clip, columns frames of the second clip. The name of the frame rate of both ends with
-        `map_rate_hz`. The times in seconds at which the two clips show the same moment have names that end with
-        `curve_first_s` and `curve_second_s`.
+        * the measurement, or `combined`: a map; rows are frames of the first clip, columns frames of the second clip
+        * `map_rate_hz`: frame rate of the rows and columns of the maps
+        * `curve_first_s`, `curve_second_s`: times in seconds at which the two clips show the same moment
         """
         with np.load(io.BytesIO(Blobs(self.transport).fetch(self._blob("maps")))) as arrays:
             return dict(arrays)

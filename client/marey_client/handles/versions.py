@@ -345,7 +345,7 @@ class DatasetHandle:
         return read_model(Ref, self.transport.send("PATCH", f"{self.url}/refs/{name}", content=body, headers=state))
 
     def ref(self, name: str) -> Ref:
-        """Return the branch or the tag with this name, a branch with its protection.
+        """Return the branch or the tag with this name; a branch includes its protection rule.
 
         Raises `NotFound` if there is none.
         """

@@ -81,8 +81,9 @@ class ClipOfStrip:
 def draw_clips(first: ClipOfStrip, second: ClipOfStrip | None, moments: int, file_type: str) -> bytes:
     """Draw a clip, and another clip or revision below it, at the same times, as PNG or SVG.
 
-    Another revision of the same clip is drawn on top of the poses of the first revision in grey. Clips with different
-    joints are drawn side by side, as PNG only. Raises `BadArgument` if the second clip ends before the range begins.
+    If both are revisions of the same clip, the lower row also shows the poses of the first revision, in grey behind
+    those of the second. Clips with different joints are drawn side by side, as PNG only. Raises `BadArgument` if the
+    second clip ends before the range begins.
     """
     frames = first.chosen(moments)
     poses = first.poses(frames)

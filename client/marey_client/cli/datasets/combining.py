@@ -176,7 +176,7 @@ class Decisions(NamedTuple):
         """Return the decisions, with one for each conflict that `preview` of these decisions finds.
 
         Previews are repeated, because an answer lists a limited number of conflicts, and a decision can move an entry
-        to a path that is taken. A conflict that stays after it was decided is left.
+        to a path that is taken. A conflict that is found again although it was decided gets no further decision.
         """
         from marey_schemas.datasets.merges import MOST_RESOLUTIONS, Resolution, Side
 

@@ -151,7 +151,8 @@ def _from_table(
         try:
             change = _of_row(row, fields, key, known, place)
             if change.clip.id in changes:
-                raise WrongUsage(f"{place}: the clip {row[key]!r} is also in {changes[change.clip.id].place}")
+                first = changes[change.clip.id].place
+                raise WrongUsage(f"{place}: the clip {row[key]!r} is also in {first}; keep one of the rows")
             changes[change.clip.id] = change
         except WrongUsage as error:
             wrong.append(str(error))

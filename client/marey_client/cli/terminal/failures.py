@@ -92,7 +92,11 @@ def interrupted_by_sigterm() -> Iterator[None]:
 
 
 def sentence(error: BaseException) -> str:
-    """Return an error as one line of text; for an error of the server also its code, request id, address and notes."""
+    """Return an error as one line of text.
+
+    For an error that the server sent, the line also contains the code, the request id, the address of the server, and
+    the notes of the error.
+    """
     from marey_client.errors import NotFound, RequestFailed
 
     text = " ".join(_text_of(error).split()) or type(error).__name__

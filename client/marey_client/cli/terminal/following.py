@@ -77,7 +77,10 @@ Wait = Annotated[
 
 
 def refuse_without_waiting(wait: bool, **options: object) -> None:
-    """Refuse the options that are given, which use results of the job, if the command does not wait for its end."""
+    """Raise `WrongUsage` if one of the options is given and the command does not wait for the end of the job.
+
+    All of the options use results of the job.
+    """
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
     if given and not wait:
         use = "uses" if len(given) == 1 else "use"

@@ -212,7 +212,7 @@ class SchemaCommand(TyperCommand):
     """Command whose options come from models.
 
     A subclass sets `function`, the function to run, and `groups`: for each parameter of the function that receives the
-    options of a model, the `OptionsOf` this model.
+    options of a model, the `OptionsOf` of this model.
     """
 
     function: ClassVar[Callable[..., Any]]
