@@ -36,7 +36,7 @@ class Kind(StrEnum):
 
     @classmethod
     def from_plural(cls, plural: str) -> "Kind":
-        """Return the kind with the given name in URLs. Raises `KeyError`."""
+        """Return the kind with the given name in URLs. Raises `KeyError` if there is none."""
         return _BY_PLURAL[plural]
 
 

@@ -32,7 +32,7 @@ SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOS
 
 
 class StartPlacement(Request):
-    """Position and heading of the coordinate frame of a model in the world; its motions start near the origin."""
+    """Position and heading, in the world, of a model's coordinate frame, near whose origin the motions start."""
 
     x: Coordinate = Field(0.0, description="Position along x, in metres.")
     z: Coordinate = Field(0.0, description="Position along z, in metres.")

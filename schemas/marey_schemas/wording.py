@@ -92,7 +92,10 @@ def first_reason(error: ValidationError, model: type[BaseModel] | None = None, g
 
 
 def misspelt_first(faults: Sequence[Any]) -> list[Any]:
-    """Return faults that pydantic found with those of unknown fields first: a misspelt field is also missing."""
+    """Sort faults that pydantic found: faults of unknown fields come first.
+
+    If a required field is misspelt, pydantic reports an unknown field and a missing one; the unknown one says more.
+    """
     return sorted(faults, key=lambda one: one["type"] != "extra_forbidden")
 
 

@@ -1,7 +1,9 @@
 """Perceptual metrics: part `metric` of an item of the kind `metric`, and the built-in metrics, which need no item.
 
-The distance of two poses by one measurement is c + N · Σ w F(x), with the sum over joint classes. The distance of a
-metric is the mean of its components' distances, weighted by their shares.
+The distance of two different poses by one component of a metric is c + N · Σ w F(x). The sum is over joint classes: x
+is the difference of a class by the component's measurement, and w the share of the class in all weights. The component
+defines the function F, the constant c and the factor N. The distance of the metric is the mean of the components'
+distances, weighted by their shares.
 """
 
 from __future__ import annotations

@@ -62,8 +62,8 @@ class ArrayDifference:
     ) -> ArrayDifference | None:
         """Return the difference of an array from a base; None if the difference would not be smaller than the array.
 
-        `content` and `pointer` name the base; `digest` is the content digest of the array. At most half of the array is
-        held in memory, decoded.
+        Also returns None if dtype, shape or layout of the two arrays differ. `content` and `pointer` name the base;
+        `digest` is the content digest of the array. At most half of the frames are held in memory in decoded form.
         """
         spec = ArraySpec(array.dtype, array.shape)
         if spec != ArraySpec(base.dtype, base.shape) or not spec.shape:

@@ -29,7 +29,7 @@ class ArrayError(ValueError):
 class ArraySpec:
     """Dtype and shape of an array, checked before memory is allocated.
 
-    `dtype` is one of `DTYPES` (numpy's spelling, little-endian). Raises `ArrayError`.
+    `dtype` is one of `DTYPES` (numpy's spelling, little-endian). Raises `ArrayError` if dtype or shape is not allowed.
     """
 
     dtype: str
@@ -79,7 +79,10 @@ class ArraySpec:
 
 
 def little_endian(array: NDArray[Any]) -> NDArray[Any]:
-    """Return the same numbers as a C-contiguous little-endian array, copied only where needed. Raises `ArrayError`."""
+    """Return the same numbers as a C-contiguous little-endian array, copied only where needed.
+
+    Raises `ArrayError` if dtype or shape is not allowed.
+    """
     spec = ArraySpec.of(array)
     return np.ascontiguousarray(array, dtype=spec.dtype).reshape(spec.shape)
 

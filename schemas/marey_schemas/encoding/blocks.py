@@ -112,7 +112,7 @@ def cut_frames(data: bytes, start: int, stop: int) -> bytes:
     """Return frames `start` to `stop` of an encoded array as another encoded array.
 
     If `start` is the first frame of a block, whole blocks are copied unchanged. All other frames are decoded and
-    encoded again without prediction. Raises `BlockError`.
+    encoded again without prediction. Raises `BlockError` if the header, or a tile to decode, is corrupt.
     """
     layout, starts = _read_head(data)
     cut = layout.of_frames(stop - start)
@@ -166,7 +166,7 @@ these frames in the list of all frames to change.
 def with_edited_frames(data: bytes, frames: NDArray[np.intp], edit: Edit) -> bytes:
     """Return an encoded array in which `edit` has changed some frames; tiles of other blocks are copied unchanged.
 
-    `frames` are indices in ascending order. Raises `BlockError`.
+    `frames` are indices in ascending order. Raises `BlockError` if the header, or a tile to decode, is corrupt.
     """
     layout, starts = _read_head(data)
     packed = [data[here:there] for here, there in pairwise(starts)]
@@ -202,7 +202,7 @@ def _assembled(layout: _Layout, packed: list[bytes]) -> bytes:
 
 
 def read_spec(data: bytes) -> ArraySpec:
-    """Return dtype and shape of an encoded array without decoding it. Raises `BlockError`."""
+    """Return dtype and shape of an encoded array without decoding it. Raises `BlockError` if its header is corrupt."""
     return _read_head(data)[0].spec
 
 
@@ -216,8 +216,9 @@ def decode(
     """Decode an array, or some of its frames and columns; only the tiles that contain the wanted values are read.
 
     `columns` are indices into all axes after the first, flattened: the result is then two-dimensional and equals
-    `array.reshape(len(array), -1)[frames][:, columns]`. The result is writable and at most `max_bytes` large. Raises
-    `BlockError`, and `IndexError` in the same cases as numpy's indexing.
+    `array.reshape(len(array), -1)[frames][:, columns]`. The result is writable. Raises
+    `BlockError` if the data is corrupt, or if the result would have more than `max_bytes`. Raises `IndexError` in the
+    same cases as numpy's indexing.
     """
     layout, starts = _read_head(data)
     if not layout.spec.shape and (frames is not None or columns is not None):

@@ -61,7 +61,7 @@ def encode_tree(tree: Any, media_type: str, *, arrays: ArrayForm = "plain") -> b
     """Encode a tree whose leaves may be numpy arrays or `EncodedArray`.
 
     `arrays="blocks"` (not in JSON) writes every array in the block encoding; an `EncodedArray` is then copied as it is.
-    Raises `CodecError`.
+    Raises `CodecError` if the media type or a value is not allowed, or if the tree exceeds a limit.
     """
     _require_media_type(media_type)
     if media_type == JSON and arrays == "blocks":

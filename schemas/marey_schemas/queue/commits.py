@@ -44,7 +44,7 @@ class OutputsCommit(Request):
 
     @classmethod
     def at(cls, place: str, **fields: Any) -> OutputsCommit:
-        """Return the commit to a place that is given as `dataset[@branch][/folder]`. Raises `ValueError`."""
+        """Return the commit to a place `dataset[@branch][/folder]`. Raises `ValueError` for a text of another form."""
         match = _PLACE.fullmatch(place.strip())
         if match is None:
             raise ValueError(f"{place!r} names no branch of a dataset; write dataset[@branch][/folder]")
@@ -74,7 +74,10 @@ class CommitOptions(Options):
     )
 
     def commit(self) -> OutputsCommit | None:
-        """Return the requested commit, or None if the options name no branch. Raises `ValueError`."""
+        """Return the requested commit, or None if the options name no branch.
+
+        Raises `ValueError` if the place of the commit is malformed, or if it is missing beside other options.
+        """
         if self.commit_to is not None:
             return OutputsCommit.at(self.commit_to, message=self.commit_message or "", replace=self.commit_replace)
         if self.commit_message is not None or self.commit_replace:

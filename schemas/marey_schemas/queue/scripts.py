@@ -369,7 +369,10 @@ class ScriptRun(Answer):
 
 
 def read_repositories(environment: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the allowed repositories from `REPOSITORIES_VARIABLE`, none if it is not set. Raises `ValueError`."""
+    """Return the allowed repositories from `REPOSITORIES_VARIABLE`, none if it is not set.
+
+    Raises `ValueError` if the value of the variable is not a JSON list of texts.
+    """
     text = environment.get(REPOSITORIES_VARIABLE, "").strip()
     if not text:
         return ()
