@@ -97,7 +97,7 @@ class JobHistory:
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """Result of a simulation: the history of each job, in the order of the jobs, and its duration in `seconds`.
+    """Result of a simulation: the history of each job, in the order of the jobs, and the simulated time in `seconds`.
 
     `busy_share` is the share of this time in which the server was occupied.
     """

@@ -1,7 +1,7 @@
 """Examples of requests and answers, made from their schemas.
 
-If a schema has an example, this is used. Otherwise, a text is an example that fits the name of its member, and any
-other value is the simplest one that the schema allows.
+If a schema has an example, this is used. Otherwise, the example of a text is chosen by the name of its member, and the
+example of any other value is the simplest value that the schema allows.
 """
 
 from __future__ import annotations

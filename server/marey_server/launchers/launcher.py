@@ -137,7 +137,7 @@ class WorkerEnd:
 
 
 class Launcher(Protocol):
-    """Engine that runs the workers of one pool. All methods raise `EngineError`."""
+    """Engine that runs the workers of one pool. Methods raise `EngineError` if a request to the engine fails."""
 
     outlives_server: bool
     """True if workers continue when the server ends. If so, only the leader among several servers uses the launcher."""

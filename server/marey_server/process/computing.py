@@ -28,10 +28,10 @@ BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 class ComputeThreads:
     """Threads of the server process, in three lanes (threads with a queue of computations).
 
-    The first lane computes for requests. One client may use as many of its threads as there are processors, but at
-    least two. The same limit applies to all clients without a known token together. One more thread is always left to
-    other clients. The second lane encodes answers. The third lane is for the long computations of housekeeping, which
-    would otherwise delay requests.
+    The first lane computes for requests. One client may use as many threads of this lane as there are processors, but
+    at least two. The same limit applies to all clients without a known token together. One more thread of the lane is
+    always left to other clients. The second lane encodes answers. The third lane is for the long computations of
+    housekeeping, which would otherwise delay requests.
     """
 
     def __init__(self, threads: int | None = None) -> None:

@@ -97,7 +97,7 @@ class CachedDocument(Generic[T]):
 
 
 def provider_unavailable(detail: str) -> UnavailableProblem:
-    """Return the error for an identity provider that does not answer, or not as it should; `detail` is the reason."""
+    """Return the error for an identity provider that does not answer, or answers wrongly; `detail` is the reason."""
     return UnavailableProblem(detail, code="identity-provider-unavailable")
 
 

@@ -5,9 +5,9 @@ refused requests, all other clients wait for seconds. So while the event loop is
 times must wait for its next refusal. Meanwhile, the event loop has time for other clients. Such a client is also
 treated as a client without a known token, so that its requests begin after the requests of other clients.
 
-While the event loop is late, threads that compute also give way to it sooner than Python's default of 5 ms, for which
-the loop would wait after almost every system call. Otherwise, the default applies, because a shorter time makes all
-work some percent slower.
+A thread that computes gives way to the event loop after some time, in Python by default after 5 ms. The loop waits
+this long after almost every system call. While the event loop is late, the server sets a shorter time. Otherwise the
+default applies, because a shorter time makes all work some percent slower.
 """
 
 from __future__ import annotations

@@ -285,7 +285,7 @@ class DirectoryBlobs:
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
         """Yield the digests of the files that are older than `older_than_s` seconds.
 
-        Also remove unfinished files of this age, which processes left that ended while they were writing.
+        Also remove unfinished files of this age: they belong to processes that ended while they were writing.
         """
         newest = time.time() - older_than_s
         for folder in sorted(path for path in self.root.iterdir() if path.is_dir()):

@@ -95,7 +95,7 @@ class DispatchPlan:
         """Return the names of Kubernetes Jobs to delete, oldest first, so that other waiting jobs get their places.
 
         `stuck` contains the Kubernetes Jobs whose pods no node runs, by name. Only Jobs that have been stuck for
-        `patience_s` seconds are deleted, and not more than waiting jobs lack a place.
+        `patience_s` seconds are deleted, and at most one for each start that had no place in the last call of `decide`.
         """
         self._stuck_since_s = {name: self._stuck_since_s.get(name, now_s) for name in stuck}
         late = [name for name, since_s in self._stuck_since_s.items() if now_s - since_s >= self.patience_s]

@@ -21,7 +21,7 @@ REQUESTS_AT_ONCE = 8
 
 
 class WorkerJobs:
-    """Jobs with certain labels, and their Secrets. All methods raise `EngineError`.
+    """Jobs with certain labels, and their Secrets. Methods raise `EngineError` if a request to the cluster fails.
 
     `token_of` returns the token of the workers of a Job. It must always return the same token for the same Job: if a
     server ends after it has created a Job, the next server creates the Secret of the Job.

@@ -40,7 +40,7 @@ class Clock(Protocol):
         ...
 
     def catch_up(self, stored_us: int) -> None:
-        """Move forward if the high-water mark that another process has stored shows that its clock is ahead."""
+        """Move forward if `stored_us`, the high-water mark of another process, shows that the other clock is ahead."""
         ...
 
 
@@ -88,7 +88,7 @@ class DatabaseClock:
     def catch_up(self, stored_us: int) -> None:
         """Move to the time of the process that stored this high-water mark, if that process is notably ahead.
 
-        Otherwise, each process would take jobs from live workers whose leases another process has extended.
+        Without this, each process would take jobs from live workers whose leases another process has extended.
         """
         with self._lock:
             if self._start_us is None:

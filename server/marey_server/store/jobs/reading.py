@@ -88,7 +88,7 @@ def read_result_file(tx: Transaction, project: str, job_id: str, name: str) -> t
     """Return the reference to a file of a job's result, and the job.
 
     `name` is the member of the result that names the file. Raises `NotFoundProblem` if the project has no such job, or
-    the result no such file.
+    if the result has no such file.
     """
     row, project_row = find_job(tx, job_id)
     found = as_documents(tx, [row])[0]

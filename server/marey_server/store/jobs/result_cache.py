@@ -106,8 +106,8 @@ def decide(tx: Transaction, candidates: Sequence[Any], *, finished: bool = True)
 
     The function locks each project of the candidates, so that only one transaction at a time decides for a project. It
     also locks the found jobs, so that none ends before the transaction has recorded who shares its result. A
-    transaction that ends a job locks this job before the project, a submission after the project. So the two can
-    deadlock; `Database.write` then runs one of them again.
+    transaction that ends a job locks the job before the project; a submission locks the project before the job. So the
+    two can deadlock; `Database.write` then runs one of them again.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:

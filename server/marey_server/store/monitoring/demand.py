@@ -36,8 +36,8 @@ class Demand:
 class JobReach:
     """Jobs that the workers of a pool can run.
 
-    These are the jobs that require no other labels than `labels`, of one of the `kinds` or, if it is empty, of any
-    kind.
+    These are the jobs that require no other labels than `labels`, and whose kind is in `kinds`. An empty `kinds` stands
+    for all kinds.
     """
 
     labels: Mapping[str, str]

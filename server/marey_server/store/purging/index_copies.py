@@ -37,9 +37,9 @@ class IndexSearch:
     def update(self, tx: Transaction) -> dict[str, frozenset[str]]:
         """Read the lists of clips that were added since the last call, and return what all lists contain.
 
-        The result gives, by the id of each index, the clips, of those given to the constructor, whose poses are in any
-        revision of this index; an index without such clips is left out. If a list cannot be read, for example because
-        somebody has written the index by hand, it is assumed to contain all these clips.
+        The result maps the id of an index to those clips of the constructor's `clips` whose poses are in some revision
+        of this index; an index without such clips is left out. If a list cannot be read, for example because somebody
+        has written the index by hand, the list is assumed to contain all of `clips`.
         """
         if not self._clips:
             return {}

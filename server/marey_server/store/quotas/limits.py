@@ -1,4 +1,4 @@
-"""Limits of one project or user, which administrators set, and members of the project or the user can read."""
+"""Limits of one project or user: administrators set them; members of the project, or the user, can read them."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ ShownPart = Literal["motion", "hierarchy", "mapping"]
 def find_shown_part(tx: Transaction, clip: int, part: ShownPart) -> FoundPart:
     """Return a document of one motion of the caller's study.
 
-    Raises `NotFoundProblem` if the study has no such motion, or the skeleton no mapping. Raises `GoneProblem` if the
-    clip was deleted, or if the consent of its performer has ended.
+    Raises `NotFoundProblem` if the study has no such motion, or if the skeleton has no mapping. Raises `GoneProblem` if
+    the clip was deleted, or if the consent of its performer has ended.
     """
     row = find_caller(tx)
     motions = load_design(tx, row.item_id, row.revision).motions
