@@ -46,7 +46,7 @@ def run(context: Context, params: QualityParams) -> dict[str, Any]:
     """Measure the clips and the reference, if it is given; the result has the totals, and refers to stored files.
 
     These files are the document, the table and the report. A clip that cannot be measured is listed as a refusal in the
-    result. Raises `JobRefused` if no clip can be measured, or no clip of a given reference.
+    result. Raises `JobRefused` if none of the clips, or none of the given reference clips, can be measured.
     """
     _require_count(sum(len(context.inputs.get(name, ())) for name in ("clips", "reference")))
     measuring = _Measuring(context, params)

@@ -23,7 +23,7 @@ SWEEP_SCHEMA = "marey/sweep@1"
 
 
 def run(context: Context, params: SweepParams) -> dict[str, Any]:
-    """Run the trials with each of this task's settings of feature weights; the result has the metrics of each."""
+    """Run the trials with this task's settings of feature weights; the result has the metrics of each setting."""
     evaluated = read_evaluated_set(context)
     settings = vary_each_group(evaluated.result.options.database, params.factors)
     with refusing_motion_errors():
