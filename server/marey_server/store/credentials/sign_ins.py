@@ -1,4 +1,4 @@
-"""Limits on wrong passwords and invitation codes, shared by all servers; they never lock out the owner of an account.
+"""Limits on tries with wrong passwords or invitation codes, shared by all servers.
 
 Every try with a wrong password counts towards two limits: one for this account from this address, and one for this
 address with all accounts. An address is unknown if nobody has signed in to the account from this address in the last

@@ -1,4 +1,4 @@
-"""Items: named things with revisions. Only this package writes their rows."""
+"""Items: named things with revisions. Only this package creates items and revisions."""
 
 from marey_server.store.items.annotating import (
     find_annotated_clip,

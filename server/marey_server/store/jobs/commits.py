@@ -188,7 +188,7 @@ class PublishedOutputs:
 
     @property
     def commit(self) -> str | None:
-        """The digest of the commit that has the outputs."""
+        """The digest of the commit that has the outputs; None if there is no commit."""
         return self.columns.get("committed")
 
     def result(self, kind: str, result: dict[str, Any]) -> dict[str, Any]:

@@ -84,7 +84,7 @@ class NewJob:
 
     @property
     def concurrency_key(self) -> str | None:
-        """Concurrency key of the request: of the jobs of a project with the same key, only one runs at a time."""
+        """Concurrency key of the request, or None. Of the jobs of a project with one key, only one runs at a time."""
         return self.submission.request.concurrency_key
 
     @property

@@ -1,1 +1,1 @@
-"""Blobs in object storage: the client, the movement of bytes outside transactions, garbage collection, migration."""
+"""Blobs in object storage: the client, the backing, and the movement of bytes outside transactions."""
