@@ -113,7 +113,7 @@ class Credential:
 
     @property
     def bearer(self) -> str | TokenFile | None:
-        """The token; if `file` is given, a `TokenFile`, which is read again whenever the file changes."""
+        """The token, or None; if `file` is given, a `TokenFile`, which is read again whenever the file changes."""
         return self.token if self.file is None else TokenFile(self.file)
 
 

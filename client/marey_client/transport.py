@@ -269,7 +269,7 @@ class Transport:
     # -- documents with arrays -----------------------------------------------------------------------------------------
 
     def get_tree(self, path: str, params: Params | None = None) -> tuple[Any, str | None]:
-        """Request a document by GET; return it with numpy arrays, and its ETag."""
+        """Request a document by GET; return it with numpy arrays, and its ETag or None."""
         response = self.send("GET", path, params=params, headers={"Accept": BLOCKS})
         return read_tree(response), response.headers.get("ETag")
 
@@ -347,7 +347,7 @@ def _quoted(path: str) -> str:
 
 
 def as_json(model: BaseModel | None) -> bytes | None:
-    """Return the fields of `model` that were set, as JSON. Secrets are in plain text; pydantic would hide them."""
+    """Return the fields of `model` that were set, as JSON with secrets in plain text; None if there is no model."""
     if model is None:
         return None
     return encode_tree(_revealed(model.model_dump(exclude_unset=True, by_alias=True)), JSON)

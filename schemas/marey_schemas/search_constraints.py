@@ -1,4 +1,4 @@
-"""Constraints on a motion at one time: joint position or orientation, place and heading of the body, or keyframe time.
+"""Constraints on a motion: where a joint or the body is, how it is turned, or when a keyframe is reached.
 
 Positions and directions are in the world. The error of each constraint is divided by the tolerance of the constraint
 and weighted before the errors of several constraints are added up.

@@ -1,4 +1,4 @@
-"""Graphs of motion primitives: they define which action may follow which."""
+"""Graphs of motion primitives: they define which primitives may follow each primitive."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ModelGraph(Request):
     """Part `graph` of an item of the kind `graph`.
 
     Every primitive can be reached from the start, and from every primitive an end (of type end, idle or single) can be
-    reached. An idle primitive may follow itself.
+    reached. Every idle primitive has a transition to itself.
     """
 
     schema_: Literal["marey/model-graph@1"] = Field("marey/model-graph@1", alias="schema")

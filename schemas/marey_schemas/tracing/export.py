@@ -100,7 +100,7 @@ def open_tracer(
 
 
 def open_optional_tracer(service: str, environment: Mapping[str, str], *, share: float | None = None) -> Tracer | None:
-    """Return the sender of traces as `open_tracer` does; if traces cannot be sent, only log the reason.
+    """Return the sender of traces as `open_tracer` does; if traces cannot be sent, log the reason and return None.
 
     The variables `MAREY_TRACES_ENDPOINT` and `MAREY_TRACES_SHARE` apply, too.
     """

@@ -95,7 +95,10 @@ class ProcessScope:
 
 
 def current_scope() -> SpanScope | None:
-    """Return the scope of this thread, else that of the process, else that of an OpenTelemetry trace of the program."""
+    """Return the scope of this thread, else that of the process, else that of an OpenTelemetry trace of the program.
+
+    Return None if there is none of these.
+    """
     return _current.get() or ProcessScope.scope or _foreign_scope()
 
 

@@ -40,7 +40,7 @@ class Principal:
 
     @property
     def actor(self) -> str | None:
-        """The name of the user, or `job:<id>` for an attempt of a job, as shown for authors and in events."""
+        """The caller in events and as author: the name of a user, or `job:<id>` for an attempt; None for all others."""
         return self.user_name if self.kind != "attempt" else f"job:{self.job_id}"
 
     def require_user_name(self) -> str:

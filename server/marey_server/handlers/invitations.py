@@ -1,4 +1,4 @@
-"""Resources of invitations: of a project, of the server, and their acceptance.
+"""Resources of invitations to a project or to the server, and of their acceptance.
 
 The code of an invitation is a secret. It occurs only in bodies of requests, and in the answer to the request that
 creates the invitation.

@@ -42,7 +42,7 @@ class CallingExchange(Exchange):
 
     @property
     def principal(self) -> Principal | None:
-        """The principal of the request, after authentication."""
+        """The principal of the request; None until the caller is authenticated."""
         caller: Caller | None = getattr(self, "caller", None)  # absent where the request was refused before
         return caller.principal if caller is not None else None
 

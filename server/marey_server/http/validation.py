@@ -20,9 +20,10 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[bytes]]) -> Model | None:
-    """Return the query parameters as `model`. Raises `BadRequestProblem` for unknown, repeated or invalid ones.
+    """Return the query parameters as `model`; None if the operation has no `model`, and so no parameters.
 
-    Unknown parameters are ignored if the configuration of the model says so (`extra="ignore"`).
+    Raises `BadRequestProblem` for unknown, repeated or invalid parameters. Unknown parameters are ignored if the
+    configuration of the model says so (`extra="ignore"`).
     """
     known = {field.alias or name: field for name, field in model.model_fields.items()} if model else {}
     values: dict[str, str] = {}

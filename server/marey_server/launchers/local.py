@@ -74,7 +74,7 @@ class LocalLauncher:
                 worker.stop()
 
     async def why_ended(self, name: str) -> WorkerEnd | None:
-        """Return why a worker ended most recently, before a restart or when it was stopped."""
+        """Return why a worker last ended, before a restart or when it was stopped; None if it has never ended."""
         worker = self._workers.get(name)
         return None if worker is None else worker.end
 

@@ -167,7 +167,10 @@ class SlurmLauncher:
             await self._run("scancel", "--quiet", *ids)
 
     async def why_ended(self, name: str) -> WorkerEnd | None:
-        """Return the reason from `squeue`, or from `sacct` when the controller has forgotten the task."""
+        """Return why a worker ended, from `squeue`, or from `sacct` if the controller has forgotten the task.
+
+        The result is None if the worker has not ended, and has the reason `unknown` if `sacct` does not know the task.
+        """
         job_name = name.rpartition("-")[0]
         task = next((task for task in await self._tasks(f"--name={job_name}") if task.name == name), None)
         if task is None:

@@ -57,7 +57,7 @@ class FileOrder(Message):
 
 
 def packed_skeleton(given: GivenSkeleton | None) -> tuple[str, int, bytes] | None:
-    """Return a stored skeleton as the value of the field `skeleton` of `FileOrder`."""
+    """Return a stored skeleton as the value of the field `skeleton` of `FileOrder`; None for None."""
     if given is None:
         return None
     return given.item, given.revision, encode_tree(given.hierarchy, MSGPACK, arrays="blocks")

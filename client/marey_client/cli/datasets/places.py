@@ -74,5 +74,5 @@ def imported(at: NamedVersion, made: ImportedVersion, *, server: str | None = No
 
 
 def short(digest: str | None) -> str | None:
-    """Return the first digits of a commit's digest."""
+    """Return the first digits of a commit's digest; None for None."""
     return None if digest is None else digest.partition(":")[2][:SHOWN_DIGITS]

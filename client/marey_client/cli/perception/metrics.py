@@ -51,9 +51,9 @@ def add_to(app: typer.Typer) -> None:
 
 
 def metric_at(marey: Marey, name: str | None) -> str | None:
-    """Return the name of a built-in metric, or the id of the metric at an address.
+    """Return `name` if it is the name of a built-in metric, or else the id of the metric at the address `name`.
 
-    Raises `WrongUsage` if there is none.
+    Returns None if `name` is None. Raises `WrongUsage` if there is no such metric.
     """
     from marey_schemas.documents.metrics import is_built_in
     from marey_schemas.kinds import Kind

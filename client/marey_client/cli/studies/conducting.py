@@ -1,4 +1,4 @@
-"""Commands `study` for the design of studies and for participants: creating, inviting, watching and withdrawing."""
+"""Commands `study` that create studies, invite participants, show their progress, and withdraw them."""
 
 from __future__ import annotations
 

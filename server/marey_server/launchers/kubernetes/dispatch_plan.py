@@ -1,4 +1,4 @@
-"""Decisions which waiting jobs get pods of their own now, and which waiting pods are deleted again."""
+"""Decisions on which waiting jobs get pods of their own now, and which waiting pods are deleted again."""
 
 from __future__ import annotations
 

@@ -95,7 +95,10 @@ class KubernetesLauncher:
             raise EngineError(f"workers of an Indexed Job cannot be stopped before they have pods: {listed}")
 
     async def why_ended(self, name: str) -> WorkerEnd | None:
-        """Return why a worker ended, from its pod or its Job; `unknown` if the cluster has deleted both."""
+        """Return why a worker ended, according to its pod or its Job.
+
+        The result is None if the worker has not ended, and has the reason `unknown` if the cluster has deleted both.
+        """
         await self._view.refresh()
         if name in self._stopped:
             return WorkerEnd("stopped")

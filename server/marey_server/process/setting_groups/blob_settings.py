@@ -83,7 +83,7 @@ class BlobSettings(BaseSettings):
 
     @property
     def bucket(self) -> Bucket | None:
-        """Return the address of the bucket for blobs, with its credentials."""
+        """The address of the bucket for blobs, with its credentials; None if the settings name no bucket."""
         if self.s3_bucket is None:
             return None
         return Bucket(
