@@ -53,8 +53,8 @@ def explain(
 ) -> list[str]:
     """Return sentences that explain the state of a job, the main reason first.
 
-    `running` are the running jobs of the project; `workers` are the workers that are alive, and `limit` is the
-    limit of running jobs of the project; each is None if unknown.
+    `running` are the running jobs of the project. `workers` are the workers that are alive, None if unknown. `limit` is
+    the number of running jobs of the project with its limit, None if unknown.
     """
     if job.size is not None and not job.state.terminal and job.children != {"succeeded": job.size}:
         counts = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))

@@ -78,11 +78,12 @@ class FoundFiles:
 
 
 def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
-    """Find the motion files in folders and below, except hidden files; files among `places` are always included.
+    """Find the motion files in folders and their subfolders.
 
-    Files in a folder that an export of a dataset wrote are named by the paths of their clips. Raises `NothingToUpload`
-    if a place does not exist or no motion file is found; `SameName` if two files would get the same name; `BadSidecar`
-    if the sidecar of an export is damaged; and `OSError` if a folder cannot be read.
+    Hidden files and hidden or linked subfolders are left out, but files among `places` are always included. Files in a
+    folder that an export of a dataset wrote are named by the paths of their clips. Raises
+    `NothingToUpload` if a place does not exist or no motion file is found; `SameName` if two files would get the same
+    name; `BadSidecar` if the sidecar of an export is damaged; and `OSError` if a folder cannot be read.
     """
     from marey_client.bridges.returning import ReturningFolder
 

@@ -22,7 +22,7 @@ PARENT_VARIABLE = "TRACEPARENT"
 
 @dataclass(slots=True)
 class TracedRequest:
-    """Request of a client that belongs to a trace, if there is one; it may be sent several times."""
+    """Request of a client, which may be sent several times. If there is a trace, the request belongs to it."""
 
     scope: SpanScope | None
     tries: int = 0

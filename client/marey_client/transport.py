@@ -255,7 +255,7 @@ class Transport:
         media_type: str = JSON,
         headers: Mapping[str, str] | None = None,
     ) -> httpx.Response:
-        """Send a body compressed by zstd, for operations that accept it; servers of earlier versions get it plain."""
+        """Send a body compressed by zstd, for operations that accept this; send it plain if the server refuses zstd."""
         if content is not None and len(content) >= LEAST_BYTES_COMPRESSED and not self._refuses_zstd.is_set():
             coded = {"Content-Encoding": ZSTD, **(headers or {})}
             try:

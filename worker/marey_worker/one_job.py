@@ -63,9 +63,10 @@ class OneJobWorker:
     def run(self) -> int:
         """Run the job, or wait until another worker has ended it; return the exit status of the worker.
 
-        0: the job has ended, or an attempt has succeeded; 1: the attempt has failed, and the queue decides about a
-        retry; `INTERRUPTED_STATUS`: the worker was stopped, whether it held the job or not, because the pod must not
-        count as a success; `REFUSED_STATUS`: the server refuses this worker, and will refuse the next one.
+        * 0: the job has ended, or the attempt has succeeded or was cancelled.
+        * `FAILED_STATUS`: the attempt has failed, and the queue decides about a retry; or no process for jobs started.
+        * `INTERRUPTED_STATUS`: the worker was stopped, even without the job, so that the pod is not a success.
+        * `REFUSED_STATUS`: the server refuses this worker, and will refuse the next one.
         """
         log.info("%s works on %s for %s", self._options.name, self._wanted.id, self._transport.url)
         child = ChildProcess(CHILD_MODULE, self._options.kinds, threads=self._options.threads_of_a_slot)

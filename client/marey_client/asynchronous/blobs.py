@@ -46,5 +46,5 @@ class AsyncBlobs(Counterpart):
         return await self._run(self._sync.fetch_to, digest, target)
 
     async def fetch_into(self, digest: str, file: BufferedRandom) -> None:
-        """Download a blob into an empty file that is open for reading and writing; the file is then at its end."""
+        """Download a blob into an empty file that is open for reading and writing; its position is then at the end."""
         await self._run(self._sync.fetch_into, digest, file)

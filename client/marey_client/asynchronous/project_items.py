@@ -167,7 +167,8 @@ class AsyncProjectItems(Counterpart):
     async def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
         """Return the skeletons of `clips` whose joint mapping may have been edited: those with several revisions.
 
-        Deleted skeletons are left out: clips use the mapping of the revision of a deleted skeleton that they refer to.
+        Deleted skeletons are left out. For a clip of a deleted skeleton, jobs use the mapping in the revision of the
+        skeleton to which the clip refers.
         """
         return await self._run(self._sync.edited_rigs, clips)
 

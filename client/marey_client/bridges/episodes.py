@@ -39,7 +39,7 @@ class ColumnStatistics:
         return cls(len(values), values.min(axis=0), values.max(axis=0), mean, squares)
 
     def merged(self, other: ColumnStatistics) -> ColumnStatistics:
-        """Return the statistics of all rows of this object and `other`, after Chan, Golub and LeVeque (1979)."""
+        """Return the statistics of all rows of this object and `other` (method of Chan, Golub and LeVeque, 1979)."""
         count = self.count + other.count
         shift = other.mean - self.mean
         return ColumnStatistics(

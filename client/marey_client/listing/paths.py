@@ -54,7 +54,8 @@ def nearest_path(transport: Transport, project: str, path: str, kinds: Iterable[
     """Return the path of the folder, or of the item of these kinds, that is spelled most like `path`.
 
     If the folder in `path` does not exist, the folder that is spelled most like it is searched instead. If nothing in
-    the folder is spelled like the last name in `path`, the path of the folder is returned; None at the top.
+    the folder is spelled like the last name in `path`, the path of the folder is returned. Returns
+    None if this folder is the top folder of the project, or if no folder is spelled like the one in `path`.
     """
     folders = _folders(transport, project)
     folder, _, name = path.strip("/").rpartition("/")

@@ -96,7 +96,7 @@ class Noted(Request):
 
 
 class PredecessorTimeDocument(Request):
-    """Time function of a model as its file contains it; it depends on k temporal scores of a latent vector.
+    """Time function of a model as the imported file contains it; it depends on k temporal scores of a latent vector.
 
     Marey's own form of time functions is less general, so that `temporal` only approximates some time functions.
     """

@@ -216,9 +216,9 @@ def decode(
     """Decode an array, or some of its frames and columns; only the tiles that contain the wanted values are read.
 
     `columns` are indices into all axes after the first, flattened: the result is then two-dimensional and equals
-    `array.reshape(len(array), -1)[frames][:, columns]`. The result is writable. Raises
-    `BlockError` if the data is corrupt, or if the result would have more than `max_bytes`. Raises `IndexError` in the
-    same cases as numpy's indexing.
+    `array.reshape(len(array), -1)[frames][:, columns]`. The result is writable. Raises `BlockError` if the data is
+    corrupt, or if the result would have more than `max_bytes`. Raises `IndexError` in the same cases as numpy's
+    indexing.
     """
     layout, starts = _read_head(data)
     if not layout.spec.shape and (frames is not None or columns is not None):

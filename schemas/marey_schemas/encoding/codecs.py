@@ -108,7 +108,7 @@ def decode_tree(
     are decoded nevertheless, as a check. `max_bytes` limits the size of the input. `max_array_bytes` limits the total
     size of all arrays; its default and its upper bound are `max_bytes`. `take_bytes` is called with the size of each
     array before the array is decoded, and may raise an error of its own. The number of values is limited, too. Raises
-    `CodecError`.
+    `CodecError` if the document is not valid or exceeds a limit, or if the media type is not supported.
     """
     _require_media_type(media_type)
     if len(data) > max_bytes:

@@ -18,7 +18,7 @@ _Limit = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
 
 
 class VerdictLimits(Options):
-    """Limits of a trial, which counts as followed if it exceeds none of them.
+    """Limits within which a trial counts as followed.
 
     The baseline in the descriptions is the evaluation of generated clips that contain every speed and turn rate.
     """

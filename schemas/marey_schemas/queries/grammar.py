@@ -67,10 +67,11 @@ class QueryError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """Comparison of a field with one or more values; it is true if at least one value matches. `has` takes no values.
+    """Comparison of a field with one or more values; it is true if at least one value matches.
 
-    Values are numbers for fields of the type `number`, and texts for the type `text`. For the type `date`, they are
-    dates, or times with a time zone.
+    The operator `has` takes no values; the condition is then true if the item has the field. Values are numbers for
+    fields of the type `number`, and texts for the type `text`. For the type `date`, they are dates, or times with a
+    time zone.
     """
 
     field: str
@@ -85,7 +86,7 @@ class Likeness:
     """Condition that a clip has a moment that looks like some frames of a clip: `like("walks/a:30-90") < 0.2`.
 
     The database cannot evaluate this condition. So an index of motions is searched first, and `with_clips` adds the
-    clips that were found to the condition.
+    found clips to the condition.
     """
 
     moment: Moment

@@ -57,10 +57,10 @@ class KindDeclaration:
     `suffix` is appended to the names. `unclear_place` is a function of the parameters and a collection; it returns why
     these do not determine the place of the results, or None if they do.
 
-    `exports` is the input whose clips the job writes to files, or `EVERY_INPUT`. Its parameters then extend
+    `exports` is the input whose clips the job writes to files, or `EVERY_INPUT`. The parameters then extend
     `ConsentOverride`. Unless `allow_expired_consent` is true, the job must refuse the clips of this input that have
-    `consent_ended`. In any case, it must list the ids of these clips as `consent_ended` in its result. The results of
-    an identical job are reused only if the consent has ended for the same clips.
+    `consent_ended`. In any case, the job must list the ids of these clips as `consent_ended` in its result. The results
+    of an identical job are reused only if the consent has ended for the same clips.
     """
 
     name: str

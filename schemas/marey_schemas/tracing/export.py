@@ -83,7 +83,7 @@ def open_tracer(
 
     `endpoint` and `share` take precedence over the variables of OpenTelemetry, which are read from `environment`; the
     exporter itself reads further ones (headers, certificates, sizes of batches) from the process. Raises
-    `TracesUnusable`.
+    `TracesUnusable` if a setting is not valid or not supported, or if the optional packages for traces are missing.
     """
     if environment.get("OTEL_SDK_DISABLED", "").strip().lower() == "true":
         return None

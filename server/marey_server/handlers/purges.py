@@ -42,7 +42,7 @@ class DatasetPurges(Resource):
 
         A version is still needed by items that a job made from it, and by unfinished jobs that read it. If there are
         such items or jobs, the answer is 409 (`still-held`), and `context` lists them. The purge does not delete the
-        items in the versions. After it, items of these versions that are marked as deleted can be purged, too.
+        items in the versions. After the purge, items of these versions that are marked as deleted can be purged, too.
         """
         if body.preview:
             return await self.render_document(Reply(await self.look_up(purging.preview_dataset_purge, project, body)))

@@ -73,12 +73,12 @@ class AsyncScriptHandle(Counterpart):
         commit: OutputsCommit | str | None = None,
         allow_expired_consent: str | None = None,
     ) -> Job:
-        """Submit a job that runs the script, and return it.
+        """Submit a job that runs the script; return the job.
 
-        `values` are the values of its parameters, and `inputs` are items, folders or outputs of other jobs. The clips
-        that the script writes are stored in the folder `into`, and committed as `commit` says, such as "gaits@trial".
-        If the consent for an input clip has ended, the run fails, unless `allow_expired_consent` gives a reason.
-        Raises `Invalid` if a value or an input is wrong.
+        `values` are the values of the script's parameters, and `inputs` are items, folders or outputs of other jobs.
+        The clips that the script writes are stored in the folder `into`, and committed as `commit` says, such as
+        "gaits@trial". If the consent for an input clip has ended, the run fails, unless `allow_expired_consent` gives a
+        reason. Raises `Invalid` if a value or an input is wrong.
         """
         return await self._run(
             self._sync.run,

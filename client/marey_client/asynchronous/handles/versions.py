@@ -296,7 +296,7 @@ class AsyncDatasetHandle(Counterpart):
         return await self._run(self._sync.move_branch, name, to, expected_rev=expected_rev)
 
     async def ref(self, name: str) -> Ref:
-        """Return the branch or the tag with this name, a branch with its protection.
+        """Return the branch or the tag with this name; a branch includes its protection rule.
 
         Raises `NotFound` if there is none.
         """
