@@ -42,7 +42,8 @@ async def serve_in_processes(settings: Settings, given: dict[str, Any]) -> None:
     metrics_sockets = []
     if settings.metrics_port is None:
         log.warning(
-            "/metrics shows the numbers of whichever process answers; metrics_port gives each a port of its own"
+            "/metrics shows the numbers of the process that answers, which may be any; set metrics_port to give "
+            "each process a port of its own for its numbers"
         )
     else:
         ports = range(settings.metrics_port, settings.metrics_port + settings.processes)

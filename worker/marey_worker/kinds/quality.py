@@ -147,7 +147,7 @@ class _Measuring:
         if not segments:
             raise AnnotationError(
                 f"no given annotation of revision {pin.revision} has a segment {' or '.join(CONTACT_LABELS)}; "
-                "annotate the contacts, or measure the clip in another job",
+                "annotate the contacts, or measure the clip in a job without annotations",
                 code="no-annotation",
             )
         labelled = np.zeros((frames, 2), dtype=np.bool_)

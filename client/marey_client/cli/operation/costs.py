@@ -74,8 +74,8 @@ def _counts(text: str, used: tuple[int, ...]) -> tuple[int, ...]:
         counts = ()
     if not counts or not all(1 < count <= MOST_CHECKED and count not in used for count in counts):
         raise WrongUsage(
-            f"--workers {text}: give numbers from 2 to {MOST_CHECKED} with commas between them, such as {CHECKED}; not "
-            f"{', '.join(map(str, used))}, from which the costs are measured"
+            f"--workers {text}: give numbers from 2 to {MOST_CHECKED} with commas between them, such as {CHECKED}; "
+            f"leave out {', '.join(map(str, used))}, because the costs are measured with these numbers"
         )
     return counts
 

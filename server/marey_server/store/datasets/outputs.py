@@ -148,7 +148,7 @@ def _on_own_branch(tx: Transaction, wanted: OutputEntries, mover: Mover, planned
     changed = f"{counted(len(paths), 'path')} of the outputs changed on {wanted.branch!r} while the job ran"
     conflict = CommitConflict(
         code="paths-changed",
-        detail=f"{changed}, the first {paths[0]!r}. The outputs are on a new branch, which can be merged.",
+        detail=f"{changed}; the first is {paths[0]!r}. The outputs are on a new branch, which can be merged.",
         paths=tuple(paths[:MOST_LISTED]),
         count=len(paths),
     )

@@ -230,8 +230,8 @@ def _entries_of(
         return
     if version.missing:
         detail = (
-            f"{counted(len(version.missing), 'entry')} of the version cannot be read, because the project has no item "
-            f"with this content, the first at {version.missing[0].path!r}."
+            f"The project has no item with the content of {counted(len(version.missing), 'entry')} of the version; the "
+            f"first is at {version.missing[0].path!r}. Select other entries, or another version."
         )
         errors.append(_error(place, "no-content", detail))
     elif not version.found:

@@ -122,7 +122,7 @@ def _author(tx: Transaction) -> dict[str, Any]:
 def _check_job(tx: Transaction, row: ProjectRow, job: JobCreate) -> None:
     """Raise `InvalidProblem`, with pointers into the request, if the job could not be submitted now."""
     for place in ["/job/after"] * bool(job.after) + [place for place, _, _ in late_inputs(job, "/job")]:
-        detail = "The job of a schedule cannot wait for other jobs."
+        detail = "The job of a schedule cannot wait for other jobs: leave out `after` and outputs of other jobs."
         raise InvalidProblem(detail, errors=[FieldError(pointer=place, code="not-allowed", detail=detail)])
     check_request(tx, row, job, "/job")
 

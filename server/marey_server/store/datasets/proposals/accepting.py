@@ -152,7 +152,7 @@ def _obstacles(prepared: PreparedAcceptance, rule: Protection | None) -> Iterato
     if rule is not None and rule.up_to_date and answer.base != answer.ours:
         yield Missing(
             code="not-up-to-date",
-            detail="The branch has commits that the proposal does not contain. Merge the branch into the source first.",
+            detail="The target has commits that the source does not have. Merge the target into the source first.",
         )
 
 
