@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ from tests.support.database_fixtures import copied_sqlite
 from tests.support.teams.hosts import local_hosts, mortal_hosts
 from tests.support.teams.machine import Diverged, run_programs
 from tests.support.teams.model import PARTNER, STUDIO
+from tests.support.teams.mortal_servers import COUNTER, Countdown
 from tests.support.teams.world import World
 from tests.support.tiers import examples, is_soak, steps
 
@@ -140,6 +142,38 @@ PLANTS: dict[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]] = {
     ignore_folder_roles: ("create_clip", "restrict"),
 }
 """Planted faults; for each fault, the kinds of steps that random programs need in order to find it."""
+
+
+def test_a_step_that_began_before_a_death_is_cancelled_does_not_restore_the_countdown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counter = tmp_path / "counter"
+    counter.write_bytes(COUNTER.pack(9))
+    in_server, in_test = Countdown(counter), Countdown(counter)
+    has_read, may_write = threading.Event(), threading.Event()
+
+    class Slow(Countdown):
+        @property
+        def left(self) -> int:
+            left = int(COUNTER.unpack(self._shared)[0])
+            has_read.set()
+            may_write.wait(30)
+            return left
+
+        @left.setter
+        def left(self, steps: int) -> None:
+            COUNTER.pack_into(self._shared, 0, steps)
+
+    in_server.__class__ = Slow
+    step, cancel = threading.Thread(target=in_server.step), threading.Thread(target=in_test.cancel)
+    step.start()
+    assert has_read.wait(30)
+    cancel.start()
+    cancel.join(0.2)
+    may_write.set()
+    step.join(30)
+    cancel.join(30)
+    assert in_test.left == 0
 
 
 @pytest.mark.soak

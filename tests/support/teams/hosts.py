@@ -68,8 +68,7 @@ class MortalHost(Host):
         self._countdown.left = steps
 
     def disarm(self) -> bool:
-        if self._countdown.left != FIRED:
-            self._countdown.left = 0
+        self._countdown.cancel()
         self.revive()
         return self._died
 

@@ -11,6 +11,7 @@ servers are killed. Forking takes a hundredth of the time that starting a new pr
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import gc
 import json
 import mmap
@@ -19,6 +20,8 @@ import signal
 import struct
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +39,8 @@ class Countdown:
     """The counter of a server."""
 
     def __init__(self, path: Path) -> None:
-        with path.open("r+b") as file:
-            self._shared = mmap.mmap(file.fileno(), COUNTER.size)
+        self._file = path.open("r+b")
+        self._shared = mmap.mmap(self._file.fileno(), COUNTER.size)
         self._lock = threading.Lock()
 
     @property
@@ -51,13 +54,29 @@ class Countdown:
 
     def step(self, *_args: Any, **_options: Any) -> None:
         """Count a step of this process, and kill this process if the step is the last one."""
-        with self._lock:
+        with self._locked():
             left = self.left
             if left <= 0:
                 return
             self.left = left - 1 if left > 1 else FIRED
             if left == 1:
                 os.kill(os.getpid(), signal.SIGKILL)
+
+    def cancel(self) -> None:
+        """Let the server live, unless it has died already."""
+        with self._locked():
+            if self.left != FIRED:
+                self.left = 0
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Keep other threads, and the other process that uses the counter, from changing it."""
+        with self._lock:
+            fcntl.flock(self._file, fcntl.LOCK_EX)
+            try:
+                yield
+            finally:
+                fcntl.flock(self._file, fcntl.LOCK_UN)
 
 
 def run_server(order: dict[str, Any], ready: int) -> None:
