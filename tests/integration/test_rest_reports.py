@@ -237,6 +237,8 @@ def test_documents_that_contradict_each_other_give_no_walk_graph(owner: httpx.Cl
         made = owner.post("/projects/lab/evaluations", content=body, headers={"Content-Type": "application/msgpack"})
         refused = owner.get(f"/projects/lab/evaluations/{made.json()['id']}/walk-graph")
         assert (refused.status_code, refused.json()["code"]) == (422, "not-a-walk")
+        assert ("its documents are malformed (KeyError('clips'))" in refused.json()["detail"]) == (number == 1)
+        assert refused.json()["detail"].endswith("Run the evaluation again.")
 
 
 def test_strangers_learn_nothing_of_an_evaluation(server: Server, evaluation: str) -> None:

@@ -271,7 +271,10 @@ class Take:
 
 
 def motion_of(clip: Clip) -> Motion:
-    """Convert a clip to double precision; frames that no command changes are bit-identical after converting back.
+    """Convert a clip to double precision, with unit quaternions whose signs are continuous in time.
+
+    If the quaternions of the clip already have unit length, within single precision, and continuous signs, frames that
+    no command changes are bit-identical after converting back.
 
     Parameters
     ----------

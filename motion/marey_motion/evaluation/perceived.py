@@ -207,10 +207,12 @@ def require_same_metric(before: PerceivedTransitions | None, after: PerceivedTra
     MotionError    if the metrics differ
     """
     if before is not None and after is not None and before.digest != after.digest:
+        same_name = before.metric == after.metric
+        names = f"both called {before.metric}" if same_name else f"{before.metric} and {after.metric}"
         raise MotionError(
-            f"the evaluations use different perceptual metrics ({before.metric} and {after.metric}), so their "
-            f"distances cannot be compared; run one evaluation again with --metric {before.metric} or --metric "
-            f"{after.metric}",
+            f"the evaluations use different perceptual metrics ({names}), so their distances cannot be compared; run "
+            "one evaluation again with the metric of the other one (--metric: the name of a built-in metric, or "
+            "project/folder/name)",
             code="not-comparable",
             where="metric",
         )

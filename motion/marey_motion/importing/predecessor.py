@@ -79,10 +79,16 @@ def described_skeleton(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
 
 def _as_json(rest: Mapping[str, Any], file: str) -> Tree:
     """Convert members of a skeleton model to JSON types; raise `FormatError` for BSON values that JSON lacks."""
-    try:
-        kept: Tree = json.loads(json.dumps(dict(rest), allow_nan=False))
-    except (TypeError, ValueError, RecursionError) as error:
-        raise FormatError(f"the skeleton model contains a value that is not JSON: {error}", file=file) from error
+    kept: Tree = {}
+    for name, value in rest.items():
+        try:
+            kept[name] = json.loads(json.dumps(value, allow_nan=False))
+        except (TypeError, ValueError, RecursionError) as error:
+            raise FormatError(
+                f"the field {name!r} of the skeleton model has a value that JSON cannot represent ({error}); remove "
+                "the field, or store the value as text or as finite numbers",
+                file=file,
+            ) from error
     return kept
 
 

@@ -94,7 +94,9 @@ def write_walk_graph(source: WalkSource, trial: str | None, form: WalkGraphForma
         clips, records = clips_from_tree(source.evaluation), records_from_tree(source.records)
         _require_rows(clips, records.values())
     except (MotionError, AttributeError, KeyError, TypeError, ValueError) as error:
-        detail = f"The walk graph of this evaluation cannot be computed: {error}."
+        explained = isinstance(error, MotionError) or type(error) is ValueError
+        reason = str(error) if explained else f"its documents are malformed ({error!r})"
+        detail = f"The walk graph of this evaluation cannot be computed: {reason}. Run the evaluation again."
         raise InvalidProblem(detail, code="not-a-walk") from error
     if trial is not None and trial not in records:
         known = ", ".join([*list(records)[:NAMES_SHOWN], *(["..."] if len(records) > NAMES_SHOWN else [])])

@@ -147,4 +147,4 @@ def test_skeleton_models_that_do_not_fit_are_refused_by_the_joint(changes: dict[
 def test_a_skeleton_model_with_values_that_are_not_json_is_refused() -> None:
     model = {**old.skeleton_model(), "made": datetime.datetime(2019, 1, 1, tzinfo=datetime.UTC)}
     files = {"body.skeleton": old.file_skeleton(), "body_skeleton_model.bson": model}
-    assert "a value that is not JSON" in refusal(files, "body.skeleton")[1]
+    assert "the field 'made' of the skeleton model has a value" in refusal(files, "body.skeleton")[1]

@@ -216,8 +216,12 @@ def test_a_jump_to_the_frame_that_would_have_followed_is_not_seen() -> None:
     require_same_metric(seen, none)
     require_same_metric(seen, None)
     other = PerceivedRows(database, built_in_metric("uniform/manhattan")).transitions(np.array([[10, 11, 1]]))
-    with pytest.raises(MotionError, match="run one evaluation again with --metric published/positions-sigmoid"):
+    with pytest.raises(
+        MotionError, match=r"\(published/positions-sigmoid and uniform/manhattan\).* project/folder/name"
+    ):
         require_same_metric(seen, other)
+    with pytest.raises(MotionError, match="both called published/positions-sigmoid"):
+        require_same_metric(seen, replace(other, metric=seen.metric))
     with pytest.raises(MotionError, match="same rate"):
         PerceivedRows(database, PAPER.model_copy(update={"frame_rate_hz": 30.0}))
 

@@ -249,7 +249,10 @@ class Database:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Future[T]:
-        """Run `write` in a thread, on behalf of the server itself; return the future of the function's result."""
+        """Run `self.write(principal, function, ...)` in a thread; return the future of the function's result.
+
+        The call waits its turn as a call of the server itself, not of a client.
+        """
         return self.queue_write(SERVER, principal, lambda tx: function(tx, *args, **kwargs))
 
     def queue_read(
