@@ -142,7 +142,8 @@ class MotionPrimitive:
         if self.spatial.mean.shape[1] != 3 + 4 * self.skeleton.joint_count:
             raise MotionError(
                 f"the spatial components have {self.spatial.mean.shape[1]} channels, but a skeleton of "
-                f"{self.skeleton.joint_count} joints needs {3 + 4 * self.skeleton.joint_count}: 3 and 4 for each joint"
+                f"{self.skeleton.joint_count} joints needs {3 + 4 * self.skeleton.joint_count}: 3 for the root "
+                "and 4 for each joint"
             )
         if self.temporal.basis.frame_count != self.frame_count - 1:
             raise MotionError(

@@ -344,7 +344,8 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
         )
     if len(means) > MOST_COMPONENTS or means.shape[1] > MOST_DIMENSIONS:
         raise FormatError(
-            f"gmm: the mixture has more than {MOST_COMPONENTS} distributions or more than {MOST_DIMENSIONS} dimensions",
+            f"gmm: the mixture has {len(means)} distributions of {means.shape[1]} dimensions; at most "
+            f"{MOST_COMPONENTS} distributions of {MOST_DIMENSIONS} dimensions can be imported",
             file=file,
         )
     covered = means.shape[1] - spatial

@@ -100,8 +100,8 @@ def with_revisions(facets: StoredFacets, revisions: Mapping[tuple[str, int], int
     """Return facets that an identical job has staged, rewritten as facets of this job.
 
     The two jobs may have read different revisions of an item. `revisions` maps each input of the other job (item id and
-    revision number) to the revision number that this job read. All other facets, of clips of evaluations, are
-    unchanged.
+    revision number) to the revision number that this job read. Facets of items that are no inputs of the job, such as
+    clips of an evaluation, are unchanged.
     """
     return [[item_id, revisions.get((item_id, number), number), values] for item_id, number, values in facets]
 
