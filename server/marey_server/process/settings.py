@@ -32,12 +32,18 @@ PREFIX = "MAREY_"
 class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     """Settings of a server. The environment variable of the setting `data` is MAREY_DATA, and so on."""
 
-    model_config = SettingsConfigDict(env_prefix=PREFIX, toml_file=SETTINGS_FILE, extra="forbid", frozen=True)
+    model_config = SettingsConfigDict(
+        env_prefix=PREFIX,
+        env_ignore_empty=True,  # as in a file for compose that sets a variable to another one, which is not set
+        toml_file=SETTINGS_FILE,
+        extra="forbid",
+        frozen=True,
+    )
 
     data: Path = Field(
         Path("marey-data"), description="Folder of the database file, the administrator's token, and blobs."
     )
-    host: str = Field(DEFAULT_HOST, description="Address to listen on; 0.0.0.0: all networks.")
+    host: str = Field(DEFAULT_HOST, min_length=1, description="Address to listen on; 0.0.0.0: all networks.")
     port: int = Field(DEFAULT_PORT, ge=0, le=65535, description="Port to listen on; 0: any free port.")
     database_url: str | None = Field(
         None,

@@ -21,6 +21,20 @@ def test_flags_win_over_variables_and_variables_over_the_file(tmp_path: Path, mo
     assert (chosen.port, chosen.host, chosen.log_level) == (1111, "10.0.0.2", "debug")
 
 
+def test_variables_without_a_value_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("HOST", "PORT", "DATA"):
+        monkeypatch.setenv(f"MAREY_{name}", "")
+    chosen = Settings()
+    default = Settings.model_fields
+    assert (chosen.host, chosen.port, chosen.data) == tuple(default[name].default for name in ("host", "port", "data"))
+
+
+def test_an_empty_host_which_would_mean_all_networks_is_refused() -> None:
+    with pytest.raises(ValidationError, match="at least 1 character"):
+        Settings(host="")
+
+
 def test_a_misspelt_setting_in_the_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "marey.toml").write_text("prot = 1111\n")
