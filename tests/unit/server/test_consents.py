@@ -1,5 +1,6 @@
 """Consents in the queue: clips that a worker must leave out, users who may allow them, and results that are shared."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -17,8 +18,10 @@ from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ForbiddenProblem
 from marey_server.store import events, items, members, users
 from marey_server.store.database.clock import datetime_of
+from marey_server.store.items.consents import EndedConsent, find_ended_consents
 from marey_server.store.items.drafts import Draft
-from marey_server.store.jobs import retrying, submission
+from marey_server.store.jobs import exports, retrying, submission
+from marey_server.store.transaction import Transaction
 
 DAY_S = 86_400
 ALLOWED = {"allow_expired_consent": True, "consent_reason": "The estate has agreed by letter."}
@@ -101,6 +104,27 @@ def test_other_kinds_of_jobs_are_not_told_and_read_every_clip(desk: Desk) -> Non
 
 
 # -- results that are shared -------------------------------------------------------------------------------------------
+
+
+def test_one_query_finds_the_ended_consents_of_all_jobs_of_a_claim(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    yesterday = day(desk, -1)
+    clips = add_clips(desk, gone=yesterday, here=day(desk, 1))
+    asked: list[set[str]] = []
+
+    def noted(tx: Transaction, item_ids: Iterable[str]) -> dict[str, EndedConsent]:
+        asked.append(wanted := set(item_ids))
+        return find_ended_consents(tx, wanted)
+
+    monkeypatch.setattr(exports, "find_ended_consents", noted)
+    export(desk, [{"item": clips["gone"]}])
+    export(desk, [{"item": clips["here"]}])
+    desk.submit("retarget", inputs={"clips": [{"item": clips["gone"]}], "skeleton": {"collection": "rigs"}}, into="out")
+    asked.clear()
+    leases = desk.claim_many(3)
+    assert [(lease.kind, ended_in(lease)) for lease in leases] == [
+        ("export", {"gone": yesterday}), ("export", {}), ("retarget", {})
+    ]  # fmt: skip
+    assert asked == [set(clips.values())]
 
 
 def test_a_result_is_shared_until_a_consent_ends(desk: Desk) -> None:

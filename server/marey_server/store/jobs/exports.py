@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from marey_schemas.access import Role
@@ -28,24 +28,40 @@ def ended_inputs(tx: Transaction, kind: KindDeclaration, inputs: Mapping[str, An
 
     Inputs that are not known yet are left out.
     """
-    if kind.exports is None:
-        return {}
+    return find_ended_consents(tx, _exported_items(kind, inputs)) if kind.exports is not None else {}
+
+
+def _exported_items(kind: KindDeclaration, inputs: Mapping[str, Any]) -> Iterator[str]:
     exported = (pin for name, pins in inputs.items() if kind.is_exported(name) for pin in pins)
-    return find_ended_consents(tx, (pin["item"] for pin in exported if "item" in pin))
+    return (pin["item"] for pin in exported if "item" in pin)
 
 
-def lease_inputs(tx: Transaction, kind_name: str, inputs: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Return the inputs of a job in the form that a worker gets.
+def lease_inputs(
+    tx: Transaction, jobs: Iterable[tuple[str, Mapping[str, Any]]]
+) -> list[dict[str, list[dict[str, Any]]]]:
+    """Return the inputs of each job in the form that a worker gets; `jobs` gives the kind and the inputs of each.
 
-    Each clip that the job exports and whose consent has ended gets the additional member `ENDED`, the last day of the
+    Each clip that a job exports and whose consent has ended gets the additional member `ENDED`, the last day of the
     consent. The consent has ended if this day is before today (UTC), whenever the job was submitted.
     """
+    declared = [(_declared(name), inputs) for name, inputs in jobs]
+    exporting = [(kind, inputs) for kind, inputs in declared if kind is not None and kind.exports is not None]
+    ended = find_ended_consents(tx, (one for kind, inputs in exporting for one in _exported_items(kind, inputs)))
+    return [_with_ended(kind, inputs, ended) for kind, inputs in declared]
+
+
+def _declared(kind_name: str) -> KindDeclaration | None:
+    """Return the declaration of a kind, or None for a kind of a worker with job kinds of its own."""
     try:
-        kind = find_kind(kind_name)
+        return find_kind(kind_name)
     except UnknownKindError:
-        return dict(inputs)  # of a worker with job kinds of its own
-    ended = ended_inputs(tx, kind, inputs)
-    if not ended:
+        return None
+
+
+def _with_ended(
+    kind: KindDeclaration | None, inputs: Mapping[str, Any], ended: Mapping[str, EndedConsent]
+) -> dict[str, list[dict[str, Any]]]:
+    if kind is None or kind.exports is None or not ended:
         return dict(inputs)
     return {
         name: [
@@ -62,11 +78,12 @@ def may_share(tx: Transaction, kind_name: str, inputs: Mapping[str, Any], result
     If the job exports clips, the clips whose consent has ended must be the same for both jobs. So the result is not
     shared if the consent for a further clip has ended since, or if a consent was prolonged.
     """
-    try:
-        kind = find_kind(kind_name)
-    except UnknownKindError:
-        return True
-    return kind.exports is None or ended_inputs(tx, kind, inputs).keys() == set((result or {}).get(ENDED, ()))
+    kind = _declared(kind_name)
+    return (
+        kind is None
+        or kind.exports is None
+        or ended_inputs(tx, kind, inputs).keys() == set((result or {}).get(ENDED, ()))
+    )
 
 
 def record_permission(

@@ -354,16 +354,17 @@ def _leases(
     tx: Transaction, rows: Sequence[Row[Any]], tokens: Sequence[IssuedToken], policy: QueuePolicy
 ) -> list[Lease]:
     sizes, seal_key = _sizes(tx, rows), read_seal_key(tx)
+    all_inputs = lease_inputs(tx, ((row.kind, row.inputs) for row in rows))
     return [
         _lease(
             row,
-            lease_inputs(tx, row.kind, row.inputs),
+            inputs,
             sizes.get(row.parent_id, row.size),
             sealed(token, seal_key),
             policy,
             _trace(tx, row),
         )
-        for row, token in zip(rows, tokens, strict=True)
+        for row, inputs, token in zip(rows, all_inputs, tokens, strict=True)
     ]
 
 
