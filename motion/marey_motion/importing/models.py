@@ -132,7 +132,9 @@ def model_checks(found: PredecessorModel) -> tuple[Tree, ...]:
     more = f" and {len(found.moved_keyframes) - MOST_NAMED} more" if len(found.moved_keyframes) > MOST_NAMED else ""
     labels = ", ".join(map(short_name, found.moved_keyframes[:MOST_NAMED])) + more
     last = found.primitive.frame_count - 1
-    message = f"the file places these keyframes at the end of the motion, after its last frame {last}: {labels}"
+    message = (
+        f"the file places these keyframes after the last frame, so the import moved them to frame {last}: {labels}"
+    )
     return ({"code": "keyframes-at-end", "message": message},)
 
 

@@ -122,7 +122,7 @@ class KindDeclaration:
             raise ValueError(f"job kind {self.name}: declare fan_out or task_count, not both")
 
     def count_tasks(self, params: Any, inputs: Mapping[str, Sequence[Any]]) -> int:
-        """Return the number of tasks of a job with these parameters and inputs, if `task_count` determines it."""
+        """Return the number of tasks of a job with these parameters and inputs; 1 if the kind has no `task_count`."""
         if self.task_count is None:
             return 1
         return self.task_count(params, *([] if self.counted is None else [len(inputs.get(self.counted, ()))]))

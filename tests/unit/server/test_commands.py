@@ -162,8 +162,8 @@ def test_an_sqlite_file_on_a_broken_disk_has_no_server_to_start(tmp_path: Path) 
     with pytest.raises(DatabaseUnusable) as failed, opening(f"sqlite:///{tmp_path}/marey.db"):
         raise UnavailableProblem("x") from OSError("disk I/O error")
     assert str(failed.value) == (
-        f"the database {tmp_path}/marey.db cannot be used: disk I/O error; check that its disk works and has free "
-        "space, and that no other program has locked the file"
+        f"the database {tmp_path}/marey.db cannot be used: disk I/O error; check that its folder exists, that you may "
+        "write there, that the disk works and has free space, and that no other program has locked the file"
     )
 
 

@@ -35,8 +35,9 @@ def opening(url: str) -> Iterator[None]:
     except UnavailableProblem as error:
         if (file := sqlite_file(url)) is not None:
             raise DatabaseUnusable(
-                f"the database {file} cannot be used: {_reason(error.__cause__)}; check that its disk works and has "
-                "free space, and that no other program has locked the file"
+                f"the database {file} cannot be used: {_reason(error.__cause__)}; check that its folder exists, that "
+                "you may write there, that the disk works and has free space, and that no other program has locked "
+                "the file"
             ) from error
         raise DatabaseUnusable(
             f"the server of the database {_shown(url)} does not answer: {_reason(error.__cause__)}; start the server "
