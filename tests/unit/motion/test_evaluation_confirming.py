@@ -150,7 +150,8 @@ def test_an_optimisation_needs_seven_replicates_to_confirm_equal_changes() -> No
     needed = next(count for count in range(3, 65) if CONFIRMED_AT_ONCE * probability(np.full(count, -1.0)) <= 0.05)
     described = OptimisationOptions.model_fields["confirmation_replicates"].description
     assert described is not None
-    assert f"3 to {needed - 1} are too few to confirm a step of an optimisation whose effect is equal" in described
+    assert f"3 to {needed - 1} are too few to confirm a step" in described
+    assert f"the sign test needs {needed}." in described
 
 
 def test_the_best_weight_of_a_group_is_confirmed_and_corrected_for_the_number_of_groups() -> None:
