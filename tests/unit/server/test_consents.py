@@ -127,6 +127,15 @@ def test_one_query_finds_the_ended_consents_of_all_jobs_of_a_claim(desk: Desk, m
     assert asked == [set(clips.values())]
 
 
+def test_inputs_that_are_no_items_are_unchanged_beside_a_job_with_an_ended_consent(desk: Desk) -> None:
+    clip = add_clips(desk, gone=day(desk, -1))["gone"]
+    other = {"clips": [{"output": "made"}]}
+    jobs = [("export", {"clips": [{"item": clip}]}), ("export", other)]
+    first, second = desk.database.read(SYSTEM, exports.lease_inputs, jobs)
+    assert first == {"clips": [{"item": clip, "consent_ended": day(desk, -1)}]}
+    assert second == other
+
+
 def test_a_result_is_shared_until_a_consent_ends(desk: Desk) -> None:
     add_clips(desk, last=day(desk, 0), open=None)
     export(desk)

@@ -65,7 +65,7 @@ def _with_ended(
         return dict(inputs)
     return {
         name: [
-            pin | {ENDED: ended[pin["item"]].until} if kind.is_exported(name) and pin["item"] in ended else pin
+            pin | {ENDED: ended[pin["item"]].until} if kind.is_exported(name) and pin.get("item") in ended else pin
             for pin in pins
         ]
         for name, pins in inputs.items()
