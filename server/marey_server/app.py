@@ -25,6 +25,7 @@ from marey_schemas.processes.memory import keep_freed_memory
 from marey_schemas.sizes import KIB, MIB
 from marey_schemas.tracing.spans import AttributeValue
 from marey_server.access.principal import SYSTEM
+from marey_server.errors import StoppingProblem
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.health import RESOURCES as MONITORING
 from marey_server.http.accepting import (
@@ -63,6 +64,8 @@ from marey_server.webhooks.delivering import delivering
 
 log = logging.getLogger(__name__)
 
+ABORT_S = 1.0
+"""Greatest number of seconds that a stopping server waits until aborted requests are answered."""
 READ_CHUNK_BYTES = 256 * KIB
 READ_BUFFER_BYTES = MIB
 FIRST_COMMAND = "marey project create lab"
@@ -93,7 +96,7 @@ class Application(TornadoApplication):
                 uneventful=handler.uneventful and status < 400,
                 attributes=_span_attributes(handler, method, route, status),
             )
-        level = logging.ERROR if status >= 500 else logging.INFO
+        level = logging.ERROR if status >= 500 and handler.problem_code != StoppingProblem.code else logging.INFO
         if handler.uneventful and status < 400:
             level = logging.DEBUG
         if access_log.isEnabledFor(level):
@@ -167,10 +170,13 @@ async def listening(
     address = address_of(sockets)
     try:
         async with running_housekeeping(app.services), following_feed(app.services), delivering(app.services):
-            yield Running(app, address, server)
-            await _linger(app.services, connections, linger_s)
+            try:
+                yield Running(app, address, server)
+                await _linger(app.services, connections, linger_s)
+            finally:  # before the end of housekeeping, which waits for a write
+                await _drain(app.services, server, connections)
     finally:
-        await _drain(app.services, server, connections)
+        app.services.close()
 
 
 @asynccontextmanager
@@ -217,6 +223,7 @@ async def _linger(services: Services, connections: Connections, linger_s: float)
 
 
 async def _drain(services: Services, server: HTTPServer, connections: Connections) -> None:
+    """Refuse new requests, wait for those in progress at most `drain_s` seconds, and close all connections."""
     services.draining.set()
     services.metrics.draining.set(1)
     wakeups.wake_everybody()
@@ -225,13 +232,22 @@ async def _drain(services: Services, server: HTTPServer, connections: Connection
     while services.in_flight and time.monotonic() < deadline:
         await asyncio.sleep(0.02)
     if services.in_flight:
-        log.warning(
-            "%d requests had not ended after the time for running requests (drain_s) and were aborted",
-            len(services.in_flight),
-        )
+        await _abort_requests(services)
     await server.close_all_connections()
     connections.close()
-    services.close()
+
+
+async def _abort_requests(services: Services) -> None:
+    """Abort the requests that are in progress, while the threads and the database can still be used."""
+    log.warning(
+        "%d requests had not ended after the time for running requests (drain_s) and were aborted",
+        len(services.in_flight),
+    )
+    for request in list(services.in_flight):
+        request.abort()
+    deadline = time.monotonic() + ABORT_S
+    while services.in_flight and time.monotonic() < deadline:
+        await asyncio.sleep(0.02)
 
 
 def open_database(settings: Settings, *, while_serving: bool = False) -> Database:

@@ -219,6 +219,18 @@ class UnavailableProblem(ApiProblem):
     code = "unavailable"
 
 
+class StoppingProblem(UnavailableProblem):
+    """The server is stopping and accepts no more work."""
+
+    code = "draining"
+
+    def __init__(self) -> None:
+        super().__init__(
+            "The server is stopping and accepts no more work; try again in a few seconds.",
+            headers={"Retry-After": "5"},
+        )
+
+
 class StorageFullProblem(ApiProblem):
     """The server has no space left to store this."""
 

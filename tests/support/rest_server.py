@@ -126,10 +126,11 @@ def chosen_settings(folder: Path, given: dict[str, Any]) -> Settings:
 
     Settings that differ only in this folder are read and checked once, because this takes 3 ms.
     """
+    given = {"drain_s": 5, **given}
     variables = sorted(one for one in os.environ.items() if one[0].startswith(PREFIX))
     key = repr((Path.cwd(), variables, sorted(given.items())))
     if key not in _CHOSEN:
-        _CHOSEN[key] = Settings(data=folder, port=0, drain_s=5, **given)
+        _CHOSEN[key] = Settings(data=folder, port=0, **given)
     return _CHOSEN[key].model_copy(update={"data": folder})
 
 
@@ -147,7 +148,12 @@ def running(database: Database, folder: Path, **settings: Any) -> Iterator[Serve
         try:
             async with listening(app) as listener:
                 loop = asyncio.get_running_loop()
-                started.update(app=app, address=listener.address, stop=lambda: loop.call_soon_threadsafe(stop.set))
+
+                def stop_server() -> None:
+                    with contextlib.suppress(RuntimeError):  # it has ended already
+                        loop.call_soon_threadsafe(stop.set)
+
+                started.update(app=app, address=listener.address, stop=stop_server)
                 ready.set()
                 await stop.wait()
         finally:

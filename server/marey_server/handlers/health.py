@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from marey_schemas.base import Answer
-from marey_server.errors import UnavailableProblem
+from marey_server.errors import StoppingProblem, UnavailableProblem
 from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.reply import Reply
@@ -23,6 +23,7 @@ class Healthz(Resource):
     path = "/healthz"
     root = ""
     uneventful = True
+    answers_while_stopping = True
     tag = "Operations"
 
     @reads(access=Access.ANYONE, scope=None, answer=Health)
@@ -37,6 +38,7 @@ class Readyz(Resource):
     path = "/readyz"
     root = ""
     uneventful = True
+    answers_while_stopping = True
     tag = "Operations"
 
     @reads(access=Access.ANYONE, scope=None, answer=Health, also=((503, None),), reserved=True)
@@ -48,9 +50,7 @@ class Readyz(Resource):
         reason only to administrators.
         """
         if self.services.draining.is_set():
-            raise UnavailableProblem(
-                "The server is stopping and accepts no more work.", code="draining", headers={"Retry-After": "5"}
-            )
+            raise StoppingProblem
         faults = await self.look_up(readiness.find_faults)
         if disk_fault := self.services.disk.fault():
             faults = [*faults, disk_fault]
@@ -69,6 +69,7 @@ class MetricsPage(Resource):
     path = "/metrics"
     root = ""
     uneventful = True
+    answers_while_stopping = True
     tag = "Operations"
 
     @reads(access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("text/plain",))

@@ -63,7 +63,11 @@ class CallingExchange(Exchange):
         return await asyncio.wrap_future(self._queued(self.services.database.queue_read, function, writes=False))
 
     async def _write(self, function: Callable[[Transaction], T]) -> T:
-        return await asyncio.wrap_future(self._queued(self.services.database.queue_write, function, writes=True))
+        future = self._queued(self.services.database.queue_write, function, writes=True)
+        try:
+            return await asyncio.wrap_future(future)
+        finally:
+            self.may_have_written = self.may_have_written or not future.cancelled()
 
     def _queued(
         self, queue: Callable[..., Future[T]], function: Callable[[Transaction], T], *, writes: bool

@@ -22,6 +22,7 @@ from marey_server.errors import (
     ApiProblem,
     DamagedProblem,
     MethodNotAllowedProblem,
+    StoppingProblem,
     UnauthenticatedProblem,
     forget_origin,
 )
@@ -70,6 +71,8 @@ class Exchange(RequestHandler):
     path: ClassVar[str]
     root: ClassVar[str] = API
     operations: ClassVar[dict[str, Operation]] = {}
+    running: asyncio.Task[Any] | None = None
+    """Task that handles the request; None before `prepare`."""
 
     def initialize(self) -> None:
         """Set up the state of one request."""
@@ -78,7 +81,7 @@ class Exchange(RequestHandler):
         self.trace = self._begin_trace()
         self.received_bytes = 0
         self.problem_code: str | None = None
-        self.refused = self.performing = False
+        self.refused = self.performing = self.aborted = self.may_have_written = False
         self.client_gone = ClientGone()
 
     def _begin_trace(self) -> RequestTrace | None:
@@ -165,6 +168,16 @@ class Exchange(RequestHandler):
             await self.flush()
             self.services.in_flight.discard(self)  # the rest of the body may never come
 
+    def abort(self) -> None:
+        """End the request before its answer is complete, because the server stops.
+
+        The answer is then an error that asks the client to repeat the request. If the request may have changed
+        something, or a part of its answer was sent, the connection is closed without this error.
+        """
+        self.aborted = True
+        if self.running is not None:
+            self.running.cancel()
+
     def method_not_allowed(self) -> MethodNotAllowedProblem:
         """Return the error for a method that the resource does not declare."""
         allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
@@ -216,6 +229,11 @@ class Exchange(RequestHandler):
         If a part of another answer is sent already, close the connection instead, so that the client notices that the
         answer is incomplete.
         """
+        if self.aborted:
+            if self.may_have_written:
+                self.wire.close()  # the error would say that the request had no effect
+            error = StoppingProblem()
+            kwargs["exc_info"] = (type(error), error, None)
         if not self._headers_written:
             super().send_error(status_code, **kwargs)
             return

@@ -36,6 +36,7 @@ from marey_server.errors import (
     ApiProblem,
     BadRequestProblem,
     LeaseLostProblem,
+    StoppingProblem,
     TooLargeProblem,
 )
 from marey_server.http import negotiation
@@ -81,6 +82,9 @@ class Resource(CallingExchange):
     tag: ClassVar[str]
     uneventful = False
     """True if a success is too frequent to be logged, such as an empty claim or a readiness check."""
+
+    answers_while_stopping = False
+    """True if requests are answered even if they come after the server has begun to stop."""
 
     media: negotiation.MediaType
     query: BaseModel | None = None
@@ -236,9 +240,12 @@ class Resource(CallingExchange):
     async def prepare(self) -> None:
         """Check the path, the query and the headers before the body is received."""
         self.services.in_flight.add(self)
+        self.running = asyncio.current_task()
         if (turn := self._turn()) is not None:
             await turn
         try:
+            if self.services.draining.is_set() and not self.answers_while_stopping:
+                raise StoppingProblem
             self._check_head()
             body = self.operation.body
             if body is not None and (body.streamed or self.expects_body()):

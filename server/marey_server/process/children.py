@@ -21,7 +21,14 @@ from marey_schemas.processes.child_process import BadMessage, ChildBroken, Conne
 from marey_schemas.processes.forking import FORKS, LOST
 from marey_schemas.processes.limits import OUT_OF_MEMORY, count_memory_kills
 from marey_schemas.sizes import MIB
-from marey_server.errors import ApiProblem, InvalidProblem, NotFoundProblem, TooLargeProblem, UnavailableProblem
+from marey_server.errors import (
+    ApiProblem,
+    InvalidProblem,
+    NotFoundProblem,
+    StoppingProblem,
+    TooLargeProblem,
+    UnavailableProblem,
+)
 from marey_server.motions.child import ChildAnswer, ChildOrder, ChildRefusal
 from marey_server.process.child_starting import LOADED_FIRST, ChildStarter
 
@@ -206,12 +213,12 @@ class Children:
         """Call `function` (`module:name`) in a child process.
 
         `make` returns the argument as bytes; `read` converts the answer to the result of the task. Raises
-        `UnavailableProblem` if the server is stopping.
+        `StoppingProblem` if the server is stopping.
         """
         task = ChildTask(caller, function, make, read, count_stop)
         with self._changed:
             if self._closed:
-                raise _stopping()
+                raise StoppingProblem
             self._waiting.append(task)
             callers = Counter(task.caller for task in (*self._waiting, *self._running))
             if sum(min(count, self.limits.children_each) for count in callers.values()) > len(self._threads):
@@ -234,7 +241,7 @@ class Children:
                 task.stop("closing")
             self._changed.notify_all()
         for task in left:
-            task.fail(_stopping())
+            task.fail(StoppingProblem())
         self._starter.close()
         for thread in self._threads:
             thread.join(CLOSING_S)
@@ -352,7 +359,7 @@ class Children:
         Also count the end in the metrics.
         """
         if task.stopped == "closing":
-            return _stopping()
+            return StoppingProblem()
         if status == LOST:
             task.count_end("died")
             return UnavailableProblem("The child process of this request ended unexpectedly; try again.")
@@ -409,10 +416,6 @@ def _busy(count: int, *, own: bool) -> UnavailableProblem:
         code="children-busy",
         headers={"Retry-After": str(ASK_AGAIN_S)},
     )
-
-
-def _stopping() -> UnavailableProblem:
-    return UnavailableProblem("The server is stopping; try again.", headers={"Retry-After": str(ASK_AGAIN_S)})
 
 
 def _too_long(limit: str, setting: str) -> TooLargeProblem:

@@ -13,13 +13,13 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import ParamSpec, TypeVar
 
 from marey_schemas.lru import LruCache
 from marey_server.errors import TooManyRequestsProblem, UnavailableProblem
 from marey_server.store.credentials.sign_ins import LimitScope, SignInTry, too_many_sign_ins
+from marey_server.store.database.lanes import SERVER, Lane
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -50,7 +50,7 @@ class PasswordLane:
     """Thread that hashes passwords, for a limited number of requests at the same time."""
 
     def __init__(self, name: str) -> None:
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"marey-password-{name}")
+        self._thread = Lane(f"marey-password-{name}", 1)
         self._places: Counter[str] = Counter()
 
     def __len__(self) -> int:
@@ -84,12 +84,15 @@ class PasswordLane:
             self._places += Counter()  # drops addresses without a place
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run `function`, which hashes a password, in the thread of the lane, and return its result."""
-        return await asyncio.wrap_future(self._thread.submit(function, *args, **kwargs))
+        """Run `function`, which hashes a password, in the thread of the lane, and return its result.
+
+        Raises `StoppingProblem` if the server stops before the function has begun.
+        """
+        return await asyncio.wrap_future(self._thread.submit(SERVER, function, *args, **kwargs))
 
     def close(self) -> None:
-        """Stop the thread after its current hash, and cancel the waiting hashes. Does not wait for the thread."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
+        """Stop the thread after its current hash; the waiting hashes fail. Does not wait for the thread."""
+        self._thread.close(wait=False)
 
 
 class RefusedTries:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 from tests.support.patience import PATIENCE_S
 
-from marey_server.errors import ClientGoneProblem, UnavailableProblem
+from marey_server.errors import ClientGoneProblem, StoppingProblem, UnavailableProblem
 from marey_server.store.database.lanes import SERVER, Client, FairLine, Lane
 
 ANNA, BEN = Client("anna"), Client("ben")
@@ -102,12 +102,14 @@ def test_the_end_of_an_iteration_is_an_error_that_event_loops_accept() -> None:
     lane.close()
 
 
-def test_closing_without_waiting_cancels_what_is_queued(release: threading.Event) -> None:
+def test_closing_without_waiting_refuses_what_is_queued(release: threading.Event) -> None:
     lane = Lane("test", 1)
     running = lane.submit(ANNA, release.wait, PATIENCE_S)
     queued = lane.submit(BEN, release.wait, PATIENCE_S)
     lane.close(wait=False)
-    assert queued.cancelled()
+    refusal = queued.exception(0)
+    assert isinstance(refusal, StoppingProblem)
+    assert "Retry-After" in refusal.headers
     release.set()
     assert running.result(PATIENCE_S)
 

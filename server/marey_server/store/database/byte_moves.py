@@ -10,9 +10,9 @@ from concurrent.futures import Future
 from functools import partial
 from typing import Any, Generic, TypeVar
 
-from marey_server.errors import UnavailableProblem
+from marey_server.errors import StoppingProblem, UnavailableProblem
 from marey_server.store.blob_backings import BlobBacking
-from marey_server.store.database.lanes import Client, Lane, stopping
+from marey_server.store.database.lanes import Client, Lane
 from marey_server.store.object_storage.awaiting import BytesAwaited, Carried
 from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.transaction import Transaction
@@ -102,4 +102,4 @@ class MovingCall(Generic[T]):
 
 
 def _error_of(ended: Future[Any]) -> BaseException | None:
-    return stopping() if ended.cancelled() else ended.exception()
+    return StoppingProblem() if ended.cancelled() else ended.exception()

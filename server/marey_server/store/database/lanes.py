@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, ParamSpec, TypeVar
 
-from marey_server.errors import ClientGoneProblem, UnavailableProblem, forget_origin
+from marey_server.errors import ClientGoneProblem, StoppingProblem, UnavailableProblem, forget_origin
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -51,22 +51,17 @@ SERVER = Client("server")
 """Client for calls that the server makes itself, such as housekeeping."""
 
 
-def stopping() -> UnavailableProblem:
-    """Return the error for a call that cannot run because the server is stopping."""
-    return UnavailableProblem("The server is stopping and accepts no more work.", code="draining")
-
-
 def begin(pool: ThreadPoolExecutor, run: Callable[[], None], future: Future[Any]) -> None:
     """Run a function in a thread of the pool; the function must finish `future`, and may finish other futures, too.
 
-    If the pool is stopped, cancels the future and raises `UnavailableProblem`, unless another thread already computes
-    the future.
+    If the pool is stopped, cancels the future and raises `StoppingProblem`, unless another thread already computes the
+    future.
     """
     try:
         pool.submit(run)
     except RuntimeError:  # so says a pool whose threads were stopped
         if future.cancel():
-            raise stopping() from None
+            raise StoppingProblem from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +168,10 @@ class Lane:
         return len(self._line)
 
     def submit(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Queue a call for a client. Raises `UnavailableProblem` if the queue is full or the lane is closed."""
+        """Queue a call for a client.
+
+        Raises `UnavailableProblem` if the queue is full, and `StoppingProblem` if the lane is closed.
+        """
         future: Future[T] = Future()
         with self._lock:
             self._line.put(client, _QueuedCall(client, partial(function, *args, **kwargs), future))
@@ -184,12 +182,19 @@ class Lane:
         return future
 
     def close(self, *, wait: bool = True) -> None:
-        """Accept no further calls. With `wait`, finish the queued calls first; otherwise cancel them."""
+        """Accept no further calls. With `wait`, finish the queued calls first; otherwise they fail.
+
+        The error of the calls that fail is `StoppingProblem`.
+        """
+        dropped: list[_QueuedCall] = []
         if not wait:
             with self._lock:
                 while (call := self._line.take()) is not None:
-                    call.future.cancel()
+                    dropped.append(call)
         self._pool.shutdown(wait=wait, cancel_futures=not wait)
+        for call in dropped:  # not cancelled: whoever waits could not distinguish this from its own cancellation
+            if call.future.set_running_or_notify_cancel():
+                call.future.set_exception(StoppingProblem())
 
     def _run_waiting(self) -> None:
         call = self._begin_next()
