@@ -1,10 +1,11 @@
 """Periodic work of the server, called housekeeping.
 
-It reclaims expired leases, and completes waiting jobs with the results of identical jobs. It commits the outputs of
-jobs that have many outputs, merges waiting proposals, and submits the jobs of due schedules. It deletes old or
-unreferenced data. Only the leading process does this work, except that each process cleans its own data folder. Even
-concurrent housekeeping would be safe, because every statement checks its conditions again. Each kind of work runs in a
-separate task, so that a failure does not affect the other kinds.
+It reclaims expired leases, and completes waiting jobs with the results of identical jobs. It propagates the ends of
+jobs with many dependants. It commits the outputs of jobs that have many outputs, merges waiting proposals, and submits
+the jobs of due schedules. It deletes old or unreferenced data. Only the leading process does this work, except that
+each process propagates ends, and cleans its own data folder. Even concurrent housekeeping would be safe, because every
+statement checks its conditions again. Each kind of work runs in a separate task, so that a failure does not affect the
+other kinds.
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ from marey_server.store.datasets.proposals import WaitingMerges
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
 from marey_server.store.jobs.finishing import commit_deferred
+from marey_server.store.jobs.propagation import propagate_rest
 from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.object_upkeep.moving import move_uploads
 from marey_server.store.retention import retire
 from marey_server.store.schedules.firing import submit_due
 from marey_server.store.transaction import Transaction
-from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, Listener, wakeups
+from marey_server.store.wakeups import ENDS_TO_PROPAGATE, OUTPUTS_TO_COMMIT, Listener, wakeups
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -57,13 +59,17 @@ async def running_housekeeping(services: Services) -> AsyncIterator[None]:
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
     merges = WaitingMerges(services.database)
-    with wakeups.listen([OUTPUTS_TO_COMMIT]) as listener:  # all the time, so that no job is missed during a commit
+    with (  # all the time, so that no job is missed during a commit
+        wakeups.listen([OUTPUTS_TO_COMMIT]) as listener,
+        wakeups.listen([ENDS_TO_PROPAGATE]) as of_ends,
+    ):
         chores = (
             (tick_s, tick_s, _reclaim_leases),
             (tick_s, tick_s, _share_results),
             (tick_s, tick_s, partial(_merge_waiting, merges=merges)),
             (tick_s, tick_s, _submit_scheduled),
             (0.0, 0.0, partial(_commit_outputs, listener=listener, longest_wait_s=tick_s)),
+            (0.0, 0.0, partial(_propagate_ends, listener=of_ends, longest_wait_s=tick_s)),
             (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
             (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
             (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _remove_index_copies),
@@ -167,6 +173,16 @@ async def _commit_outputs(services: Services, holder: str, *, listener: Listener
     await listener.wait(longest_wait_s)
     if await _write(services, _leads, holder):
         await _in_thread(services, commit_deferred, services.database)
+
+
+async def _propagate_ends(services: Services, _holder: str, *, listener: Listener, longest_wait_s: float) -> None:
+    """Propagate the ends of jobs that other transactions have left, in short transactions.
+
+    First wait until there are such ends, but at most `longest_wait_s` seconds, because another process may have ended.
+    """
+    await listener.wait(longest_wait_s)
+    while await _write(services, propagate_rest):
+        pass
 
 
 def _leads(tx: Transaction, holder: str) -> bool:

@@ -112,6 +112,8 @@ class Transaction:
     ) -> None:
         self.connection = connection
         self.principal = principal
+        self.continued_for: str | None = None
+        """Actor of an earlier transaction whose work this one continues; see `actor`."""
         self.required_role = STRICTEST
         """Role and scope that the request's operation declares; `projects.require` enforces them."""
         self.blobs = blobs
@@ -141,6 +143,11 @@ class Transaction:
         if self._now_us is None:
             self._now_us = self._clock.now_us(self.connection)
         return self._now_us
+
+    @property
+    def actor(self) -> str | None:
+        """Who has caused the events of this transaction: the principal, or the actor for whom work is continued."""
+        return self.continued_for or self.principal.actor
 
     def beside(self, principal: Principal) -> Transaction:
         """Return a transaction for another `principal` on the same connection; the two are committed together."""
@@ -228,7 +235,7 @@ class Transaction:
         self._record([{**row, "about": about, "token_id": token_id}])
 
     def _record(self, events: Iterable[Mapping[str, Any]]) -> None:
-        common = {"at_us": self.now_us, "actor": self.principal.actor}
+        common = {"at_us": self.now_us, "actor": self.actor}
         rows = [{**common, **one} for one in events]
         if rows:
             self.run_each(_INSERT_EVENT, rows)

@@ -16,6 +16,9 @@ COMMITTED_EVENTS = "committed events"
 OUTPUTS_TO_COMMIT = "outputs to commit"
 """Topic that is announced when the tasks of a job have ended and the server must commit their many outputs."""
 
+ENDS_TO_PROPAGATE = "ends to propagate"
+"""Topic that is announced when a transaction has left the ends of some jobs to later transactions."""
+
 NUMBERED_EVENTS = "numbered events"
 """Topic that is announced when new events can be read. On Postgres, this is when their numbers are assigned."""
 

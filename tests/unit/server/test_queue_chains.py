@@ -1,5 +1,8 @@
 """Connected jobs: dependencies, fan-outs, shared results, and retries."""
 
+import re
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,13 +15,15 @@ from tests.support.store_fixtures import declared, requiring
 from marey_schemas.access import MemberChange, Role, UserCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_kinds
-from marey_schemas.queue.jobs import JobCreate, JobState, Progress
+from marey_schemas.queue.jobs import ItemInput, JobCreate, JobState, Progress
 from marey_schemas.queue.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem, NotFoundProblem
 from marey_server.store import blobs, events, garbage, items, members, users
+from marey_server.store.database.connections import Database
 from marey_server.store.items.drafts import Draft
-from marey_server.store.jobs import reading, result_cache, retrying
+from marey_server.store.jobs import propagation, reading, result_cache, retrying
+from marey_server.store.jobs.propagation import propagate_rest
 from marey_server.store.jobs.reaper import share_waiting
 from marey_server.store.tables import staged_output
 from marey_server.store.transaction import Transaction
@@ -95,6 +100,85 @@ def test_what_depends_on_a_cancelled_job_fails(desk: Desk) -> None:
     second = desk.submit(after=[first])
     desk.cancel(first)
     assert desk.state(second) == "failed"
+
+
+def _graph(desk: Desk, collection: str) -> dict[str, str]:
+    """Submit jobs that depend on the job `root` directly and indirectly; return their ids by name."""
+    ids = {"root": desk.submit(), "other": desk.submit()}
+    things = tuple(ItemInput(item=one) for one in desk.things(4, collection))
+    for number in range(12):
+        ids[f"chain-{number}"] = desk.submit(after=[ids[f"chain-{number - 1}" if number else "root"]])
+    for number in range(12):
+        ids[f"wide-{number}"] = desk.submit(after=[ids["root"], ids["other"]])
+    ids["skipped"] = desk.submit(after=[ids["wide-3"], ids["chain-2"]], on_failure="skip")
+    ids["after skipped"] = desk.submit(after=[ids["skipped"]])
+    ids["whole"] = desk.submit("square", inputs={"things": things}, after=[ids["chain-5"]])
+    ids["after whole"] = desk.submit(after=[ids["whole"]])
+    ids["apart"] = desk.submit(after=[ids["other"]])
+    return ids
+
+
+def _told(desk: Desk, ids: dict[str, str]) -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
+    """Return the states and failures of jobs, and the events of their ends, with names in place of ids."""
+    desk.database.write(desk.user, events.number_events)
+    feed = desk.database.read(desk.user, events.list_events, desk.project, limit=1000).items
+    names = {job_id: name for name, job_id in ids.items()}
+
+    def named(text: str) -> str:
+        return re.sub(r"job_\w+", lambda found: names.get(found[0], "?"), text)
+
+    jobs = {name: desk.job(job_id) for name, job_id in ids.items()}
+    documents = {
+        name: (job.state, job.failure and named(job.failure.model_dump_json()), job.finished_at is not None, job.rev)
+        for name, job in jobs.items()
+    }
+    tasks = desk.database.read(desk.user, reading.list_jobs, desk.project, reading.JobFilters(parent=ids["whole"]))
+    names |= {task.id: "task" for task in tasks.items}
+    ends = [(one.kind, names[one.subject], one.actor) for one in feed if one.subject in names]
+    return documents, [end for end in ends if end[0] in ("job.failed", "job.cancelled", "job.succeeded")]
+
+
+def test_the_end_of_a_job_with_many_dependants_is_propagated_in_short_transactions(
+    desk: Desk, open_database: Callable[[], Database], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = _graph(desk, "raw")
+    desk.cancel(whole["root"])
+    documents, ends = _told(desk, whole)
+    assert len(ends) == len(whole) - 2 + 2  # without `other` and `apart`, but with two tasks
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 4)
+    ids = _graph(desk, "more")
+    desk.cancel(ids["root"])
+    assert [desk.state(ids[name]) for name in ("root", "chain-11", "after whole")] == [
+        "cancelled",
+        "waiting",
+        "waiting",
+    ]
+    late = desk.submit(after=[ids["root"]])
+    assert desk.state(late) == "failed"
+    steps = 0
+    while open_database().write(SYSTEM, propagate_rest):  # as another process, after the end of this one
+        steps += 1
+    assert steps >= 8
+    in_steps, ends_in_steps = _told(desk, ids)
+    assert in_steps == documents
+    assert sorted(ends_in_steps) == sorted(ends)
+    order = [name for _, name, _ in ends_in_steps]
+    assert all(order.index(f"chain-{number}") < order.index(f"chain-{number + 1}") for number in range(11))
+    assert order.index("chain-5") < order.index("whole") < order.index("after whole")
+    assert not desk.database.write(SYSTEM, propagate_rest)
+
+
+def test_dependants_of_a_job_that_succeeds_are_queued_in_short_transactions(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 4)
+    first = desk.submit()
+    others = [desk.submit(after=[first]) for _ in range(9)]
+    desk.complete(desk.claim())
+    assert Counter(desk.state(one) for one in others) == {"queued": 4, "waiting": 5}
+    while desk.database.write(SYSTEM, propagate_rest):
+        pass
+    assert Counter(desk.state(one) for one in others) == {"queued": 9}
 
 
 def test_a_job_can_only_come_after_jobs_of_its_project(desk: Desk) -> None:

@@ -1,43 +1,131 @@
-"""Propagates the end of a job, in the same transaction.
+"""Propagates the end of a job.
 
 The end of a job affects the jobs that depend on it, its parent job, and the jobs that wait to share its result. Rows
 are locked downstream: a job before its parent job and before its dependants.
+
+A job may have thousands of dependants, also indirect ones, and other writes must not wait until all of them have ended.
+So one transaction propagates a limited number of ends. It marks the remaining jobs, whose ends later transactions
+propagate (`propagate_rest`), also after a restart of the server.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
-from itertools import islice
+from dataclasses import replace
+from itertools import takewhile
 from typing import Any
 
-from sqlalchemy import Row, and_, bindparam, false, select, update
+from sqlalchemy import Row, and_, bindparam, false, func, null, select, update
 
 from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_schemas.queue.jobs import JobState
 from marey_schemas.sizes import batched
-from marey_server.store.database.prepared import Prepared
+from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.jobs import late_inputs, result_cache
-from marey_server.store.jobs.endings import Ended, dependency_failure, end_jobs
+from marey_server.store.jobs.endings import ENDED_COLUMNS, Ended, as_ended, dependency_failure, end_jobs
 from marey_server.store.jobs.events import emit_job_events, wake_watchers
 from marey_server.store.jobs.fan_out import gather
 from marey_server.store.jobs.fencing import RUNNING, WAITING
 from marey_server.store.jobs.result_cache import READY_COLUMNS
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, job_dependency
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Transaction, in_lists
+from marey_server.store.wakeups import ENDS_TO_PROPAGATE, wakeups
 
 PAGE = 1000
 """Greatest number of ended jobs in one statement."""
+MOST_AT_ONCE = 200
+"""Number of ended jobs and of steps after which a transaction leaves the other ends to later transactions.
+
+A step propagates the ends of some jobs. It also moves at most this number of dependants.
+"""
 
 
 def propagate_ends(tx: Transaction, ended: Iterable[Ended]) -> None:
-    """Propagate the ends of jobs to dependants, parent jobs and jobs that share a result, until no further job ends."""
+    """Propagate the ends of jobs to dependants, parent jobs and jobs that share a result, until no further job ends.
+
+    The parent jobs of `ended` are updated in this transaction. If there are many dependants, later transactions end or
+    queue some of them, in the same order.
+    """
     queue = list(ended)
-    while queue:
+    unmoved, queue = _propagate(tx, queue, required=len(queue), most=MOST_AT_ONCE)
+    _leave(tx, unmoved, announced=True)
+    _leave(tx, queue, announced=False)
+
+
+def propagate_rest(tx: Transaction) -> bool:
+    """Propagate some of the ends that earlier transactions have left, the oldest first; return whether there were any.
+
+    Events have the same actor as those of the earlier transaction.
+    """
+    tx.lock("propagation")
+    most = {"most": MOST_AT_ONCE}
+    hold_off_purges(tx, *{row.project_id for row in tx.execute(_REST, most)})
+    found = tx.execute(_REST, most).all()  # again, because a purge may have deleted some
+    if not found:
+        return False
+    how, rank = found[0].propagation, found[0].propagation_rank
+    rows = list(takewhile(lambda row: row.propagation == how, found))
+    ended = [replace(as_ended(row), shareable=how["shareable"]) for row in rows]
+    unmark = update(job).where(job.c.id.in_([one.id for one in ended]))
+    tx.execute(unmark.values(propagation=null(), propagation_rank=None))
+    tx.continued_for = how["actor"]
+    ends_here = len(rows) == len(found) < MOST_AT_ONCE  # otherwise, others come before jobs that end now
+    further = MOST_AT_ONCE if ends_here else 0
+    if how["announced"]:
+        following, is_complete = _move_dependants(tx, ended)
+        unmoved, queue = _propagate(tx, following, required=0, most=further if is_complete else 0)
+        unmoved += [] if is_complete else ended
+    else:
+        unmoved, queue = _propagate(tx, ended, required=len(ended), most=further)
+    _leave(tx, unmoved, announced=True, rank=rank)
+    _leave(tx, queue, announced=False)
+    return True
+
+
+_REST = (
+    select(*ENDED_COLUMNS, job.c.propagation, job.c.propagation_rank)
+    .where(job.c.propagation_rank.is_not(None))
+    .order_by(job.c.propagation_rank, job.c.id)
+    .limit(bindparam("most"))
+)
+
+
+def _propagate(tx: Transaction, queue: list[Ended], *, required: int, most: int) -> tuple[list[Ended], list[Ended]]:
+    """Propagate the ends of the first `required` jobs in `queue`, and of at most about `most` further jobs.
+
+    Each step counts as another job. Returns the jobs that have dependants left, and the jobs whose ends are still to be
+    propagated.
+    """
+    unmoved: list[Ended] = []
+    while queue and (required > 0 or (most > 0 and not unmoved)):
         page, queue = queue[:PAGE], queue[PAGE:]
         _announce(tx, page)
-        queue += _count_tasks(tx, page)
-        queue += _move_dependants(tx, page)
+        of_tasks = _count_tasks(tx, page)
+        following, is_complete = _move_dependants(tx, page)
+        unmoved += [] if is_complete else page
+        queue += of_tasks + following
+        required += len(of_tasks) - len(page)
+        most -= len(page) + 1
+    return unmoved, queue
+
+
+def _leave(tx: Transaction, ended: Sequence[Ended], *, announced: bool, rank: int | None = None) -> None:
+    """Mark ended jobs, so that later transactions propagate their ends, by default after all other marked jobs.
+
+    `announced` says whether only dependants of these jobs remain to be updated.
+    """
+    if not ended:
+        return
+    if rank is None:
+        last = select(func.max(job.c.propagation_rank)).where(job.c.propagation_rank.is_not(None))
+        rank = (tx.execute(last).scalar() or 0) + 1
+    for shareable in (True, False):
+        how = {"actor": tx.actor, "shareable": shareable, "announced": announced}
+        for some in in_lists([end.id for end in ended if end.shareable == shareable]):
+            tx.execute(update(job).where(job.c.id.in_(some)).values(propagation=how, propagation_rank=rank))
+    tx.after_commit(lambda: wakeups.announce([ENDS_TO_PROPAGATE]))
 
 
 def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
@@ -91,30 +179,44 @@ def _facts_of(end: Ended) -> dict[str, Any]:
 # -- dependants -------------------------------------------------------------------------------------------------------
 
 
+_OF_ENDED = (
+    job_dependency.c.on_job_id.in_(bindparam("ended", expanding=True)),
+    job_dependency.c.satisfied == false(),
+)
+_DEPENDANTS = Prepared(
+    select(job_dependency.c.job_id)
+    .distinct()
+    .where(*_OF_ENDED)
+    .order_by(job_dependency.c.job_id)
+    .limit(bindparam("most"))
+)
 _RELEASE = Prepared(
     update(job_dependency)
-    .where(job_dependency.c.on_job_id.in_(bindparam("ended", expanding=True)), job_dependency.c.satisfied == false())
+    .where(*_OF_ENDED, job_dependency.c.job_id.in_(bindparam("dependants", expanding=True)))
     .values(satisfied=True)
     .returning(job_dependency.c.job_id, job_dependency.c.on_job_id)
 )
+_WAITING_JOBS = Prepared(
+    select(*READY_COLUMNS, job.c.parent_id, job.c.dependencies_left, job.c.on_failure)
+    .where(job.c.id.in_(bindparam("ids", expanding=True)), job.c.state == WAITING)
+    .order_by(job.c.id)
+    .with_for_update()
+)
 
 
-def _move_dependants(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
+def _move_dependants(tx: Transaction, ended: Sequence[Ended]) -> tuple[list[Ended], bool]:
+    """Update the first `MOST_AT_ONCE` jobs that depend on ended jobs.
+
+    Returns the jobs that have ended as a result, and whether no dependants are left.
+    """
     ends = {end.id: end for end in ended}
+    ids = [row.job_id for row in tx.run(_DEPENDANTS, {"ended": padded(ends), "most": MOST_AT_ONCE})]
+    if not ids:
+        return [], True
     upstream: dict[str, list[Ended]] = {}
-    for row in tx.run(_RELEASE, {"ended": list(ends)}):
+    for row in tx.run(_RELEASE, {"ended": padded(ends), "dependants": padded(ids)}):
         upstream.setdefault(row.job_id, []).append(ends[row.on_job_id])
-    following: list[Ended] = []
-    ids = iter(sorted(upstream))
-    while page := list(islice(ids, PAGE)):
-        following += _move(tx, _waiting(tx, page), upstream)
-    return following
-
-
-def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
-    columns = (*READY_COLUMNS, job.c.parent_id, job.c.dependencies_left, job.c.on_failure)
-    statement = select(*columns).where(job.c.id.in_(ids), job.c.state == WAITING).order_by(job.c.id).with_for_update()
-    return tx.execute(statement).all()
+    return _move(tx, tx.run(_WAITING_JOBS, {"ids": padded(ids)}), upstream), len(ids) < MOST_AT_ONCE
 
 
 def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
@@ -153,7 +255,7 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
         tx.execute(statement, [{"of_job": job_id, "left": count} for job_id, count in left.items()])
 
 
-_END_UNRUNNABLE = (
+_END_UNRUNNABLE = Prepared(
     update(job)
     .where(job.c.id == bindparam("of_job"), job.c.state == WAITING)
     .values(
@@ -180,7 +282,7 @@ def _end_unrunnable(tx: Transaction, unrunnable: Sequence[tuple[Row[Any], Ended]
         for row, cause in unrunnable
     ]
     if ended:
-        tx.execute(
+        tx.run_each(
             _END_UNRUNNABLE,
             [{"of_job": one.id, "its_state": one.state, "its_failure": one.failure, "now": tx.now_us} for one in ended],
         )

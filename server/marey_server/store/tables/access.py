@@ -15,6 +15,7 @@ user = Table(
     Column("disabled", Boolean, nullable=False, default=False),
     Column("created_us", Micros, nullable=False),
     Column("rev", Integer, nullable=False, default=1),
+    Column("jobs_bound", BigInteger),  # not less than the number of unfinished jobs; null: not counted yet
 )
 
 token = Table(

@@ -32,6 +32,9 @@ NOT_SUCCEEDED = text("job.state <> 'succeeded'")
 """Condition of the index `ix_job_list_state`; SQLite uses the index only for queries that contain this condition."""
 
 
+_UNPROPAGATED = text("propagation_rank IS NOT NULL")
+
+
 def _listing_index(name: str, *columns: str, of: str = "parent_id IS NULL") -> Index:
     """Return an index for lists of jobs without tasks; its last columns are those by which the lists are sorted."""
     condition = text(of)
@@ -98,6 +101,8 @@ job = Table(
     Column("started_us", Micros),
     Column("finished_us", Micros),
     Column("rev", Integer, nullable=False, default=1),
+    Column("propagation", Document),  # {actor, shareable, announced}, while `propagation_rank` is set
+    Column("propagation_rank", BigInteger),  # place among the jobs whose ends later transactions propagate, or null
     Index("ix_job_listing", "project_id", "id"),
     _listing_index("created", "created_us"),
     _listing_index("state", "state", "created_us", of="parent_id IS NULL AND state <> 'succeeded'"),
@@ -149,6 +154,9 @@ job = Table(
         sqlite_where=text("state = 'running' AND concurrency_key IS NOT NULL"),
         postgresql_where=text("state = 'running' AND concurrency_key IS NOT NULL"),
     ),
+    Index(  # jobs whose ends are propagated by later transactions
+        "ix_job_unpropagated", "propagation_rank", "id", sqlite_where=_UNPROPAGATED, postgresql_where=_UNPROPAGATED
+    ),
     Index("ix_job_unfinished", "author_id", sqlite_where=UNFINISHED, postgresql_where=UNFINISHED),
     Index("ix_job_cache", "project_id", "cache_key"),
     Index(
@@ -173,6 +181,13 @@ job_dependency = Table(
     Column("job_id", ID, ForeignKey("job.id"), primary_key=True),
     Column("on_job_id", ID, ForeignKey("job.id"), primary_key=True, index=True),
     Column("satisfied", Boolean, nullable=False, default=False),
+    Index(  # the next dependants of an ended job, without reading those that were updated before
+        "ix_job_dependency_unsatisfied",
+        "on_job_id",
+        "job_id",
+        sqlite_where=text("satisfied = 0"),
+        postgresql_where=text("satisfied = false"),
+    ),
 )
 
 attempt = Table(
