@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import pytest
+from sqlalchemy import event
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab, skeleton_tree
@@ -126,6 +127,29 @@ def test_unfinished_jobs_and_their_tasks_count_until_they_end(desk: Desk) -> Non
     later = desk.submit()
     desk.cancel(later)
     desk.submit()
+
+
+def test_a_submission_does_not_count_the_unfinished_jobs_again_while_there_is_room(desk: Desk) -> None:
+    counts: list[str] = []
+
+    def note(_connection: Any, _cursor: Any, statement: str, *_others: Any) -> None:
+        if "count(*)" in statement and "FROM job" in statement:
+            counts.append(statement)
+
+    desk.database.quotas = Quotas(user_jobs=2 * LIMIT)
+    event.listen(desk.database.engine, "before_cursor_execute", note)
+    jobs = [desk.submit() for _ in range(2 * LIMIT)]
+    assert len(counts) == 1
+    with pytest.raises(QuotaExceededProblem, match="6 unfinished jobs"):
+        desk.submit()
+    for one in jobs[:LIMIT]:
+        desk.cancel(one)
+    counts.clear()
+    for _ in range(LIMIT):
+        desk.submit()
+    assert len(counts) == 1
+    with pytest.raises(QuotaExceededProblem, match="6 unfinished jobs"):
+        desk.submit()
 
 
 def test_tasks_of_a_job_that_gets_its_inputs_later_count_as_well(desk: Desk) -> None:

@@ -26,7 +26,7 @@ from marey_server.store.jobs.fencing import WAITING
 from marey_server.store.jobs.inputs import MOST_INPUTS, Pin, PinnedInputs, items_by_id, pin, record_named_items
 from marey_server.store.jobs.layout import NewJob, Submission
 from marey_server.store.jobs.result_places import find_clash
-from marey_server.store.quotas.counting import room_of
+from marey_server.store.quotas.counting import note_jobs, room_of
 from marey_server.store.quotas.daily import count_late
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction, in_lists
@@ -128,6 +128,7 @@ def _take_room(tx: Transaction, submission: Submission, room: dict[str, int]) ->
         )
         raise LateInputError(QuotaExceededProblem.code, detail)
     room[author_id] -= tasks
+    note_jobs(tx, author_id, tasks)
 
 
 def _count_inputs(tx: Transaction, submission: Submission, known: int) -> None:

@@ -53,7 +53,7 @@ from marey_server.store.jobs.result_places import find_clash, result_folders
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import daily
-from marey_server.store.quotas.counting import require_room
+from marey_server.store.quotas.counting import require_room_for_jobs
 from marey_server.store.scripts.registry import record_runs, resolve_params
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction, in_lists
@@ -138,7 +138,7 @@ def submit_checked(
     heads = [_head(project, one, upstream) for one in submissions]
     tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])
     everything = [*heads, *tasks]
-    require_room(tx, "user_jobs", sum(not JobState(one.state).terminal for one in everything))
+    require_room_for_jobs(tx, sum(not JobState(one.state).terminal for one in everything))
     rows = {one.id: new_row(tx, one) for one in everything}
     tx.run_each(_INSERT_JOB, list(rows.values()))
     record_named_items(tx, map(naming, everything), new=True)

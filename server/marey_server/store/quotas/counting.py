@@ -1,6 +1,7 @@
 """Quotas of things that are counted each time another one is added, such as tokens, jobs and schedules.
 
-The transaction that adds something counts it, so the count is always exact.
+The transaction that adds something counts it, so the count is always exact. Only unfinished jobs are not counted each
+time; see `require_room_for_jobs`.
 """
 
 from __future__ import annotations
@@ -8,13 +9,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Select, Table, and_, exists, func, or_, select
+from sqlalchemy import Select, Table, and_, bindparam, exists, func, or_, select, update
 
 from marey_schemas.access import Role
 from marey_server.errors import QuotaExceededProblem
+from marey_server.store.database.prepared import Prepared
 from marey_server.store.invitations.validity import is_unspent
-from marey_server.store.tables import UNFINISHED, blob, invitation, job, member, project, token, upload, upload_chunk
+from marey_server.store.tables import (
+    UNFINISHED,
+    blob,
+    invitation,
+    job,
+    member,
+    project,
+    token,
+    upload,
+    upload_chunk,
+    user,
+)
 from marey_server.store.transaction import Transaction
+
+_ENDLESS = 2**62
+"""Limit that no number of jobs reaches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +67,47 @@ def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
     if user_id is None or tx.principal.kind != "user":
         return
     tx.lock(f"{quota} {user_id}")
+    _require_counted(tx, quota, user_id, more)
+
+
+def _require_counted(tx: Transaction, quota: str, user_id: str, more: int) -> int:
+    """Count what a user has, and return the count; raise `QuotaExceededProblem` if `more` would exceed the quota."""
     used, limit = int(tx.execute(_used(tx, quota, user_id)).scalar_one()), getattr(tx.quotas, quota)
     if used + more <= limit:
-        return
+        return used
     remedy = _remedy(tx, quota, user_id) if used else f"The operator can raise the setting `{quota}`."
     raise exceeded("You have", quota, _RULES[quota].noun, used, limit, more, remedy)
+
+
+_ADD_JOBS = Prepared(
+    update(user)
+    .where(user.c.id == bindparam("of_user"), user.c.jobs_bound + bindparam("more") <= bindparam("most"))
+    .values(jobs_bound=user.c.jobs_bound + bindparam("more"))
+    .returning(user.c.id)
+)
+
+
+def require_room_for_jobs(tx: Transaction, more: int) -> None:
+    """Raise `QuotaExceededProblem` if the caller would exceed the quota `user_jobs` by adding `more` unfinished jobs.
+
+    Counting all unfinished jobs takes long if there are many. So a number is stored for each user that is not less than
+    their number: it grows with each submission, but does not fall when jobs end. The jobs are counted, and the stored
+    number is corrected, only when it would exceed the quota. Concurrent checks of one user run one after another.
+    """
+    user_id = tx.principal.user_id
+    if user_id is None:
+        return
+    if tx.principal.kind != "user":  # attempts have no quotas
+        note_jobs(tx, user_id, more)
+    elif not tx.run(_ADD_JOBS, {"of_user": user_id, "more": more, "most": tx.quotas.user_jobs}):
+        tx.execute(select(user.c.id).where(user.c.id == user_id).with_for_update(key_share=True))
+        used = _require_counted(tx, "user_jobs", user_id, more)
+        tx.execute(update(user).where(user.c.id == user_id).values(jobs_bound=used + more))
+
+
+def note_jobs(tx: Transaction, user_id: str, more: int) -> None:
+    """Note that a user has `more` unfinished jobs, even if this exceeds the quota `user_jobs`."""
+    tx.run(_ADD_JOBS, {"of_user": user_id, "more": more, "most": _ENDLESS})
 
 
 def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
