@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from sqlalchemy import case, delete, select, update
+from sqlalchemy import BigInteger, Table, bindparam, case, delete, select, update
+from sqlalchemy.dialects import postgresql, sqlite
 
 from marey_schemas.encoding.canonical import canonical_json
 from marey_server.store.database.clock import DAY_US
+from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import sign_in_limit
 from marey_server.store.transaction import Transaction
 
@@ -66,14 +69,29 @@ def wait_s(tx: Transaction, limit: RateLimit) -> int:
 
 def count(tx: Transaction, limit: RateLimit) -> int:
     """Count an event and return 0; if the limit is reached, count nothing and return the seconds to wait."""
-    until, now_us = sign_in_limit.c.until_us, tx.now_us
-    counted = tx.insert_into(sign_in_limit, {"key": limit.key, "until_us": now_us + limit.interval_us})
-    counted = counted.on_conflict_do_update(
-        index_elements=["key"],
-        set_={"until_us": case((until > now_us, until), else_=now_us) + limit.interval_us},
-        where=until <= limit.latest_us(now_us),
+    now_us = tx.now_us
+    given = {"of_key": limit.key, "now": now_us, "interval": limit.interval_us, "latest": limit.latest_us(now_us)}
+    return 0 if tx.run(_COUNT[tx.is_postgres], given) else wait_s(tx, limit)
+
+
+def _counting(insert: Callable[[Table], sqlite.Insert | postgresql.Insert]) -> Prepared:
+    """Return the statement that counts an event, and gives a row unless the limit is reached."""
+    until = sign_in_limit.c.until_us
+    now_us, interval_us, latest_us = (bindparam(name, type_=BigInteger) for name in ("now", "interval", "latest"))
+    return Prepared(
+        insert(sign_in_limit)
+        .values(key=bindparam("of_key"), until_us=now_us + interval_us)
+        .on_conflict_do_update(
+            index_elements=["key"],
+            set_={"until_us": case((until > now_us, until), else_=now_us) + interval_us},
+            where=until <= latest_us,
+        )
+        .returning(until)
     )
-    return 0 if tx.execute(counted.returning(until)).first() is not None else wait_s(tx, limit)
+
+
+_COUNT = {True: _counting(postgresql.insert), False: _counting(sqlite.insert)}
+"""Prepared statements of `count`: on Postgres, and on SQLite."""
 
 
 def uncount(tx: Transaction, limit: RateLimit) -> None:
