@@ -35,7 +35,7 @@ def find(house: House) -> Iterator[Offence]:
     named = _named(house)
     for module in _written_by_hand(house):
         for name, node in module.definitions:
-            if not (named[node.name] or _is_entry(node) or _is_of_format(module, node)):
+            if not (named[node.name] or _is_entry(node) or is_of_format(module, node)):
                 yield Offence(
                     module.path, node.lineno, f"{module.name}.{name}", f"{name} is used by tests only, or by nothing"
                 )
@@ -91,7 +91,7 @@ def _is_entry(node: Definition) -> bool:
     )
 
 
-def _is_of_format(module: Module, node: Definition) -> bool:
+def is_of_format(module: Module, node: Definition) -> bool:
     """Return whether a definition is the reader or writer of a file format, looked up by the name of its module."""
     folder, _, name = module.name.rpartition(".")
     return folder == "marey_motion.formats" and node.name in (f"read_{name}", f"write_{name}")

@@ -107,6 +107,23 @@ def test_a_small_module_with_one_importer_belongs_into_it() -> None:
     assert not list(small_modules.find(house(modules)))
 
 
+@pytest.mark.parametrize(
+    "users",
+    [
+        {"marey_x.kinds": f'KIND = "marey_x.small:run"\n{LONG}'},
+        {"marey_x.lazy": f'LATER = "marey_x.small"\n{LONG}'},
+    ],
+    ids=["function", "module"],
+)
+def test_a_small_module_that_is_loaded_by_name_stays(users: dict[str, str]) -> None:
+    assert not list(small_modules.find(house({"marey_x.small": "", **users})))
+
+
+def test_a_small_module_of_a_file_format_stays() -> None:
+    small = {"marey_motion.formats.toy": "def read_toy(): ...\n", "marey_motion.formats.toys": "def read_toy(): ...\n"}
+    assert [one.subject for one in small_modules.find(house(small))] == ["marey_motion.formats.toys"]
+
+
 def test_two_classes_of_one_name_are_found_with_both_places() -> None:
     (offence,) = class_names.find(house({"marey_x.a": "class Take: ...\n", "marey_y.b": "\nclass Take: ...\n"}))
     assert (offence.subject, offence.line) == ("Take", 2)
