@@ -21,7 +21,16 @@ from lint import (
     unused,
     wording,
 )
-from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, read_exceptions, shown, shrink_baseline
+from lint.exceptions import (
+    EXCEPTIONS,
+    apply_baseline,
+    apply_exceptions,
+    line_of,
+    read_baseline,
+    read_exceptions,
+    shown,
+    shrink_baseline,
+)
 from lint.sources import House, Offence, read_house
 
 ROOT = Path(__file__).parent.parent
@@ -44,7 +53,8 @@ def check(house: House, root: Path) -> Iterator[tuple[str, Offence]]:
     """Yield every offence that has no exception, with the name of its rule."""
     reasons = read_exceptions()
     for rule in reasons.keys() - RULES.keys():
-        yield "exceptions", Offence(root, 1, rule, f"no rule is called {rule}")
+        message = f"no rule is called {rule}; remove the table, or name one of {', '.join(RULES)}"
+        yield "exceptions", Offence(EXCEPTIONS, line_of(f"[{rule}]", EXCEPTIONS), rule, message)
     for name, find in RULES.items():
         yield from ((name, one) for one in apply_exceptions(name, find(house), reasons.get(name, {})))
     yield from (("wording", one) for one in apply_baseline(wording.find(house), read_baseline(), root))

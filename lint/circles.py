@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 
-from lint.sources import House, Offence
+from lint.sources import House, Offence, imported_by
 
 
 def find(house: House) -> Iterator[Offence]:
@@ -16,5 +16,8 @@ def find(house: House) -> Iterator[Offence]:
         circle = list(reversed(error.args[1][1:]))
         first = circle.index(min(circle))
         circle = [*circle[first:], *circle[:first], circle[first]]
-        message = f"modules import each other: {' -> '.join(circle)}"
-        yield Offence(house.modules[circle[0]].path, 1, circle[0], message)
+        message = f"modules import each other: {' -> '.join(circle)}; move what both ends need into another module"
+        module = house.modules[circle[0]]
+        imports = (node for node in module.nodes if circle[1] in imported_by(node, house.modules))
+        line = next(getattr(node, "lineno", 1) for node in imports)
+        yield Offence(module.path, line, circle[0], message)

@@ -19,4 +19,6 @@ def find(house: House) -> Iterator[Offence]:
     for name, places in sorted(found.items()):
         for module, line in places[1:]:
             first, first_line = places[0]
-            yield Offence(module.path, line, name, f"class {name} is also in {first.name}, line {first_line}")
+            yield Offence(
+                module.path, line, name, f"class {name} is also in {first.name}, line {first_line}; rename one"
+            )

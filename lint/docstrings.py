@@ -48,17 +48,17 @@ def problem_of(function: Function) -> str:
     """Return a description of the first thing that a function's docstring lacks; empty if nothing is missing."""
     text = ast.get_docstring(function) or ""
     if not text:
-        return "has no docstring"
+        return "has no docstring; write one"
     sections = {match[1]: match[2] for match in _SECTION.finditer(text)}
     listed = re.findall(r"\w+", " ".join(_NAMES.findall(sections.get("Parameters", ""))))
     given = _parameters(function)
     if missing := [name for name in given if name not in listed]:
-        return f"does not document {', '.join(missing)} under Parameters"
+        return f"does not document {', '.join(missing)} under Parameters; add the entry"
     if unknown := [name for name in listed if name not in given]:
-        return f"documents {', '.join(unknown)}, which it does not take"
+        return f"documents {', '.join(unknown)}, which it does not take; remove the entry"
     result = ast.unparse(function.returns) if function.returns else "None"
     if result not in ("None", "NoReturn") and not sections.keys() & {"Returns", "Yields"}:
-        return "does not document what it returns under Returns"
+        return "does not document what it returns under Returns; add the section"
     return ""
 
 

@@ -31,7 +31,18 @@ def apply_exceptions(rule: str, offences: Iterable[Offence], reasons: Mapping[st
         if not fitting:
             yield offence
     for subject in sorted(unused):
-        yield Offence(EXCEPTIONS, 1, subject, f"the exception {rule}.{subject!r} is not needed any more; remove it")
+        yield Offence(
+            EXCEPTIONS,
+            line_of(f'"{subject}"', EXCEPTIONS),
+            subject,
+            f"the exception {rule}.{subject!r} is not needed any more; remove it",
+        )
+
+
+def line_of(beginning: str, path: Path) -> int:
+    """Return the number of the first line of a file that begins with a text; 1 if there is none."""
+    lines = path.read_text("utf-8").splitlines()
+    return next((number for number, line in enumerate(lines, 1) if line.startswith(beginning)), 1)
 
 
 def read_baseline(path: Path = BASELINE) -> dict[str, int]:
@@ -53,7 +64,7 @@ def apply_baseline(offences: Iterable[Offence], allowed: Mapping[str, int], root
             yield from found
         elif len(found) < most:
             message = f"{name} has {len(found)} offences, not {most}: run `python -m lint --shrink`"
-            yield Offence(BASELINE, 1, name, message)
+            yield Offence(BASELINE, line_of(f'"{name}"', BASELINE), name, message)
 
 
 def shrink_baseline(offences: Iterable[Offence], root: Path, path: Path = BASELINE) -> None:

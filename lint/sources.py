@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -110,15 +110,19 @@ class House:
         return found
 
 
-def _imported(module: Module, known: dict[str, Module]) -> Iterator[str]:
-    for node in module.nodes:
-        if isinstance(node, ast.ImportFrom) and node.module:
-            for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                if (target := inner if inner in known else node.module) in known:
-                    yield target
-        elif isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names if alias.name in known)
+def _imported(module: Module, known: Container[str]) -> Iterator[str]:
+    return (name for node in module.nodes for name in imported_by(node, known))
+
+
+def imported_by(node: ast.AST, known: Container[str]) -> Iterator[str]:
+    """Yield the names of the modules that a statement imports and that are in `known`."""
+    if isinstance(node, ast.ImportFrom) and node.module:
+        for alias in node.names:
+            inner = f"{node.module}.{alias.name}"
+            if (target := inner if inner in known else node.module) in known:
+                yield target
+    elif isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names if alias.name in known)
 
 
 def read_house(root: Path) -> House:

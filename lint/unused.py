@@ -37,7 +37,10 @@ def find(house: House) -> Iterator[Offence]:
         for name, node in module.definitions:
             if not (named[node.name] or _is_entry(node) or is_of_format(module, node)):
                 yield Offence(
-                    module.path, node.lineno, f"{module.name}.{name}", f"{name} is used by tests only, or by nothing"
+                    module.path,
+                    node.lineno,
+                    f"{module.name}.{name}",
+                    f"{name} is used by tests only, or by nothing; remove it",
                 )
             if not isinstance(node, ast.ClassDef):
                 yield from _unused_locals(module, name, node)
@@ -46,7 +49,10 @@ def find(house: House) -> Iterator[Offence]:
                 variable = variables[0]
                 subject = f"{module.name}.{variable.id}"
                 yield Offence(
-                    module.path, variable.lineno, subject, f"{variable.id} is used by tests only, or by nothing"
+                    module.path,
+                    variable.lineno,
+                    subject,
+                    f"{variable.id} is used by tests only, or by nothing; remove it",
                 )
 
 
@@ -68,7 +74,9 @@ def _unused_locals(module: Module, name: str, outer: Function) -> Iterator[Offen
     named = {node.id for node in ast.walk(outer) if isinstance(node, ast.Name)} if inner else set()
     for node in inner:
         if node.name not in named and not node.decorator_list:
-            yield Offence(module.path, node.lineno, f"{module.name}.{name}.{node.name}", f"{node.name} is not used")
+            yield Offence(
+                module.path, node.lineno, f"{module.name}.{name}.{node.name}", f"{node.name} is not used; remove it"
+            )
 
 
 def _locals(node: ast.AST) -> Iterator[Function]:

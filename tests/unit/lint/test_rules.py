@@ -20,7 +20,13 @@ from lint import (
 )
 from lint.__main__ import RULES, check
 from lint.commit_subject import faults_of
-from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, shrink_baseline
+from lint.exceptions import (
+    EXCEPTIONS,
+    apply_baseline,
+    apply_exceptions,
+    read_baseline,
+    shrink_baseline,
+)
 from lint.sample import draw
 from lint.sources import House, Module, Offence
 
@@ -50,13 +56,19 @@ def messages(offences: Iterator[Any]) -> list[str]:
 def test_modules_that_import_each_other_are_found(back: str) -> None:
     circle = house({"marey_x.a": "from marey_x import b\n", "marey_x.b": "import marey_x.c\n", "marey_x.c": back})
     (offence,) = circles.find(circle)
-    assert offence.message.endswith("marey_x.a -> marey_x.b -> marey_x.c -> marey_x.a")
+    assert "marey_x.a -> marey_x.b -> marey_x.c -> marey_x.a; move" in offence.message
+
+
+def test_a_circle_has_the_line_of_its_first_import() -> None:
+    circle = house({"marey_x.a": "import ast\nfrom marey_x import b\n", "marey_x.b": "import marey_x.a\n"})
+    (offence,) = circles.find(circle)
+    assert (offence.path.name, offence.line) == ("a.py", 2)
 
 
 def test_a_circle_through_two_packages_is_found() -> None:
     circle = house({"marey_x.a": "import marey_y.b\n", "marey_y.b": "def f():\n    from marey_x import a\n"})
     (offence,) = circles.find(circle)
-    assert offence.message.endswith("marey_x.a -> marey_y.b -> marey_x.a")
+    assert "marey_x.a -> marey_y.b -> marey_x.a; move" in offence.message
 
 
 def test_modules_that_import_downwards_are_no_circle() -> None:
@@ -78,10 +90,13 @@ WITHOUT_RESULT = NUMPYDOC.format("angle : float    radians").partition("    Retu
 @pytest.mark.parametrize(
     ("docstring", "fault"),
     [
-        ("", "turned has no docstring"),
-        ('"""Turn."""', "turned does not document angle under Parameters"),
-        (NUMPYDOC.format("axis : str\n    angle : float"), "turned documents axis, which it does not take"),
-        (WITHOUT_RESULT, "turned does not document what it returns under Returns"),
+        ("", "turned has no docstring; write one"),
+        ('"""Turn."""', "turned does not document angle under Parameters; add the entry"),
+        (
+            NUMPYDOC.format("axis : str\n    angle : float"),
+            "turned documents axis, which it does not take; remove the entry",
+        ),
+        (WITHOUT_RESULT, "turned does not document what it returns under Returns; add the section"),
     ],
 )
 def test_a_function_of_the_library_documents_what_it_takes_and_returns(docstring: str, fault: str) -> None:
@@ -371,15 +386,17 @@ def test_a_migration_of_an_unknown_phase_is_found() -> None:
 
 
 def test_the_command_checks_every_rule() -> None:
-    """Plant an offence for each rule."""
+    """Plant an offence for each rule; each message has a remedy after a semicolon or a colon."""
     text = "import marey_motion.b\nMOST = 3\nWORDS = ('one', 'two', 'three')\nclass Take: ...\ndef turned(): ...\n"
     planted = {f"marey_x.m{number}": "" for number in range(26)}
     planted |= {"marey_motion.a": text.replace("n.b", "n.a2"), "marey_motion.a2": text.replace("n.b", "n.a")}
     planted |= {"marey_motion.long": "x = 'what becomes of it'\n" * 401}
     modules = house(planted).modules
     migration = {ROOT / "migrations" / "versions" / "0099_next.py": "phase = 'befor'\n"}
-    found = {rule for rule, _ in check(House(modules, {}, migration), ROOT)}
-    assert found >= {*RULES, "wording"}
+    found = list(check(House(modules, {}, migration), ROOT))
+    assert {rule for rule, _ in found} >= {*RULES, "wording"}
+    without_remedy = {rule for rule, offence in found if not any(sign in offence.message for sign in ("; ", ": "))}
+    assert not without_remedy
 
 
 def test_an_exception_with_a_reason_lets_one_offence_pass_and_is_reported_when_nothing_needs_it() -> None:
@@ -387,6 +404,22 @@ def test_an_exception_with_a_reason_lets_one_offence_pass_and_is_reported_when_n
     assert [one.subject for one in apply_exceptions("lengths", offences, {"marey_x.*": "a table"})] == ["marey_y.b"]
     (left,) = apply_exceptions("lengths", [], {"marey_x.a": "a table"})
     assert "not needed any more" in left.message
+
+
+def test_an_exception_that_is_not_needed_is_reported_with_its_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "exceptions.toml"
+    path.write_text('[lengths]\n"marey_x.a" = "a table"\n', "utf-8")
+    monkeypatch.setattr("lint.exceptions.EXCEPTIONS", path)
+    (left,) = apply_exceptions("lengths", [], {"marey_x.a": "a table"})
+    assert (left.path, left.line) == (path, 2)
+
+
+def test_exceptions_of_an_unknown_rule_are_reported_in_their_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lint.__main__.read_exceptions", lambda: {"ghosts": {}})
+    (offence,) = (one for rule, one in check(house({}), ROOT) if rule == "exceptions")
+    assert (offence.path, offence.message.partition(";")[0]) == (EXCEPTIONS, "no rule is called ghosts")
 
 
 def test_the_baseline_of_the_wording_only_shrinks(tmp_path: Path) -> None:
