@@ -169,6 +169,8 @@ class Children:
         self._idle: set[int] = set()
         """Numbers of the children that wait for a task."""
         self._closed = False
+        self._generation = 0
+        """Number of renewals; a child that was started before the last renewal gets no further task."""
         self._memory_kills = count_memory_kills()
 
     @property
@@ -232,6 +234,12 @@ class Children:
             while not self._closed and len(self._threads) < self.limits.children_each:
                 self._start_thread()
 
+    def renew(self) -> None:
+        """Replace all children, those with a task when it ends, so that no child keeps data of earlier tasks."""
+        with self._changed:
+            self._generation += 1
+            self._changed.notify_all()
+
     def close(self) -> None:
         """Kill all children; their tasks and all waiting tasks fail."""
         with self._changed:
@@ -263,9 +271,15 @@ class Children:
     # -- the thread of one child --
 
     def _work(self, number: int) -> None:
-        """Run tasks in one child until the pool is closed. A child that has ended is replaced at once."""
-        child, orders = self._started(), 0
-        while (task := self._next_task(number)) is not None:
+        """Run tasks in one child after the other until the pool is closed."""
+        while not self._closed:
+            self._use_child(number)
+
+    def _use_child(self, number: int) -> None:
+        """Start a child, and run tasks in it until it is replaced; a child that has ended is replaced at once."""
+        generation = self._generation
+        child, orders, usable = self._started(), 0, True
+        while usable and (task := self._next_task(number, generation)) is not None:
             if child is None or not child.alive:
                 _discard(child)
                 child, orders = self._started(), 0
@@ -278,9 +292,6 @@ class Children:
                 if usable:
                     self._idle.add(number)
                 self._changed.notify_all()
-            if child is not None and not usable:
-                _discard(child)
-                child, orders = None if self._closed else self._started(), 0
         _discard(child)
 
     def _started(self) -> ConnectedChild | None:
@@ -292,14 +303,14 @@ class Children:
                 log.error("a child process cannot be started: %s", error)
             return None
 
-    def _next_task(self, number: int) -> ChildTask[Any] | None:
-        """Wait for the next task of the child with this number; None if the pool is closed.
+    def _next_task(self, number: int, generation: int) -> ChildTask[Any] | None:
+        """Wait for the next task of the child with this number; None if the pool is closed or renewed.
 
         A task goes to the idle child with the lowest number, whose caches most likely contain what the task needs.
         """
         with self._changed:
             self._idle.add(number)
-            while not self._closed:
+            while not self._closed and generation == self._generation:
                 eligible = self._eligible()
                 if len(eligible) > sum(other < number for other in self._idle):
                     using = Counter(task.caller for task in self._running)
@@ -311,6 +322,7 @@ class Children:
                     self._turns[task.caller] = self._turn
                     return task
                 self._changed.wait()
+            self._idle.remove(number)
         return None
 
     def _perform(self, task: ChildTask[Any], child: ConnectedChild) -> bool:

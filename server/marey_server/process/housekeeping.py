@@ -198,9 +198,13 @@ async def _collect_garbage(services: Services, holder: str) -> None:
 
 
 async def _remove_index_copies(services: Services, _holder: str) -> None:
-    """Remove this server's copies of index files that were deleted from the store, for example after a purge."""
+    """Remove this server's copies of index files that were deleted from the store, for example after a purge.
+
+    Child processes that have searched these files keep them mapped into memory, so they are replaced.
+    """
     removed = await _in_thread(services, services.database.read, SYSTEM, services.index_files.remove_unstored)
     if removed:
+        services.children.renew()
         log.info("removed the copies of %d files of indexes that are no longer stored", removed)
 
 

@@ -85,6 +85,23 @@ def test_of_idle_children_the_first_one_gets_the_next_order(children: Children, 
     assert used < processes
 
 
+def test_a_renewed_pool_replaces_idle_children_at_once_and_busy_ones_when_their_task_ends(
+    children: Children, tmp_path: Path
+) -> None:
+    tasks = [wait_for(children, tmp_path, name, caller=name) for name in ("otto", "olga")]
+    busy, idle = (psutil.Process(int((tmp_path / name).read_text())) for name in ("otto", "olga"))
+    let_go(tmp_path, "olga")
+    tasks[1].future.result(PATIENCE_S)
+    wait_until(lambda: children.sizes == (1, 0))
+    children.renew()
+    wait_until(lambda: not idle.is_running())
+    assert busy.is_running()
+    let_go(tmp_path, "otto")
+    assert tasks[0].future.result(PATIENCE_S) == b"waited"
+    wait_until(lambda: not busy.is_running())
+    assert process_id(children) not in (busy.pid, idle.pid)
+
+
 def test_no_child_sees_a_secret(children: Children) -> None:
     seen = run(children, "environment").decode()
     assert "PATH=" in seen
