@@ -6,6 +6,7 @@ time; see `require_room_for_jobs`.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,9 +29,6 @@ from marey_server.store.tables import (
     user,
 )
 from marey_server.store.transaction import Transaction
-
-_ENDLESS = 2**62
-"""Limit that no number of jobs reaches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +105,7 @@ def require_room_for_jobs(tx: Transaction, more: int) -> None:
 
 def note_jobs(tx: Transaction, user_id: str, more: int) -> None:
     """Note that a user has `more` unfinished jobs, even if this exceeds the quota `user_jobs`."""
-    tx.run(_ADD_JOBS, {"of_user": user_id, "more": more, "most": _ENDLESS})
+    tx.run(_ADD_JOBS, {"of_user": user_id, "more": more, "most": sys.maxsize})
 
 
 def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
