@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import signal
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
-from tests.support.patience import PATIENCE_S
+from tests.support.patience import PATIENCE_S, wait_until
+from tests.support.rest_server import stored_file
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 from tests.support.short_walks import write_short_walks
 from tests.support.tiers import is_soak
@@ -24,6 +27,7 @@ from marey_motion.gait import game_skeleton
 from marey_schemas.access import ProjectCreate
 from marey_schemas.queue.jobs import JobState
 from marey_schemas.queue.pipelines import PipelineCreate
+from marey_server.store.jobs.propagation import MOST_AT_ONCE
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -142,6 +146,30 @@ def test_a_server_killed_where_a_pipeline_is_handed_in_has_all_of_it_or_nothing(
         start_worker("steady")
         run.wait(timeout_s=PATIENCE_S)
         assert_made_once(marey.project("lab"), run, few_takes)
+    server.check_database()
+
+
+@pytest.mark.parametrize("place", ["propagation.before_commit@2", "propagation.after_commit@2"])
+def test_a_server_killed_while_the_dependants_of_a_cancelled_job_end_goes_on_with_the_others(
+    server: ServerProcess, place: str
+) -> None:
+    server.start(fault=f"{place}:kill")
+    api = {"base_url": f"{server.url}/api/v1", "headers": {"Authorization": f"Bearer {server.token}"}}
+    with httpx.Client(**api, timeout=PATIENCE_S) as client:
+        assert client.post("/projects", json={"name": "lab"}).is_success
+        file = {"name": "take.bvh", "blob": stored_file(client, b"HIERARCHY")["blob"]}
+        request = {"kind": "import", "params": {"files": [file]}}
+        root = client.post("/projects/lab/jobs", json=request).raise_for_status().json()["id"]
+        dependants = [{**request, "after": [root]}] * (4 * MOST_AT_ONCE)
+        client.post("/projects/lab/jobs/batch", json={"jobs": dependants}).raise_for_status()
+        last = client.post("/projects/lab/jobs", json={**request, "after": [root]}).raise_for_status().json()["id"]
+        assert client.post(f"/jobs/{root}/cancel").raise_for_status().json()["state"] == "cancelled"
+        assert server.wait_until_dead() == -signal.SIGKILL
+        server.start()
+        wait_until(lambda: client.get(f"/jobs/{last}").json()["state"] == "failed")
+    with server.client() as marey:
+        jobs = list(marey.jobs.list("lab", limit=1000))
+        assert Counter(job.state for job in jobs) == {JobState.CANCELLED: 1, JobState.FAILED: len(dependants) + 1}
     server.check_database()
 
 

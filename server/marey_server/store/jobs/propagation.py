@@ -21,6 +21,7 @@ from sqlalchemy import Row, and_, bindparam, false, func, null, select, update
 from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_schemas.queue.jobs import JobState
 from marey_schemas.sizes import batched
+from marey_server import faults
 from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.jobs import late_inputs, result_cache
 from marey_server.store.jobs.endings import ENDED_COLUMNS, Ended, as_ended, dependency_failure, end_jobs
@@ -81,6 +82,8 @@ def propagate_rest(tx: Transaction) -> bool:
         unmoved, queue = _propagate(tx, ended, required=len(ended), most=further)
     _leave(tx, unmoved, announced=True, rank=rank)
     _leave(tx, queue, announced=False)
+    faults.point("propagation.before_commit")
+    tx.after_commit(lambda: faults.point("propagation.after_commit"))
     return True
 
 
