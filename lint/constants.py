@@ -1,6 +1,7 @@
 """Rule: a constant is declared once, so no two modules give the same name the same value.
 
-Leading underscores of names do not count, and `1 << 20` and `1048576` are the same value.
+Leading underscores of names do not count. `1 << 20`, `1048576` and `1024 * KIB` are the same value, if the module also
+declares `KIB = 1024`.
 """
 
 from __future__ import annotations
@@ -33,13 +34,15 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def _constants(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """Yield name, value and line of each constant: a name in capitals with a value that needs no other name."""
+    """Yield name, value and line of each constant: a name in capitals with a literal or calculated value."""
+    numbers: dict[str, Any] = {}
     for node in tree.body:
         if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
             continue
         for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
             for name, value in _pairs(target, node.value):
-                if isinstance(name, ast.Name) and name.id.isupper() and (known := _value(value)):
+                if isinstance(name, ast.Name) and name.id.isupper() and (known := _value(value, numbers)):
+                    numbers[name.id] = _number(value, numbers)
                     yield name.id, known, node.lineno
 
 
@@ -50,29 +53,34 @@ def _pairs(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.expr, ast.ex
         yield target, value
 
 
-def _value(node: ast.expr) -> str:
+def _value(node: ast.expr, numbers: Mapping[str, Any]) -> str:
     """Return the value of a literal, or of a calculation with numbers; empty if it is something else."""
-    if (number := _number(node)) is not None:
+    if (number := _number(node, numbers)) is not None:
         return repr(number)
     match node:
         case ast.Name(id=name) if name.isupper():
             return name
         case ast.Call(func=ast.Name(id="frozenset"), args=[elements]):
-            return f"frozenset({known})" if (known := _value(elements)) else ""
+            return f"frozenset({known})" if (known := _value(elements, numbers)) else ""
     try:
         return repr(ast.literal_eval(node))
     except (ValueError, TypeError):  # TypeError: a list as a key
         return ""
 
 
-def _number(node: ast.expr) -> Any:
-    """Return the number that a literal or a calculation with numbers gives; None if it is something else."""
+def _number(node: ast.expr, numbers: Mapping[str, Any]) -> Any:
+    """Return the number that a literal or a calculation gives; None if it is something else.
+
+    `numbers` are the numbers that the module has declared before, by name.
+    """
     match node:
+        case ast.Name(id=name):
+            return numbers.get(name)
         case ast.Constant(value=int() | float() as number):
             return number
-        case ast.UnaryOp(op=ast.USub(), operand=operand) if (number := _number(operand)) is not None:
+        case ast.UnaryOp(op=ast.USub(), operand=operand) if (number := _number(operand, numbers)) is not None:
             return -number
         case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _CALCULATIONS:
-            numbers = _number(left), _number(right)
-            return None if None in numbers else _CALCULATIONS[type(operator)](*numbers)
+            pair = _number(left, numbers), _number(right, numbers)
+            return None if None in pair else _CALCULATIONS[type(operator)](*pair)
     return None

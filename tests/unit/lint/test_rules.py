@@ -247,8 +247,9 @@ def test_letters_are_no_words() -> None:
         "LONGEST_BYTES: Final = 1048576\n",
         "_LONGEST_BYTES = 1 << 20\n",
         "LONGEST_BYTES = 1024 * 1024\n",
+        "PIECE = 1024\nLONGEST_BYTES = 1024 * PIECE\n",
     ],
-    ids=["one of several", "with a type", "private", "calculated"],
+    ids=["one of several", "with a type", "private", "calculated", "calculated from another"],
 )
 def test_a_constant_that_two_modules_declare_is_found(copy: str) -> None:
     (offence,) = constants.find(house({"marey_x.a": "LONGEST_BYTES = 1_048_576\n", "marey_y.b": copy}))
