@@ -116,7 +116,8 @@ def list_collections(
         *_children(directly_in, name),
         collection.c.deleted_us.is_not(None) if deleted else _ALIVE,
     )
-    identity = ["collections", project_row.id, path, directly_in, name, deleted]
+    newer = () if directly_in is None else (directly_in, name)  # without them, cursors of version 0.1 are valid
+    identity = ["collections", project_row.id, path, deleted, *newer]
     rows, next_cursor = listing.read_page(tx, statement, order, identity, cursor, limit)
     rights = rights_shown(tx, project_row)
     return Page(items=tuple(_document(project_row, rights, row) for row in rows), next_cursor=next_cursor)

@@ -1,5 +1,7 @@
 """Lists of items: filters, order, cursors."""
 
+import base64
+import json
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
@@ -11,13 +13,18 @@ from tests.support.kept_rows import made_once
 from tests.support.store_fixtures import Lab
 from tests.support.tiers import examples
 
+from marey_schemas.access import TokenCreate
 from marey_schemas.items import Page
 from marey_schemas.kinds import Kind
+from marey_server.access.principal import SYSTEM
 from marey_server.errors import BadRequestProblem, InvalidProblem
-from marey_server.store import items
-from marey_server.store.credentials import server_key
+from marey_server.store import collections, items, listing, projects, users
+from marey_server.store.credentials import server_key, tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters
+from marey_server.store.items.listing import SORT_KEYS
+from marey_server.store.tables import collection as collection_table
+from marey_server.store.tables import token
 from marey_server.store.transaction import Transaction
 
 pytestmark = pytest.mark.every_database
@@ -196,6 +203,61 @@ def test_a_cursor_serves_only_the_list_it_came_from(filled: FilledLab) -> None:
     ):
         with pytest.raises(BadRequestProblem):
             wrong()
+
+
+FILTERS_OF_0_1: dict[str, Any] = {
+    **dict.fromkeys(("collection", "directly_in", "path", "name", "exact_name", "skeleton", "clip", "q")),
+    "frames_gte": None,
+    "frames_lte": None,
+    "tags": (),
+    "deleted": False,
+}
+
+
+def old_cursor(tx: Transaction, cursor: str, order: listing.Order, identity: list[Any]) -> str:
+    """Return the cursor that version 0.1 made for a list at the place of `cursor`."""
+    payload = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
+    return listing.make_cursor(tx, order, identity, json.loads(payload[listing._MAC_BYTES :])[2])
+
+
+def test_cursors_of_version_0_1_continue_a_list_of_items(filled: FilledLab) -> None:
+    def found(tx: Transaction) -> tuple[Page, Page]:
+        order = listing.parse_order("name", SORT_KEYS)
+        first = items.list_items(tx, "lab", Kind.CLIP, sort="name", limit=2)
+        identity = [projects.require(tx, "lab").id, "clip", FILTERS_OF_0_1]
+        cursor = old_cursor(tx, str(first.next_cursor), order, identity)
+        rest = items.list_items(tx, "lab", Kind.CLIP, sort="name", cursor=cursor)
+        return first, rest
+
+    first, rest = filled.read(found)
+    assert sorted(one.name for one in (*first.items, *rest.items)) == sorted(name for name, *_ in CLIPS)
+
+
+def test_cursors_of_version_0_1_continue_a_list_of_folders(filled: FilledLab) -> None:
+    def found(tx: Transaction) -> tuple[Page, Page]:
+        order = listing.parse_order("path", {"path": collection_table.c.path, "id": collection_table.c.id})
+        first = collections.list_collections(tx, "lab", limit=2)
+        identity = ["collections", projects.require(tx, "lab").id, "", False]
+        cursor = old_cursor(tx, str(first.next_cursor), order, identity)
+        return first, collections.list_collections(tx, "lab", cursor=cursor)
+
+    first, rest = filled.read(found)
+    paths = [one.path for one in (*first.items, *rest.items)]
+    assert paths == sorted(set(paths))
+    assert {"raw", "raw/a", "raw/a/x", "raw/b", "rawer"} <= set(paths)
+
+
+def test_cursors_of_version_0_1_continue_a_list_of_tokens(database: Database) -> None:
+    database.write(SYSTEM, users.ensure_first_administrator)
+    owner = database.read(SYSTEM, users.administrator_principal)
+    made = [database.write(owner, tokens.create_token, TokenCreate(name="mine")).id for _ in range(3)]
+
+    def found(tx: Transaction) -> Page:
+        order = listing.parse_order("-id", {"id": token.c.id})
+        cursor = str(tokens.list_tokens(tx, limit=1).next_cursor)
+        return tokens.list_tokens(tx, cursor=old_cursor(tx, cursor, order, ["tokens", owner.user_id]))
+
+    assert [one.id for one in database.read(owner, found).items] == sorted(made)[1::-1]
 
 
 def test_cursors_of_one_server_are_worth_nothing_on_another(filled: FilledLab) -> None:

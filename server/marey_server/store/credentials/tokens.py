@@ -267,7 +267,8 @@ def list_tokens(
         conditions.append(token.c.expires_us.between(tx.now_us, tx.now_us + wanted.ends_within_s * 1_000_000))
     order = listing.parse_order("-id", {"id": token.c.id})
     statement = select(token, user.c.name.label("user_name")).join(user, user.c.id == token.c.user_id)
-    identity = ["tokens", own_id, *map(str, wanted)]
+    # Without filters, cursors of version 0.1 are valid.
+    identity = ["tokens", own_id, *(() if wanted == OWN_TOKENS else map(str, wanted))]
     rows, next_cursor = listing.read_page(tx, statement.where(*conditions), order, identity, cursor, limit)
     return Page(items=tuple(shown(row, row.user_name) for row in rows), next_cursor=next_cursor)
 

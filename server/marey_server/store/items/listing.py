@@ -65,6 +65,16 @@ class ItemFilters:
         """
         return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The filters as the cursors of a list contain them.
+
+        Without newer filters, they are the same as in version 0.1, so that its cursors stay valid after an upgrade.
+        """
+        found = {"exact_name": None, **asdict(replace(self, alike={}))}  # a filter that only version 0.1 had
+        newer = () if self.query else ("query",)
+        return {name: value for name, value in found.items() if name not in ("alike", *newer)}
+
 
 def list_items(
     tx: Transaction,
@@ -89,7 +99,7 @@ def list_items(
         )
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)
-    identity = [project_row.id, kind.value, asdict(replace(filters, alike={}))]
+    identity = [project_row.id, kind.value, filters.identity]
     conditions = _fast_conditions(tx, project_row.id, filters, kind, order)
     total = None
     if count:
