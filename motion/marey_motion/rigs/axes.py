@@ -6,8 +6,8 @@ hinge. The swing axis of an arm turns with the arm when the arm is raised sidewa
 swing axis of the left arm points up, and that of the right arm points down.
 
 The twist can usually be computed from offsets alone. The swing of a limb can be computed from the rest pose only if the
-rest pose is that of a standing body. In many files all bones are on one line at rest; the swing is then determined from
-a motion.
+rest pose is that of a standing body. In many files all bones are on one line at rest. The axes of a known rig are then
+those that the rig always has (`conventions`); only the axes of an unknown rig are determined from a motion.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError
+from marey_motion.rigs.conventions import conventional_axes
 from marey_motion.rigs.mapping import JointMapping
 from marey_motion.rigs.standard import CENTRE_JOINTS, FINGERS, SIDES, STANDARD_JOINTS
 from marey_motion.skeleton import Skeleton, same_hierarchy
@@ -94,9 +95,9 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
     ----------
     skeleton : Skeleton    the joints
     mapping : JointMapping    standard names of the skeleton's joints; hips or shoulders of both sides are needed
-    motion : Clip, optional    a clip of the skeleton in which the body moves. The clip is used only for the parts that
-        `rest_pose_doubts` names; without a motion, the swing axes of these parts are guesses on which retargeting
-        should not rely.
+    motion : Clip, optional    a clip of the skeleton in which the body moves. The clip is used only for the joints that
+        `axes_from_motion` names; without a motion, the axes of these joints are guesses on which retargeting should
+        not rely.
 
     Returns
     -------
@@ -117,13 +118,73 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
     """
     rest = _resting_body(skeleton, mapping)
     moving = rest if motion is None else _moving_body(skeleton, motion, rest.joints)
+    conventional = _conventional(rest, mapping)
     axes = {}
     for standard in (name for name in STANDARD_JOINTS if name in rest.joints):
-        body = rest if _part(standard) in rest.readable_parts else moving
-        twist = _twist(standard, body)
-        swing = body.in_joint(standard, _swing(standard, body))
+        if standard in conventional:
+            twist, swing = conventional[standard]
+        else:
+            body = rest if _part(standard) in rest.readable_parts else moving
+            twist = _twist(standard, body)
+            swing = body.in_joint(standard, _swing(standard, body))
         axes[skeleton.joint_names[rest.joints[standard]]] = JointAxes(_triple(twist), _triple(_across(swing, twist)))
     return axes
+
+
+def axes_from_motion(skeleton: Skeleton, mapping: JointMapping) -> frozenset[str]:
+    """List the joints whose axes only a motion shows, because neither the rest pose nor the names of a known rig do.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    the joints
+    mapping : JointMapping    its standard joints
+
+    Returns
+    -------
+    frozenset of str    joint names; a root that is not also the pelvis is left out, because no bone defines its axes
+
+    Raises
+    ------
+    MappingError    if the mapping lacks the joints that define left and up, or if joints of an arm coincide
+    """
+    rest = _resting_body(skeleton, mapping)
+    known = _conventional(rest, mapping)
+    return frozenset(
+        mapping.joints[standard]
+        for standard in rest.joints
+        if standard != "root" and standard not in known and _part(standard) not in rest.readable_parts
+    )
+
+
+def doubtful_joints(skeleton: Skeleton, mapping: JointMapping) -> frozenset[str]:
+    """List the joints of the parts of the body that `rest_pose_doubts` names.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    the joints
+    mapping : JointMapping    its standard joints
+
+    Returns
+    -------
+    frozenset of str    joint names
+
+    Raises
+    ------
+    MappingError    if the mapping lacks the joints that define left and up, or if joints of an arm coincide
+    """
+    rest = _resting_body(skeleton, mapping)
+    return frozenset(mapping.joints[name] for name in rest.joints if _part(name) not in rest.readable_parts)
+
+
+def _conventional(rest: _PosedBody, mapping: JointMapping) -> dict[str, tuple[Floats, Floats]]:
+    """Find the axes that a known rig gives the joints of those parts that its rest pose does not show."""
+    names = (name for name in STANDARD_JOINTS if name in rest.joints)
+    doubtful = [name for name in names if _part(name) not in rest.readable_parts]
+    if not doubtful:
+        return {}
+    ends = {name: end for name in doubtful if (end := bone_end(name, rest.joints)) is not None}
+    known = conventional_axes(rest.skeleton, mapping.rig, rest.joints, ends)
+    return {name: known[name] for name in doubtful if name in known}
 
 
 def bone_end(standard: str, joints: Collection[str]) -> str | None:

@@ -14,7 +14,7 @@ from marey_motion import kinematics, quaternions
 from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError
-from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
+from marey_motion.rigs import JointMapping, axes_from_motion, guess_axes, map_joints, rest_pose_doubts
 from marey_motion.rigs.axes import JointAxes
 from marey_motion.skeleton import EndSite, Skeleton
 
@@ -292,3 +292,45 @@ def test_in_a_real_walk_bones_point_down_and_hinges_point_left_on_every_rig(moca
     for joint in ("pelvis", "spine_2", "head"):
         assert mean_along(joint, "twist", Y) > 0.85
         assert mean_along(joint, "swing", left) > 0.9
+
+
+FOLDED = {
+    "bandai-namco": "bandai-namco-2/dataset-2_walk-turn-left_normal_003.bvh",
+    "game-engine": "rigs/game-engine/custom_skeleton_walk_example.bvh",
+    "geno": "rigs/geno/Geno_stance.bvh",
+    "mh-cmu": "rigs/game-engine/vis_example.bvh",
+    "reallusion": "cmu-iclone-bvh/002_01.bvh",
+}
+STEADY = ("hip", "knee", "shoulder")
+
+
+@pytest.mark.parametrize("rig", FOLDED)
+def test_the_stated_axes_of_a_known_rig_are_those_that_its_hinges_show(mocap: Path, rig: str) -> None:
+    from marey_motion.formats import read_motion
+
+    path = mocap / FOLDED[rig]
+    clip = present(read_motion(path.read_bytes(), path.name).clip)
+    mapping = map_joints(clip.skeleton)
+    assert mapping.rig == rig
+    assert rest_pose_doubts(clip.skeleton, mapping)
+    assert axes_from_motion(clip.skeleton, mapping) == frozenset()
+
+    stated = guess_axes(clip.skeleton, mapping)
+    moved = guess_axes(clip.skeleton, mapping, clip)
+    assert all(moved[joint] == stated[joint] for name, joint in mapping.joints.items() if name != "root")
+    shown = guess_axes(clip.skeleton, replace(mapping, rig=None), clip)
+    for joint in (mapping.joints[f"{side}_{part}"] for side in ("left", "right") for part in STEADY):
+        assert np.dot(stated[joint].swing, shown[joint].swing) > 0.9, joint
+
+
+def test_a_rig_that_contradicts_the_stated_axes_of_its_names_is_read_from_a_motion(mocap: Path) -> None:
+    from marey_motion.formats import read_motion
+
+    path = mocap / FOLDED["bandai-namco"]
+    body = present(read_motion(path.read_bytes(), path.name).clip).skeleton
+    turned = quaternions.from_axis_angle(Z, np.array(np.pi / 2))
+    other = replace(body, offsets=quaternions.rotate_vectors(turned, body.offsets).astype(np.float64))
+
+    assert axes_from_motion(body, map_joints(body)) == frozenset()
+    assert map_joints(other).rig == "bandai-namco"
+    assert "LowerArm_L" in axes_from_motion(other, map_joints(other))
