@@ -9,6 +9,7 @@ import httpx
 import numpy as np
 import pytest
 from tests.support.floor_work import floor_work, with_upright_rest
+from tests.support.folded_rig import folded
 from tests.support.motion_files import AMC, ASF
 from tests.support.rest_server import Server, running
 
@@ -309,3 +310,20 @@ def test_events_tell_what_happened_and_can_be_followed(owner: httpx.Client) -> N
         assert next(lines) == f"id: {told[-1]['seq']}"
         owner.post("/projects/lab/collections", json={"path": "later"})
         assert int(next(lines).removeprefix("id: ")) > told[-1]["seq"]
+
+
+def test_the_order_of_takes_does_not_change_the_joint_map_of_their_skeleton(owner: httpx.Client) -> None:
+    """The rest pose of this rig shows no axes, and each of the takes would show others."""
+    takes = [write_bvh(folded(generate_gait(1.4, 0.0, 2.0, 30.0), twisted)) for twisted in (0.0, 0.9)]
+    mappings = []
+    for project, order in (("first", takes), ("second", takes[::-1])):
+        owner.post("/projects", json={"name": project}).raise_for_status()
+        for number, take in enumerate(order):
+            sent = owner.post(f"/projects/{project}/imports", files=[("files", (f"take{number}.bvh", take))])
+            assert statuses(sent) == {f"take{number}.bvh": "created"}
+        (skeleton,) = owner.get(f"/projects/{project}/skeletons").raise_for_status().json()["items"]
+        part = owner.get(f"/projects/{project}/skeletons/{skeleton['id']}/parts/mapping")
+        mappings.append(part.raise_for_status().json())
+
+    assert mappings[0] == mappings[1]
+    assert "LeftForeArm" not in mappings[0]["axes"]

@@ -11,18 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from marey_motion.clip import Clip
 from marey_motion.documents import mapping_to_document, skeleton_to_document
 from marey_motion.errors import MappingError
 from marey_motion.importing.landmarks import KEPT_SKELETONS, Landmarks, find_landmarks, path_length
 from marey_motion.importing.source import SourceMotion
-from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
+from marey_motion.rigs import JointMapping, axes_from_motion, guess_axes, map_joints
 from marey_motion.skeleton import EndSite, Skeleton
 from marey_schemas.documents.standard_joints import SIDES
 from marey_schemas.lru import LruCache
 
 LEG_OF_STATURE = 0.491
 """Length of thigh and shank together, as a share of the stature (Drillis and Contini, 1966)."""
+
+_UNKNOWN_AXES = "the skeleton does not show the axes of all joints; those that are missing are read from each clip"
 
 
 class Anatomy:
@@ -69,37 +70,21 @@ class Anatomy:
         return skeleton_to_document(self.skeleton).model_dump(by_alias=True, exclude_none=True)
 
     @cached_property
-    def _resting(self) -> dict[str, Any] | None:
-        """Document `mapping` with axes from the rest pose; None if some axes can only be found in a motion."""
-        try:
-            if rest_pose_doubts(self.skeleton, self.mapping):
-                return None
-        except MappingError:
-            pass  # no motion helps where the joints are missing: `_mapping_part` notes it
-        return _mapping_part(self, None)
+    def mapping_part(self) -> dict[str, Any]:
+        """Document `mapping`: standard joints, and the axes that the skeleton alone shows.
 
-    def mapping_part(self, clip: Clip | None) -> dict[str, Any]:
-        """Make the document `mapping`: standard joints, and axes found in the rest pose or, failing that, in a clip.
-
-        Parameters
-        ----------
-        clip : Clip or None    motion of this skeleton, which shows axes that the rest pose does not define
-
-        Returns
-        -------
-        dict    the document, as plain values
+        No motion is used, because the document belongs to all takes of the skeleton, whichever is imported first. If
+        too few joints are recognised, the document contains a note instead of axes.
         """
-        return self._resting or _mapping_part(self, clip)
-
-
-def _mapping_part(anatomy: Anatomy, clip: Clip | None) -> dict[str, Any]:
-    """Make the document `mapping`; if too few joints are recognised, it contains a note instead of axes."""
-    mapping = anatomy.mapping
-    try:
-        document = mapping_to_document(mapping, guess_axes(anatomy.skeleton, mapping, clip))
-    except MappingError as error:
-        document = mapping_to_document(replace(mapping, notes=(*mapping.notes, f"no axes: {error.message}")), {})
-    return document.model_dump(by_alias=True, exclude_none=True)
+        mapping = self.mapping
+        try:
+            unknown = axes_from_motion(self.skeleton, mapping)
+            axes = {name: one for name, one in guess_axes(self.skeleton, mapping).items() if name not in unknown}
+            notes = (_UNKNOWN_AXES,) if unknown else ()
+        except MappingError as error:
+            axes, notes = {}, (f"no axes: {error.message}",)
+        document = mapping_to_document(replace(mapping, notes=(*mapping.notes, *notes)), axes)
+        return document.model_dump(by_alias=True, exclude_none=True)
 
 
 _SkeletonKey = tuple[tuple[str, ...] | bytes, ...]

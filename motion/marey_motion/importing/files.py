@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from marey_motion.clip import Clip
-from marey_motion.documents import clip_from_document, clip_to_tree, skeleton_from_document
+from marey_motion.documents import clip_to_tree, skeleton_from_document
 from marey_motion.errors import AmbiguousUnits, FormatError, MotionError
 from marey_motion.formats import read_source
 from marey_motion.formats.conversion import convert
@@ -34,7 +34,6 @@ from marey_motion.importing.predecessor import described_skeleton, motion_conten
 from marey_motion.importing.siblings import AxisFinding
 from marey_motion.importing.source import ImportedMotion, SourceDocument
 from marey_motion.skeleton import SAME_OFFSET_M, Skeleton
-from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry, skeleton_output
 from marey_schemas.kinds import Kind
@@ -166,25 +165,20 @@ def _imported_document(file: FileToImport, source: SourceDocument) -> ImportedFi
     return import_document(file, source)
 
 
-def mapping_part(found: ImportedFile) -> Tree:
-    """Make the document `mapping` of the skeleton in a file, with the axes of its joints.
+def mapping_part(hierarchy: Tree) -> Tree:
+    """Make the document `mapping` of a skeleton, with the axes of its joints.
 
     `import_file` leaves this document out: it takes long, and only a skeleton that is new to the project needs it.
 
     Parameters
     ----------
-    found : ImportedFile    a result of `import_file` whose first item is a skeleton; the clip, if there is one, shows
-        axes that the rest pose does not define
+    hierarchy : dict    document `hierarchy` of the skeleton, as plain values
 
     Returns
     -------
     dict    the document, as plain values
     """
-    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(found.items[0].parts["hierarchy"]))
-    motion = next((item.parts["motion"] for item in found.items if item.kind is Kind.CLIP), None)
-    anatomy = anatomy_of(skeleton)
-    clip = None if motion is None else clip_from_document(MotionDocument.model_validate(motion), anatomy.skeleton)
-    return anatomy.mapping_part(clip)
+    return anatomy_of(skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))).mapping_part
 
 
 def _check_document(warning: Tree) -> Tree:

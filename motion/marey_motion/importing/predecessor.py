@@ -57,7 +57,7 @@ def described_skeleton(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
     FormatError    if the skeleton model does not fit the skeleton
     """
     item = skeleton_item(file, skeleton)
-    mapping = dict(anatomy_of(skeleton).mapping_part(None))  # a copy: equal skeletons share the document
+    mapping = dict(anatomy_of(skeleton).mapping_part)  # a copy: equal skeletons share the document
     name, companion = file.planned.name, file.planned.companion
     own = decode_document(bytes(file.data), name)
     document, place = own.get("skeleton_model"), name

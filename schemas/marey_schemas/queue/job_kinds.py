@@ -51,7 +51,7 @@ IMPORT = KindDeclaration(
     description="Imports clips, skeletons, models and graphs from files that the server has stored.",
     params=job_params.ImportParams,
     implementation="marey_worker.kinds.imports:run",
-    version=3,
+    version=4,
     outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON, "models": Kind.MODEL, "graphs": Kind.GRAPH},
     newest_of=("skeleton",),
     never_cached_for=_may_hold_graphs,
@@ -63,7 +63,7 @@ RETARGET = KindDeclaration(
     description="Transfers the motion of clips to another skeleton.",
     params=job_params.RetargetParams,
     implementation="marey_worker.kinds.retarget:run",
-    version=4,
+    version=5,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to retarget."),
         "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton to retarget to."),
@@ -93,7 +93,7 @@ EDIT = KindDeclaration(
     description="Applies the commands of an edit to clips: trims, joins, smooths, places and repairs them.",
     params=job_params.EditParams,
     implementation="marey_worker.kinds.edit:run",
-    version=5,
+    version=6,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to edit."),
         "edit": InputSpec(

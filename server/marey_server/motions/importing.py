@@ -228,13 +228,9 @@ def firsts_of_skeletons(files: Sequence[PreparedImport], new: Collection[str]) -
 def mapping_order(file: PreparedImport) -> bytes:
     """Return the packed message that asks a child process to find the joint mapping and axes of a file's skeleton."""
     with LOADING:
-        from marey_server.motions.reading import MappingOrder, ReadDocument
+        from marey_server.motions.reading import ReadDocument
 
-    motion = next((_part(draft, "motion") for draft in file.drafts if draft.kind is Kind.CLIP), None)
-    return MappingOrder(
-        hierarchy=ReadDocument.of(_hierarchy(file.drafts[0])),
-        motion=None if motion is None else ReadDocument.of(motion),
-    ).pack()
+    return ReadDocument.of(_hierarchy(file.drafts[0])).pack()
 
 
 def found_mapping(answer: bytes) -> PreparedDocument:

@@ -8,7 +8,7 @@ import orjson
 
 from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
 from marey_motion.importing.files import import_file, mapping_part
-from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
+from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedGraph, ImportedItem
 from marey_motion.importing.plan import PlannedFile
 from marey_motion.importing.siblings import AxisFinding
 from marey_motion.warm_up import compile_kernels
@@ -147,16 +147,6 @@ class ReadFile(Message):
     axis: AxisFinding | None = None
 
 
-class MappingOrder(Message):
-    """Message that asks a child process to find the joint mapping and axes of a skeleton.
-
-    `motion` is the motion of a clip that uses the skeleton, or None if the file contains no clip.
-    """
-
-    hierarchy: ReadDocument
-    motion: ReadDocument | None
-
-
 # -- in the child ------------------------------------------------------------------------------------------------------
 
 
@@ -185,16 +175,12 @@ def read_file(order: bytes) -> bytes:
 
 
 def find_mapping(order: bytes) -> bytes:
-    """Find the joint mapping and the axes of a skeleton, in a child process. `order` is a `MappingOrder` as bytes.
+    """Find the joint mapping and the axes of a skeleton, in a child process.
 
-    Return the part `mapping` as a `ReadDocument`, as bytes.
+    `order` is the part `hierarchy` as a `ReadDocument`, as bytes. Return the part `mapping` in the same form.
     """
-    wanted = MappingOrder.unpack(order)
-    skeleton = ImportedItem("", Kind.SKELETON, "", "", {"hierarchy": decoded_tree(wanted.hierarchy.document())})
-    items = [skeleton]
-    if wanted.motion is not None:
-        items.append(ImportedItem("", Kind.CLIP, "", "", {"motion": decoded_tree(wanted.motion.document())}))
-    return ReadDocument.of(prepare_document(mapping_part(ImportedFile("", tuple(items))))).pack()
+    hierarchy = decoded_tree(ReadDocument.unpack(order).document())
+    return ReadDocument.of(prepare_document(mapping_part(hierarchy))).pack()
 
 
 def _read_item(item: ImportedItem) -> ReadDraft:

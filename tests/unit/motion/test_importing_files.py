@@ -106,7 +106,8 @@ def test_what_is_kept_of_one_file_changes_nothing_about_another(monkeypatch: pyt
 
     def documents_of(data: bytes) -> Any:
         found = read("take.bvh", data)
-        return mapping_part(found), found.items[0].parts["hierarchy"], found.checks
+        hierarchy = found.items[0].parts["hierarchy"]
+        return mapping_part(hierarchy), hierarchy, found.checks
 
     monkeypatch.setattr(anatomy, "_KNOWN", LruCache(max_entries=8))
     alone = documents_of(takes[1])

@@ -6,8 +6,18 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from marey_motion import documents
+from marey_motion.clip import Clip
+from marey_motion.errors import MappingError
 from marey_motion.retargeting import RetargetPlan, plan_retarget
-from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints, require_trust
+from marey_motion.rigs import (
+    JointAxes,
+    JointMapping,
+    axes_from_motion,
+    doubtful_joints,
+    guess_axes,
+    map_joints,
+    require_trust,
+)
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
@@ -19,11 +29,22 @@ MOST_KEPT = 512
 
 
 class MappedSkeleton(NamedTuple):
-    """Skeleton with its joint mapping and axes."""
+    """Skeleton with its joint mapping and axes.
+
+    `guessed` are the joints whose axes the skeleton does not show and nobody has stated: a motion shows them better.
+    """
 
     skeleton: Skeleton
     mapping: JointMapping
     axes: Mapping[str, JointAxes]
+    guessed: frozenset[str]
+
+    def seen_in(self, clip: Clip) -> MappedSkeleton:
+        """Return the skeleton with the axes that a clip shows in place of those that are guessed."""
+        if not self.guessed:
+            return self
+        seen = guess_axes(self.skeleton, self.mapping, clip)
+        return self._replace(axes={**self.axes, **{name: seen[name] for name in self.guessed}})
 
 
 class Rig(NamedTuple):
@@ -50,18 +71,19 @@ def read_mapped(context: Context, rig: Rig) -> MappedSkeleton:
     return _skeletons.get_or_make(rig, lambda: _read(context, rig))
 
 
-def plan_between(context: Context, source: Rig, target: Rig, scale: float | None) -> RetargetPlan:
-    """Return the plan for retargeting from one skeleton to another.
+def plan_between(context: Context, source: Rig, target: Rig, scale: float | None, clip: Clip) -> RetargetPlan:
+    """Return the plan for retargeting a clip from one skeleton to another.
 
     `scale` is the number of metres that the target's pelvis moves per metre of the source's pelvis; None: it is
-    computed from the skeletons. Raises `MotionError` if a joint mapping cannot be used, or if joints or axes that the
-    plan needs are missing.
+    computed from the skeletons. `clip`, on the source's skeleton, shows the axes that the source does not have.
+    Raises `MotionError` if a joint mapping cannot be used, or if joints or axes that the plan needs are missing.
     """
+    mapped = read_mapped(context, source)
 
     def plan() -> RetargetPlan:
-        return plan_retarget(*read_mapped(context, source), *read_mapped(context, target), scale=scale)
+        return plan_retarget(*mapped.seen_in(clip)[:3], *read_mapped(context, target)[:3], scale=scale)
 
-    return _plans.get_or_make((source, target, scale), plan)
+    return plan() if mapped.guessed else _plans.get_or_make((source, target, scale), plan)
 
 
 def _read(context: Context, rig: Rig) -> MappedSkeleton:
@@ -69,7 +91,22 @@ def _read(context: Context, rig: Rig) -> MappedSkeleton:
     skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
     stored = context.document(Kind.SKELETON, rig.mapping.item, rig.mapping.revision, "mapping", required=False)
     if stored is None:
-        mapping = require_trust(map_joints(skeleton))
-        return MappedSkeleton(skeleton, mapping, guess_axes(skeleton, mapping))
+        return _with_axes(skeleton, require_trust(map_joints(skeleton)), {})
     mapping, axes = documents.mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)
-    return MappedSkeleton(skeleton, require_trust(mapping), axes)
+    return _with_axes(skeleton, require_trust(mapping), axes)
+
+
+def _with_axes(skeleton: Skeleton, mapping: JointMapping, stored: Mapping[str, JointAxes]) -> MappedSkeleton:
+    """Complete the stored axes by those that the skeleton shows, and note which axes can only be guessed.
+
+    Imports used to read axes that the rest pose does not show from the first clip of the skeleton. Such axes depend on
+    the order of imports, so they are not used. Axes in a document that a person has edited are used as they are.
+    """
+    try:
+        if mapping.method != "manual":
+            doubtful = doubtful_joints(skeleton, mapping)
+            stored = {name: axes for name, axes in stored.items() if name not in doubtful}
+        axes = {**guess_axes(skeleton, mapping), **stored}
+        return MappedSkeleton(skeleton, mapping, axes, axes_from_motion(skeleton, mapping) - stored.keys())
+    except MappingError:  # the plan names the joints whose axes are missing
+        return MappedSkeleton(skeleton, mapping, stored, frozenset())

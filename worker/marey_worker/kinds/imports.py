@@ -91,7 +91,7 @@ class _Importing:
         if found.refusal is not None:
             return refused_entry(planned.name, found.refusal), found.axis
         for item in items:
-            self._stage(item, found)
+            self._stage(item)
         checks = tuple(map(Check.model_validate, found.checks))
         return ImportEntry(name=planned.name, status="created", frames=found.frames, warnings=checks), found.axis
 
@@ -152,12 +152,12 @@ class _Importing:
                 found[model.path] = model
         return len(found), list(found.values())[:FEW]
 
-    def _stage(self, item: ImportedItem, found: ImportedFile) -> None:
+    def _stage(self, item: ImportedItem) -> None:
         parts = dict(item.parts)
         if item.kind is Kind.SKELETON and "mapping" not in parts:
             content = canonical_json(parts["hierarchy"])
             if content not in self._mappings:
-                self._mappings[content] = mapping_part(found)
+                self._mappings[content] = mapping_part(parts["hierarchy"])
             parts["mapping"] = self._mappings[content]
         self._results.add(
             StagedOutput(

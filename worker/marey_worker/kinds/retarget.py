@@ -8,6 +8,7 @@ from typing import Any
 
 from marey_motion import documents
 from marey_motion.errors import MotionError
+from marey_motion.importing.checks import CheckWarning
 from marey_motion.retargeting import RetargetPlan, retarget_with_checks
 from marey_schemas.documents.clips import Check, ClipInfo, ClipSource, MotionDocument
 from marey_schemas.documents.references import RevisionRef
@@ -17,8 +18,17 @@ from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces
-from marey_worker.job_io.skeleton_cache import Rig, plan_between, read_mapped
+from marey_worker.job_io.skeleton_cache import MappedSkeleton, Rig, plan_between, read_mapped
 from marey_worker.job_io.staged_results import StagedResults
+
+_FROM_CLIP = (
+    "neither the rest pose nor the names of the source skeleton show the axes of these joints, so they were read from "
+    "this clip; other clips may be turned differently; state the axes with `marey skeleton axes`"
+)
+_GUESSED = (
+    "neither the rest pose nor the names of the target skeleton show the axes of these joints, so they were guessed; "
+    "the joints of the result may be turned about their bones; state the axes with `marey skeleton axes`"
+)
 
 
 def run(context: Context, params: RetargetParams) -> dict[str, Any]:
@@ -79,9 +89,12 @@ class _Retargeting:
         used = RevisionRef.model_validate(motion.skeleton.model_dump())
         edited = self._rigs.get(used.item)
         source = Rig(used, edited.ref if edited else used)
-        plan = plan_between(self._context, source, self._target, self._params.scale)
-        made = retarget_with_checks(documents.clip_from_document(motion, plan.source), plan, self._params)
-        checks = tuple(Check.model_validate(check.as_dict()) for check in made.checks)
+        mapped = read_mapped(self._context, source)
+        moving = documents.clip_from_document(motion, mapped.skeleton)
+        plan = plan_between(self._context, source, self._target, self._params.scale, moving)
+        made = retarget_with_checks(moving, plan, self._params)
+        found = (*self._unknown_axes(mapped, plan), *made.checks)
+        checks = tuple(Check.model_validate(check.as_dict()) for check in found)
         clip = made.clip
         self._warnings.update(check.code for check in checks)
         self._frames += clip.frame_count
@@ -101,6 +114,19 @@ class _Retargeting:
                 **({"rigs": (edited.as_input(),)} if edited else {}),
             },
         )
+
+    def _unknown_axes(self, source: MappedSkeleton, plan: RetargetPlan) -> list[CheckWarning]:
+        """Return warnings of paired joints whose axes neither the skeleton shows nor a user has stated."""
+        target = read_mapped(self._context, self._target)
+        both = (
+            (source.guessed, [pair.source for pair in plan.pairs], "axes-from-clip", _FROM_CLIP),
+            (target.guessed, [pair.target for pair in plan.pairs], "axes-guessed", _GUESSED),
+        )
+        return [
+            CheckWarning(code, text, joints=joints)
+            for guessed, names, code, text in both
+            if (joints := tuple(name for name in names if name in guessed))
+        ]
 
     def _info(self, stored: dict[str, Any] | None, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
         """Return the part `info` of a result: that of the source clip, with a new origin and new checks."""

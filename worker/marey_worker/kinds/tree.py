@@ -35,7 +35,7 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
     model = context.document(Kind.MODEL, pin.item, pin.revision, "model")
     options = TreeOptions.of(params)
     with refusing_motion_errors():
-        skeleton, mapping, _axes = read_mapped(context, Rig.as_stored(RevisionRef.model_validate(model["skeleton"])))
+        skeleton, mapping, *_axes = read_mapped(context, Rig.as_stored(RevisionRef.model_validate(model["skeleton"])))
         primitive = primitive_from_tree(model, skeleton)
         known = [name for name in END_EFFECTORS if name in mapping.joints]
         context.progress(1, 2, "grouping samples")
