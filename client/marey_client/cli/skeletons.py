@@ -88,12 +88,12 @@ def joint_axes(
         if twist or swing:
             if joint is None:
                 raise WrongUsage("name the joint whose axes `--twist` or `--swing` changes")
-            if joint not in mapping.axes:
-                raise WrongUsage(
-                    f"the joint {joint!r} has no axes; `marey skeleton axes {place}` lists the joints with axes"
-                )
-            old = mapping.axes[joint]
-            new = JointAxesDocument(twist=_vector(twist) or old.twist, swing=_vector(swing) or old.swing)
+            old = mapping.axes.get(joint)
+            new_twist = _vector(twist) or (old and old.twist)
+            new_swing = _vector(swing) or (old and old.swing)
+            if new_twist is None or new_swing is None:
+                raise WrongUsage(f"the joint {joint!r} has no axes yet; give it both `--twist` and `--swing`")
+            new = JointAxesDocument(twist=new_twist, swing=new_swing)
             mapping = mapping.model_copy(update={"axes": {**mapping.axes, joint: new}, "method": "manual"})
             item = found.put_mapping(mapping)
             print_message(f"{place}: revision {item.revision}")
