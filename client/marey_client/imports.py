@@ -41,6 +41,8 @@ OTHER_MOTION = (
 FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20
 UPLOADS_AT_ONCE = 8
+NO_MODEL = "no-model"
+"""Code of the refusal of a graph whose models are not in the project."""
 
 _FILE_NAME: TypeAdapter[str] = TypeAdapter(FileName)
 
@@ -213,10 +215,15 @@ class Imports:
         named = [file for file in files if _can_be_sent(file.name)]
         entries = {file.name: _refused_name(file.name) for file in files if not _can_be_sent(file.name)}
         sent = {file.name: file for file in self.send(named, notice=notify)}
-        for portion in batches(named):
+        portions = list(batches(named))
+        for portion in portions:
             for entry in self.run(tuple(sent[file.name] for file in portion), options):
                 entries.setdefault(entry.name, entry)
             notify("importing", len(entries), len(files))
+        # A graph may have been sent before the portion with its models.
+        again = tuple(sent[name] for name, one in entries.items() if one.error and one.error.code == NO_MODEL)
+        if again and len(portions) > 1:
+            entries |= {entry.name: entry for entry in self.run(again, options)}
         return list(entries.values())
 
     def restore(self, found: FoundFiles, entries: Sequence[ImportEntry], *, notice: Notice | None = None) -> int:

@@ -2,12 +2,15 @@
 
 import hashlib
 import io
+import json
 import zipfile
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
+from tests.support import predecessor_documents as old
+from tests.support import predecessor_models as models
 from tests.support.floor_work import floor_work, with_upright_rest
 from tests.support.folded_rig import folded
 from tests.support.motion_files import AMC, ASF
@@ -250,6 +253,14 @@ def test_a_clip_of_the_predecessor_is_imported_with_the_skeleton_beside_it(owner
     assert clip["frames"] == 30
     item = owner.get(f"/projects/lab/clips/{clip['item']}").json()
     assert (item["collection"], item["name"]) == ("old", "walk")
+
+
+def test_a_graph_is_imported_after_its_models_whatever_the_order_of_their_names(owner: httpx.Client) -> None:
+    documents = {"a.json": old.graph_of_one("stand"), "stand_mm.json": models.static()}
+    files = [("files", (name, json.dumps(document).encode())) for name, document in documents.items()]
+    entries = owner.post("/projects/lab/imports", files=files).json()["entries"]
+    assert [entry["name"] for entry in entries] == ["a.json", "stand_mm.json"]
+    assert [entry["status"] for entry in entries] == ["created", "created"]
 
 
 def test_clips_can_be_made_to_use_a_given_skeleton(owner: httpx.Client) -> None:

@@ -340,6 +340,12 @@ def graph() -> Document:
     }  # fmt: skip
 
 
+def graph_of_one(name: str) -> Document:
+    """Return a graph with one node, an idle state whose model is called `name`."""
+    node = {"name": name, "type": "idle", "transitions": transitions(("idle", name, "21"))}
+    return {"nodes": {"idle": {"21": node}}, "start_node": ["idle", name]}
+
+
 TIME_FUNCTION = [min(47, int(1.2 * place)) for place in range(40)]
 """Source frame of each canonical frame of the aligned clip."""
 SECTIONS: dict[str, Document] = {

@@ -195,7 +195,7 @@ class ProjectImports(Resource):
     ) -> dict[int, ImportEntry]:
         """Read files in child processes while earlier files are stored; return the entries by place in the import.
 
-        Files of which the upward axis is not clear are recorded in `unclear`, if it is given, and not stored.
+        Files that need other files (see `UnclearFiles`) are recorded in `unclear`, if it is given, and not stored.
         """
         entries: dict[int, ImportEntry] = {}
         reading = deque(works)

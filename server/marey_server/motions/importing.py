@@ -164,9 +164,10 @@ def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> 
 
 
 class UnclearFiles:
-    """Files of an import that do not clearly show which axis points up.
+    """Files of an import that need other files: graphs of models, and files that do not show which axis points up.
 
-    They wait until all other files have been read, because another file with the same skeleton may show the axis.
+    They wait until all other files have been read and stored: a graph refers to models, and another file with the same
+    skeleton may show the axis.
     """
 
     def __init__(self) -> None:
@@ -176,8 +177,11 @@ class UnclearFiles:
     def take(self, place: int, file: PreparedImport) -> bool:
         """Record the upward axis found in a file; return whether the file must wait for the other files.
 
-        `place` is the index of the file in the import.
+        `place` is the index of the file in the import. A graph that contains its models (a zipped graph) need not wait.
         """
+        if file.graph is not None and not file.drafts:
+            self._files[place] = file
+            return True
         if file.axis is None:
             return False
         self._findings.append(file.axis)

@@ -13,7 +13,16 @@ import pytest
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
-from marey_client.imports import FILES_PER_IMPORT, Imports, LocalFile, batches, find_files, left_out_texts, refusal_text
+from marey_client.imports import (
+    FILES_PER_IMPORT,
+    NO_MODEL,
+    Imports,
+    LocalFile,
+    batches,
+    find_files,
+    left_out_texts,
+    refusal_text,
+)
 from marey_schemas.options.imports import ImportOptions
 
 
@@ -282,3 +291,31 @@ def test_after_a_failure_no_further_file_is_sent(tmp_path: Path) -> None:
     with pytest.raises(errors.Unreachable):
         Imports(nothing, "lab", full, nothing).send(find_files([tmp_path]).files)
     assert len(full.sent) < 100
+
+
+def test_a_graph_that_was_sent_before_its_models_is_sent_again(script: ScriptedServer, tmp_path: Path) -> None:
+    for name in ["graph.json", *(f"model {number:02d}_mm.json" for number in range(FILES_PER_IMPORT))]:
+        (tmp_path / name).write_text(name)
+    portions: list[list[str]] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        if request.method == "PUT":
+            return httpx.Response(204)
+        body = json.loads(request.content)
+        if request.url.path.endswith("/blobs/missing"):
+            return httpx.Response(200, json={"missing": []})
+        portions.append([file["name"] for file in body["files"]])
+        error = {"code": NO_MODEL, "detail": "no model"}
+        entries = [
+            {"name": name, "status": "failed", "error": error}
+            if name == "graph.json" and len(portions) == 1
+            else {"name": name, "status": "created"}
+            for name in portions[-1]
+        ]
+        return httpx.Response(200, json={"entries": entries})
+
+    script.answers = [answer] * 10
+    entries = script.marey().project("lab").imports.upload(find_files([tmp_path]).files)
+    assert len(portions) == 3
+    assert portions[-1] == ["graph.json"]
+    assert [entry.status for entry in entries] == ["created"] * (FILES_PER_IMPORT + 1)

@@ -1,22 +1,33 @@
 """Results of import jobs."""
 
 import hashlib
+import json
 from math import radians
 from pathlib import Path
 from typing import Any
 
+from tests.support import predecessor_documents as old
+from tests.support import predecessor_models as models
 from tests.support.floor_work import floor_work, with_upright_rest
 from tests.support.project_in_memory import ProjectInMemory
 
 from marey_motion.clip import Clip
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
+from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import ImportParams
 from marey_worker.context import FileTooLarge
 from marey_worker.kinds import imports
 
 LIMIT_BYTES = 1 << 20
+
+
+class ProjectWithoutModels(ProjectInMemory):
+    """Project in which no model is stored yet."""
+
+    def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
+        return []
 
 
 class ProjectWithLimit(ProjectInMemory):
@@ -84,3 +95,18 @@ def test_the_result_counts_the_clips_and_frames_that_were_imported(tmp_path: Pat
     assert [entry["status"] for entry in result["entries"]] == ["created", "created", "failed"]
     assert (result["clips"], result["frames"]) == (2, walk.frame_count + turn.frame_count)
     assert sorted(one.item_name for one in project.staged if one.kind is Kind.CLIP) == ["turn", "walk"]
+
+
+def test_a_graph_is_imported_after_its_models_whatever_the_order_of_their_names(tmp_path: Path) -> None:
+    project = ProjectWithoutModels(tmp_path)
+    files = []
+    for name, document in (("a.json", old.graph_of_one("stand")), ("stand_mm.json", models.static())):
+        data = json.dumps(document).encode()
+        digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
+        project.blobs[digest] = data
+        files.append({"name": name, "blob": digest})
+    result = imports.run(project, ImportParams.model_validate({"files": files}))
+    assert [(entry["name"], entry["status"]) for entry in result["entries"]] == [
+        ("a.json", "created"),
+        ("stand_mm.json", "created"),
+    ]

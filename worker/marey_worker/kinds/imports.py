@@ -55,7 +55,7 @@ class _Importing:
         axes = axes_of_skeletons(findings)
         entries = []
         for planned, entry, finding in zip(plan, made, findings, strict=True):
-            # What was put aside is read again, because later files may have shown its upward axis.
+            # What was put aside is read again, because later files may have shown its upward axis, or be its models.
             final = entry or self._import(planned, axis_of_siblings(finding, axes), is_last=True)[0]
             assert final is not None
             if final.error is not None:
@@ -74,13 +74,15 @@ class _Importing:
     ) -> tuple[ImportEntry | None, AxisFinding | None]:
         """Import a file; return its entry in the result, and the upward axis that the motion shows.
 
-        If the motion does not clearly show the axis, the entry is None and nothing is staged: the file must be read
-        again later. With `is_last`, the file is imported in any case.
+        If the motion does not clearly show the axis, or if the file is a graph without its models, the entry is None
+        and nothing is staged: the file must be read again after all others. With `is_last`, it is imported in any case.
         """
         try:
             found = self._read(planned, sibling_axis)
             if found.axis is not None and not found.axis.is_clear and not is_last:
                 return None, found.axis
+            if found.graph is not None and not found.items and not is_last:
+                return None, None
             items = found.items if found.graph is None else (*found.items, self._graph_item(found))
         except NoSuchThing as error:
             return refused_entry(planned.name, Refusal(code="blob-missing", detail=str(error))), None
