@@ -18,6 +18,10 @@ def main() -> None:
         _run()
     except KeyboardInterrupt:  # also of who is impatient while modules load
         sys.exit(INTERRUPTED)
+    except RuntimeError as error:
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
+        sys.exit(INTERRUPTED)  # until Python 3.11, an exception in `__set_name__` of a class gets this wrapping
 
 
 def _run() -> None:

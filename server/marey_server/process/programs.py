@@ -15,7 +15,10 @@ async def start_program(
 
     The process inherits the descriptors `inherited`. `stdin` is a descriptor, `asyncio.subprocess.PIPE`, or None to
     inherit the standard input. Raises `OSError` if the process cannot be started.
+
+    The process gets a session of its own: Ctrl-C in the terminal of the server reaches only the server, which
+    then stops the process. A process that is still loading modules would print a traceback.
     """
     return await asyncio.create_subprocess_exec(
-        sys.executable, *arguments, stdin=stdin, pass_fds=inherited, env=environment
+        sys.executable, *arguments, stdin=stdin, pass_fds=inherited, env=environment, start_new_session=True
     )

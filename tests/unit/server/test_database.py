@@ -15,6 +15,7 @@ from sqlalchemy.engine.default import DefaultDialect
 
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ClientGoneProblem, InvalidProblem, StorageFullProblem, UnavailableProblem
+from marey_server.store.database import opening
 from marey_server.store.database.clock import DatabaseClock
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client
@@ -326,3 +327,8 @@ def test_a_write_follows_one_whose_commit_found_the_disk_full(
             database.write(SYSTEM, add_user)
     database.write(SYSTEM, add_user)
     assert database.read(SYSTEM, user_names) == ["u"]
+
+
+def test_reasons_of_drivers_contain_no_numbers_of_errors() -> None:
+    error = OSError("failed to resolve host 'db.invalid': [Errno -2] Name or service not known")
+    assert opening._reason(error) == "failed to resolve host 'db.invalid': Name or service not known"

@@ -14,7 +14,7 @@ import pytest
 from marey_schemas.backoff import Backoff
 from marey_server import commands
 from marey_server.http.accepting import listen
-from marey_server.process import notices
+from marey_server.process import notices, programs
 from marey_server.process.settings import Settings
 from marey_server.process_program import share_of
 from marey_server.shared_port import handles, parent
@@ -176,3 +176,18 @@ def test_several_processes_need_postgres(tmp_path: Path) -> None:
     with pytest.raises(commands.CommandFailed, match="need Postgres"):
         commands.serve(data=tmp_path / "data", processes=2)
     assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
+    "make_loop", [asyncio.new_event_loop, commands._new_event_loop], ids=["asyncio", "of the server"]
+)
+def test_ctrl_c_in_the_terminal_of_a_server_does_not_reach_its_programs(
+    make_loop: Callable[[], asyncio.AbstractEventLoop],
+) -> None:
+    async def run() -> int:
+        leads_group = "import os, sys; sys.exit(0 if os.getpgrp() == os.getpid() else 1)"
+        process = await programs.start_program("-c", leads_group, environment={})
+        return await process.wait()
+
+    with asyncio.Runner(loop_factory=make_loop) as runner:
+        assert runner.run(run()) == 0

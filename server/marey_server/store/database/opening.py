@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,8 @@ from sqlalchemy import URL, Connection, NullPool, create_engine, exc, make_url
 
 from marey_server.errors import StorageFullProblem, UnavailableProblem
 from marey_server.store.database.clock import ClockFarAhead
+
+_ERROR_NUMBER = re.compile(r"\[Errno -?\d+\] ")
 
 
 class DatabaseUnusable(Exception):
@@ -108,6 +111,9 @@ def _shown(url: str) -> str:
 
 
 def _reason(error: BaseException | None) -> str:
-    """Return the first line of the message of the driver's error, or of `error` if there is no driver's error."""
-    text = str(getattr(error, "orig", None) or error).strip()
+    """Return the first line of the message of the driver's error, or of `error` if there is no driver's error.
+
+    Numbers of the system's errors, as in `[Errno -2]`, are left out.
+    """
+    text = _ERROR_NUMBER.sub("", str(getattr(error, "orig", None) or error)).strip()
     return text.splitlines()[0] if text else "no reason is given"
