@@ -40,7 +40,8 @@ class _Check:
         self._facets()
         if left := sorted(self.archive.members.keys() - self.checked):
             raise BadArchive(
-                f"{left[0].name}: no version in the archive contains this member; the member was added later"
+                f"{left[0].name}: no version in the archive contains this member, so it was added later; export the "
+                "archive again"
             )
 
     def _changes_of(self, commit: str) -> None:
@@ -50,7 +51,7 @@ class _Check:
                 if unchanged and not self.archive.manifest.base:
                     raise BadArchive(
                         f"{ArchiveMember(MemberKind.CHANGES, commit).name}: the member refers to an earlier archive, "
-                        "but this archive contains the whole history; the archive was altered"
+                        "but this archive contains the whole history, so it was altered; export it again"
                     )
                 documents = [digest for part, digest in value["parts"].items() if part not in unchanged]
                 self._revision(revision_content(path_and_kind(key)[1], value["parts"]), documents)
@@ -76,7 +77,7 @@ class _Check:
         found = self.archive.tree(MemberKind.REVISION, content)
         self._mark(member)
         if not isinstance(found, dict) or not isinstance(found.get("parts"), dict):
-            raise BadArchive(f"{member.name}: the content of the member does not describe a revision")
+            raise BadArchive(f"{member.name}: the content does not describe a revision; export the archive again")
         self._revision(content, found["parts"].values())
 
     def _array(self, leaf: Mapping[str, Any], document: str, difference: ArrayDifference | None) -> None:
@@ -101,7 +102,10 @@ class _Check:
         """Raise `BadArchive` if a document states another dtype or shape than the member with the array."""
         if leaf["dtype"] != array.dtype or leaf["shape"] != list(array.shape):
             name = ArchiveMember(MemberKind.DOCUMENT, document).name
-            raise BadArchive(f"{name}: the dtype or shape given here differs from that of the array {member.name}")
+            raise BadArchive(
+                f"{name}: the dtype or shape given here differs from that of the array {member.name}; export the "
+                "archive again"
+            )
 
     def _file(self, digest: str) -> None:
         member = ArchiveMember(MemberKind.FILE, digest)

@@ -87,7 +87,10 @@ class ArchiveMember(NamedTuple):
         except ValueError:
             member = None
         if member is None or member.name != name:
-            raise BadArchive(f"{name}: this is not a valid name of a member of an archive")
+            raise BadArchive(
+                f"{name}: no member of an archive has such a name, so another program wrote or changed the file; "
+                "export the archive again"
+            )
         return member
 
 
@@ -113,7 +116,10 @@ def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
                 "copy or export the archive again"
             ) from error
         if header.type != tarfile.REGTYPE or header.size < 0:
-            raise BadArchive(f"{header.name}: the archive contains something other than a regular file")
+            raise BadArchive(
+                f"{header.name}: the member is not a regular file, so another program wrote or changed the archive; "
+                "export it again"
+            )
         header.offset_data = position + tarfile.BLOCKSIZE
         position = header.offset_data + -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
         if position > size_bytes:
@@ -131,9 +137,13 @@ def canonical_tree(member: ArchiveMember, data: bytes) -> Any:
         tree = json.loads(data)
         same = canonical_json(tree) == data
     except (ValueError, RecursionError, TypeError, OverflowError) as error:
-        raise BadArchive(f"{member.name}: the content of the member is not JSON: {error}") from error
+        raise BadArchive(
+            f"{member.name}: the content of the member is not JSON ({error}); export the archive again"
+        ) from error
     if not same:
-        raise BadArchive(f"{member.name}: the JSON is not in canonical form")
+        raise BadArchive(
+            f"{member.name}: the JSON is not in canonical form, so another program wrote it; export the archive again"
+        )
     return tree
 
 
@@ -147,7 +157,7 @@ def stored_array(member: ArchiveMember, data: bytes) -> EncodedArray:
         array = EncodedArray(spec.dtype, spec.shape, data)
         decoded = array.decode(max_bytes=MAX_ARRAY_BYTES)
     except (ArrayError, BlockError) as error:
-        raise BadArchive(f"{member.name}: {error}") from error
+        raise BadArchive(f"{member.name}: {error}; copy or export the archive again") from error
     require_digest(member, array_digest(decoded))
     return EncodedArray(spec.dtype, spec.shape, data, decoded)
 
@@ -162,10 +172,12 @@ def stored_differences(member: ArchiveMember, data: bytes) -> list[ArrayDifferen
     try:
         found = [ArrayDifference.of(one) for one in decode_tree(data, MSGPACK, keep_blocks=True)]
     except (ArrayError, CodecError, TypeError) as error:
-        raise BadArchive(f"{member.name}: {error}") from error
+        raise BadArchive(f"{member.name}: {error}; copy or export the archive again") from error
     differences = [one for one in found if one is not None]
     if len(differences) < len(found):
-        raise BadArchive(f"{member.name}: the content of the member is not a list of array differences")
+        raise BadArchive(
+            f"{member.name}: the content of the member is not a list of array differences; export the archive again"
+        )
     return differences
 
 

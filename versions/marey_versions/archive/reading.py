@@ -74,7 +74,10 @@ class Archive:
         manifest: Manifest | None = None
         for header in read_headers(self._file):
             if manifest is not None:
-                raise BadArchive(f"{header.name}: the member follows {MANIFEST}, which must be the last member")
+                raise BadArchive(
+                    f"{header.name}: the member follows {MANIFEST}, which must be the last member, so another program "
+                    "changed the archive; export it again"
+                )
             if header.name == MANIFEST:
                 manifest = _manifest(self._bytes(MANIFEST, header.offset_data, header.size))
             else:
@@ -88,7 +91,7 @@ class Archive:
 
     def _add(self, member: ArchiveMember, header: tarfile.TarInfo) -> None:
         if member in self.members:
-            raise BadArchive(f"{member.name}: the archive has two members of this name")
+            raise BadArchive(f"{member.name}: the archive has two members of this name; export the archive again")
         self.members[member] = (header.offset_data, header.size)
 
     # -- members -------------------------------------------------------------------------------------------------------
@@ -113,7 +116,9 @@ class Archive:
         if member not in self.members:
             return {}
         if not self.manifest.base:
-            raise BadArchive(f"{member.name}: an archive with the whole history must contain whole arrays")
+            raise BadArchive(
+                f"{member.name}: an archive with the whole history must contain whole arrays; export the archive again"
+            )
         return {one.digest: one for one in stored_differences(member, self._read(member))}
 
     def file(self, digest: str) -> Iterator[bytes]:
@@ -136,7 +141,8 @@ class Archive:
         try:
             return CommitRecord.of(self.tree(MemberKind.COMMIT, digest))
         except ValueError as error:
-            raise BadArchive(f"{ArchiveMember(MemberKind.COMMIT, digest).name}: {error}") from error
+            name = ArchiveMember(MemberKind.COMMIT, digest).name
+            raise BadArchive(f"{name}: {error}; export the archive again") from error
 
     def changes(self, digest: str) -> dict[str, EntryChange]:
         """Return the entries that differ between a commit and its first parent, by key."""
@@ -145,7 +151,9 @@ class Archive:
             lines = [json.loads(line) for line in self._read(member).splitlines()]
             return {key_of(str(one["path"]), str(one["kind"])): _change(one) for one in lines}
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise BadArchive(f"{member.name}: the content of the member is not a list of changes: {error!r}") from error
+            raise BadArchive(
+                f"{member.name}: the content of the member is not a list of changes; export the archive again"
+            ) from error
 
     def facets(self) -> dict[str, dict[str, float]]:
         """Return the facets (numbers that jobs have published about revisions) by content digest of the revision.
@@ -168,7 +176,10 @@ class Archive:
 
     def _bytes(self, name: str, position: int, size_bytes: int) -> bytes:
         if size_bytes > MOST_BYTES:
-            raise BadArchive(f"{name}: the member has {size_bytes:,} bytes; at most {MOST_BYTES:,} are accepted")
+            raise BadArchive(
+                f"{name}: the member has {size_bytes:,} bytes, but at most {MOST_BYTES:,} are accepted, so another "
+                "program wrote or changed the archive; export it again"
+            )
         self._file.seek(position)
         data = self._file.read(size_bytes)
         if len(data) < size_bytes:
@@ -213,11 +224,11 @@ class Archive:
             try:
                 root = change(store, before, {key: one.value for key, one in changes.items()})
             except (TypeError, ValueError) as error:
-                raise BadArchive(f"{name}: an entry is not valid: {error}") from error
+                raise BadArchive(f"{name}: an entry is not valid ({error}); export the archive again") from error
             if root != record.tree:
                 raise BadArchive(
                     f"{name}: with these changes, the entries do not have the digest that the commit states; the "
-                    "changes were altered after the archive was written"
+                    "changes were altered after the archive was written; export it again"
                 )
             roots[digest] = root
         return Versions(store, roots)
@@ -249,14 +260,18 @@ def _manifest(data: bytes) -> Manifest:
         base = tuple(map(str, tree["base"]))
         schema, manifest = tree["schema"], Manifest(str(tree["dataset"]), str(tree["commit"]), base)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise BadArchive(f"{MANIFEST}: the content of the member is not the manifest of an archive") from error
+        raise BadArchive(
+            f"{MANIFEST}: the content of the member is not the manifest of an archive; copy or export the archive again"
+        ) from error
     if schema not in (SCHEMA, SCHEMA_WITH_FACETS, SCHEMA_WITH_DIFFERENCES):
         raise BadArchive(
             f"{MANIFEST}: this version of Marey reads {SCHEMA_WITH_DIFFERENCES}, not {str(schema)[:80]!r}; update Marey"
         )
     for digest in (manifest.commit, *base):
         if not is_digest(digest):
-            raise BadArchive(f"{MANIFEST}: {digest[:80]!r} is not the digest of a commit")
+            raise BadArchive(
+                f"{MANIFEST}: {digest[:80]!r} is not the digest of a commit; copy or export the archive again"
+            )
     return manifest
 
 
@@ -266,7 +281,7 @@ def _facets(member: ArchiveMember, tree: Any) -> dict[str, dict[str, float]]:
         named: dict[str, Any] = values if isinstance(values, dict) and is_digest(content) else {"": None}
         numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in named.values())
         if not numbers or not all(map(is_facet_name, named)):
-            raise BadArchive(f"{member.name}: the content of the member is not a list of facets")
+            raise BadArchive(f"{member.name}: the content is not a list of facets; export the archive again")
     return dict(by_content)
 
 
