@@ -156,17 +156,24 @@ def _from_file(url: str, file: Path) -> Credential:
 
 
 def require_address(url: str) -> None:
-    """Raise `BadAddress` if `url` is not the address of a server."""
+    """Raise `BadAddress` if `url` is not the address of a server, or contains more than scheme, host, port and path."""
     if _PLAIN_ADDRESS.fullmatch(url):
         return  # without httpx, which takes long to load, and which shell completion does not need
     import httpx
 
+    named = False
     try:
         parts, _ = urlsplit(url), httpx.URL(url)
+        named = parts.username is not None
         fits = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
     except (httpx.InvalidURL, ValueError):
         fits = False
-    if not fits:
+    if named:  # errors and logs would show the password
+        raise BadAddress(
+            f"the address of a server must not contain a user name or a password; write it like {DEFAULT_URL}, and log "
+            "in with `marey login`"
+        )
+    if not fits or "?" in url or "#" in url:
         raise BadAddress(f"{url!r} is not the address of a server; write it like {DEFAULT_URL}")
 
 

@@ -246,12 +246,18 @@ def test_what_is_no_token_is_refused_before_it_is_sent_and_shown_nowhere(script:
     "url",
     [
         "127.0.0.1:8460", "marey.example.org", "ftp://marey.example.org", "http://", "http://127.0.0.256:8000",
-        "http://999.1.1.1",
+        "http://999.1.1.1", "http://127.0.0.1:8460?x=1", "http://marey.example.org/#top",
     ],
 )  # fmt: skip
 def test_what_is_no_address_is_refused_before_anything_is_sent(url: str) -> None:
     with pytest.raises(errors.BadAddress, match="not the address of a server"):
         Marey(url, "marey_secret")
+
+
+def test_an_address_with_a_password_is_refused_without_repeating_it() -> None:
+    with pytest.raises(errors.BadAddress, match="must not contain a user name or a password") as refused:
+        Marey("http://ada:enigma@127.0.0.1:8460", "marey_secret")
+    assert "enigma" not in str(refused.value)
 
 
 def test_authorities_of_the_house_are_trusted_beside_the_public_ones(monkeypatch: pytest.MonkeyPatch) -> None:
