@@ -27,8 +27,8 @@ from marey_client.cli.app import OTHER_NAMES, app, with_one_command
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
 from marey_client.cli.datasets import combining, versions
 from marey_client.cli.datasets.combining import resolutions_of
-from marey_client.cli.files import uploading
-from marey_client.cli.files.listing import _folders_in, _items_in
+from marey_client.cli.files import downloading, uploading
+from marey_client.cli.files.listing import _folders_in, _items_in, _stale_reasons
 from marey_client.cli.files.uploading import _print_entries
 from marey_client.cli.queue.jobs import _done
 from marey_client.cli.queue.pipelines import _print_shortfalls
@@ -41,6 +41,7 @@ from marey_client.errors import BadCredentialFile, Forbidden, Invalid, NotFound,
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.marey import Marey
 from marey_schemas.imports import ImportEntry
+from marey_schemas.items import LineageEdge, Staleness
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.jobs import CollectionInput, Job, JobState, Progress
 
@@ -130,12 +131,14 @@ def test_every_command_explains_itself() -> None:
     walk(get_command(app), ["marey"])
 
 
-def test_who_interrupts_while_modules_load_sees_nothing_and_gets_130() -> None:
+@pytest.mark.parametrize("interrupt", ["raise KeyboardInterrupt", "type('Class', (), {'attribute': Impatience()})"])
+def test_who_interrupts_while_modules_load_sees_nothing_and_gets_130(interrupt: str) -> None:
     probe = (
         "import sys\n"
         "class Impatience:\n"
+        "    def __set_name__(self, owner, name): raise KeyboardInterrupt\n"
         "    def find_spec(self, name, path, target=None):\n"
-        "        if name == 'typer': raise KeyboardInterrupt\n"
+        f"        if name == 'typer': {interrupt}\n"
         "sys.meta_path.insert(0, Impatience())\n"
         "from marey_client.cli import main; main()"
     )
@@ -510,6 +513,35 @@ def test_who_interrupts_an_upload_is_told_how_to_go_on(
     with pytest.raises(KeyboardInterrupt):
         uploading.upload(NO_OPTIONS, [tmp_path], "lab", {})
     assert "repeating the command sends only the missing ones" in capsys.readouterr().err
+
+
+def test_who_interrupts_a_download_is_told_what_is_complete(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def export(folder: Path, **_: object) -> Path:
+        if exported:
+            raise KeyboardInterrupt
+        exported.append(folder)
+        return folder / "walk.bvh"
+
+    exported: list[Path] = []
+    item = cast(Any, mock.Mock(export=export))
+    chosen = [downloading._Exported(item, None, "", name) for name in ("walk", "turn")]
+    with pytest.raises(KeyboardInterrupt):
+        downloading._download_all(chosen, tmp_path, {})
+    assert "at least 1 file of 2 are complete" in capsys.readouterr().err
+
+
+def test_of_many_outdated_inputs_the_first_are_named_and_the_others_counted() -> None:
+    edges = tuple(
+        LineageEdge(item=f"clip_{number}", kind=Kind.CLIP, name=f"walk {number}", revision=1, job=None, role="clips")
+        for number in range(900)
+    )
+    staleness = Staleness(item="evaluation_1", revision=1, stale=True, because=edges)
+    item = cast(Any, mock.Mock(project="lab", path="all walks"))
+    *first, others = _stale_reasons(staleness, item)
+    assert first == [f"clip walk {number} has newer revisions than 1" for number in range(3)]
+    assert others == "and 897 more inputs; `marey show 'lab/all walks' --history --json` lists all"
+    few = Staleness(item="evaluation_1", revision=1, stale=True, because=edges[:3])
+    assert len(list(_stale_reasons(few, item))) == 3
 
 
 def test_a_token_whose_file_cannot_be_written_is_never_made(

@@ -180,11 +180,18 @@ def _download_all(
                 raise
             return sentence(error)
 
-    with ThreadPoolExecutor(DOWNLOADS_AT_ONCE) as pool, progress() as advance:
-        for one, outcome in zip(chosen, pool.map(write, chosen), strict=True):
-            if isinstance(outcome, Path):
-                written.append(outcome)
-            else:
-                refused[f"{one.folder}/{one.name}".strip("/")] = outcome
-            advance("downloading", len(written) + len(refused), len(chosen))
+    try:
+        with ThreadPoolExecutor(DOWNLOADS_AT_ONCE) as pool, progress() as advance:
+            for one, outcome in zip(chosen, pool.map(write, chosen), strict=True):
+                if isinstance(outcome, Path):
+                    written.append(outcome)
+                else:
+                    refused[f"{one.folder}/{one.name}".strip("/")] = outcome
+                advance("downloading", len(written) + len(refused), len(chosen))
+    except KeyboardInterrupt:
+        print_message(
+            f"interrupted; at least {counted(len(written), 'file')} of {len(chosen)} are complete in {output}, and no "
+            "file is cut off; repeating the command writes all files again"
+        )
+        raise
     return written, refused

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
-    from marey_schemas.items import Item, Revision
+    from marey_schemas.items import Item, Revision, Staleness
     from marey_schemas.kinds import Kind
 
 
@@ -49,6 +50,8 @@ COLUMNS: dict[str, Callable[[Item], object]] = {
 }
 """Columns that follow the name in a list of items; the values of `stale` come from a separate request."""
 DEFAULT_COLUMNS = "kind,revision,joints,frames,Hz,tags"
+REASONS_SHOWN = 3
+"""Number of outdated inputs of an item that are named one by one."""
 FIGURES = ("revision", "joints", "frames", "Hz", "seconds")
 """Columns with numbers, which are aligned to the right."""
 
@@ -333,8 +336,7 @@ def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
         elif name != "warnings":
             yield name, _rounded(value)
     yield from ((f"{FACET_PREFIX}{name}", _rounded(value)) for name, value in item.item.facets.items())
-    for edge in item.staleness().because:
-        yield "stale", f"{edge.kind} {edge.name} has newer revisions than {edge.revision}"
+    yield from (("stale", reason) for reason in _stale_reasons(item.staleness(), item))
     for name, one in item.item.parts.items():
         yield f"part {name}", f"{one.size_bytes} bytes, {one.schema_}, {one.document}"
     if item.item.kind is Kind.RECORD:
@@ -370,6 +372,15 @@ def _show_history(item: ItemHandle, as_json: bool) -> None:
         typer.echo(f"made from {edge.kind} {edge.name} ({edge.item} revision {edge.revision}) as {edge.role}")
     for edge in lineage.outputs:
         typer.echo(f"used for  {edge.kind} {edge.name} ({edge.item} revision {edge.revision}) as {edge.role}")
-    for edge in staleness.because:
-        typer.echo(f"stale: {edge.kind} {edge.name} has newer revisions than {edge.revision}")
+    for reason in _stale_reasons(staleness, item):
+        typer.echo(f"stale: {reason}")
     return None
+
+
+def _stale_reasons(staleness: Staleness, item: ItemHandle) -> Iterator[str]:
+    """Yield a text for each of the first outdated inputs, and one for all others: an evaluation can have thousands."""
+    for edge in staleness.because[:REASONS_SHOWN]:
+        yield f"{edge.kind} {edge.name} has newer revisions than {edge.revision}"
+    if (others := len(staleness.because) - REASONS_SHOWN) > 0:
+        command = f"marey show {shlex.quote(f'{item.project}/{item.path}')} --history --json"
+        yield f"and {counted(others, 'more input')}; `{command}` lists all"
