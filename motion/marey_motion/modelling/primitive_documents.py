@@ -101,7 +101,10 @@ def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPr
     ModelError    if the joints differ, or if the numbers describe no model
     """
     if tree.get("schema") != PRIMITIVE_SCHEMA:
-        raise ModelError(f"the document has the schema {tree.get('schema')!r}, not {PRIMITIVE_SCHEMA!r}")
+        raise ModelError(
+            f"the document has the schema {tree.get('schema')!r}, not {PRIMITIVE_SCHEMA!r}; choose a model, or update "
+            "Marey if a newer version made the document"
+        )
     return MotionPrimitive(
         name=tree["name"],
         skeleton=skeleton,

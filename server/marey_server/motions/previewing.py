@@ -87,7 +87,9 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
     `TooLargeProblem` if the motions are so large that only a job may edit them.
     """
     if kind is not Kind.CLIP:
-        raise NotFoundProblem(f"Only clips can be edited, not an item of the kind {kind}.", code="not-a-clip")
+        raise NotFoundProblem(
+            f"Only clips can be edited, not an item of the kind {kind}; name a clip.", code="not-a-clip"
+        )
     edit = EditDocument(commands=request.commands) if request.edit is None else _read_edit(tx, project, request)
     motion = items.read_part(tx, project, Kind.CLIP, item_id, "motion", revision=request.revision).tree
     numbers = _size(motion)
@@ -116,7 +118,7 @@ def _read_edit(tx: Transaction, project: str, request: EditPreviewRequest) -> Ed
         return EditDocument.model_validate(tree)
     except ValidationError as error:
         first = field_errors(error, EditDocument, tree)[0]
-        detail = f"The edit cannot be applied: {first.pointer}: {first.detail}"
+        detail = f"The edit cannot be applied: {first.pointer}: {first.detail}; correct the edit, or send `commands`."
         raise _invalid("/edit", "bad-document", detail) from error
 
 
@@ -157,15 +159,15 @@ def make_preview(packed: bytes) -> bytes:
     source, request = order.source(), order.request
     made = _edited(source, order.most_work)
     if request.piece >= len(made):
-        raise _invalid(
-            "/piece", "no-piece", f"The edit creates only {counted(len(made), 'clip')}; `piece` counts clips from 0."
-        )
+        detail = f"The edit creates only {counted(len(made), 'clip')}; set `piece` to at most {len(made) - 1}."
+        raise _invalid("/piece", "no-piece", detail)
     wanted = made[request.piece]
     start, stop = request.frames
     stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
     if start >= stop:
         frames = counted(wanted.clip.frame_count, "frame")
-        raise _invalid("/frames", "no-frames", f"The new clip has {frames}; the range contains none of them.")
+        detail = f"The new clip has {frames}, and the range contains none of them; request frames below its number."
+        raise _invalid("/frames", "no-frames", detail)
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > order.most_shown:
         raise TooLargeProblem(

@@ -101,7 +101,10 @@ def _at_paths(tree: Tree, paths: Sequence[str]) -> Iterator[tuple[str, Value]]:
         entries = chain.from_iterable(tree.entries(prefix=prefix) for prefix in prefixes_of(path))
         first = next(entries, None)
         if first is None:
-            raise NotFoundProblem(f"The version has no entry at {path!r} or below it.", code="no-entry")
+            raise NotFoundProblem(
+                f"The version has no entry at {path!r} or below it; `marey dataset entries` lists the entries.",
+                code="no-entry",
+            )
         if not wanted.intersection(_folders_above(path)):  # otherwise these entries are read with those of the folder
             chosen.update([first, *entries])
     return iter(sorted(chosen.items()))
