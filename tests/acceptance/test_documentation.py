@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 from docs.generate import ROOT, files
+from lint.sources import PACKAGES
 from tests.support.named_commands import unknown_options
 from tests.support.printed_pages import blocks
 from tests.support.who_may import table
@@ -40,6 +41,25 @@ def test_links_between_pages_lead_somewhere() -> None:
         if "://" not in link and not (page.parent / link).exists()
     ]
     assert broken == []
+
+
+def test_the_readme_lists_every_folder_of_the_repository() -> None:
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    hidden_or_generated = (".", "_", "build", "dist", "marey-", "node_modules")
+    folders = [one.name for one in ROOT.iterdir() if one.is_dir() and not one.name.startswith(hidden_or_generated)]
+    assert not [name for name in folders if f"| `{name}/` |" not in page]
+
+
+def test_the_architecture_names_every_subpackage() -> None:
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    packages = [ROOT / folder / package for folder, found in PACKAGES.items() for package in found]
+    server = ROOT / "server" / "marey_server"
+    subpackages = [
+        file.parent.name
+        for package in (*packages, server / "launchers", server / "store")
+        for file in package.glob("*/__init__.py")
+    ]
+    assert not [name for name in subpackages if f"`{name}/`" not in page]
 
 
 def test_every_decision_is_listed() -> None:
