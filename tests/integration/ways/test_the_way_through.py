@@ -504,3 +504,20 @@ def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it
     assert project.skeletons.get(source.id).item.revision == 3
     ended = marey.jobs.wait(project.retarget(sources, studio.id, into="confirmed").id, timeout_s=PATIENCE_S)
     assert present(ended.result)["clips"] == 1
+
+
+def test_axes_that_a_mapping_lacks_are_stated_as_a_pair(project: ProjectHandle, run: CommandLine) -> None:
+    studio = target_skeleton(project)
+    mapping = studio.mapping()
+    elbow = mapping.joints["left_elbow"]
+    others = {joint: axes for joint, axes in mapping.axes.items() if joint != elbow}
+    studio.put_mapping(mapping.model_copy(update={"axes": others}))
+    place = f"{project.name}/{studio.id}"
+
+    refused = run("skeleton", "axes", place, elbow, "--twist", "1,0,0", status=2).stderr
+    assert "has no axes yet; give it both" in refused
+    run("skeleton", "axes", place, elbow, "--twist", "1,0,0", "--swing", "0,1,0")
+    run("skeleton", "axes", place, elbow, "--swing", "0,0,1")
+    assert studio.mapping().axes[elbow].twist == (1.0, 0.0, 0.0)
+    assert studio.mapping().axes[elbow].swing == (0.0, 0.0, 1.0)
+    assert studio.mapping().method == "manual"
