@@ -530,6 +530,21 @@ def test_who_interrupts_a_download_is_told_what_is_complete(tmp_path: Path, caps
     assert "at least 1 file of 2 are complete" in capsys.readouterr().err
 
 
+def test_a_token_whose_file_does_not_fit_on_the_disk_is_never_made(
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tokens, "connect", lambda context: script.marey())
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as refused:
+        tokens.create_token(NO_OPTIONS, "ci", output=tmp_path / "token")
+    assert sentence(refused.value) == "No space left on device"
+    assert script.requests == []
+    assert not (tmp_path / "token").exists()
+
+
 def test_of_many_outdated_inputs_the_first_are_named_and_the_others_counted() -> None:
     edges = tuple(
         LineageEdge(item=f"clip_{number}", kind=Kind.CLIP, name=f"walk {number}", revision=1, job=None, role="clips")

@@ -25,6 +25,8 @@ token = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage yo
 
 SOON_DAYS = 14
 """For tokens that expire in fewer days than this, lists show the number of days left."""
+RESERVED_BYTES = 1000
+"""Size of a file before a token is written to it; no token is longer."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -90,11 +92,16 @@ def create_token(
 
 
 def _token_in_file(marey: Marey, wanted: TokenCreate, path: Path) -> NewToken:
-    """Create a token and write its secret to a new file; create no token if the file cannot be created."""
+    """Create a token and write its secret to a new file; create no token if the file cannot be written."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
         try:
+            file.write(" " * RESERVED_BYTES)  # so that a full disk is noticed before the token is created
+            file.flush()
+            os.fsync(file.fileno())
             made = marey.tokens.create(wanted)
+            file.seek(0)
             file.write(made.secret + "\n")
+            file.truncate()
         except BaseException:
             path.unlink()
             raise

@@ -110,9 +110,11 @@ def sentence(error: BaseException) -> str:
 
 
 def _text_of(error: BaseException) -> str:
-    """Return the text of an error; for errors about files, the name of the file and the reason."""
-    if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
+    """Return the text of an error; for errors of the system, the file and the reason without its number."""
+    if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
+    if error.filename is None:
+        return error.strerror
     file = Path(os.fsdecode(error.filename))
     if isinstance(error, FileNotFoundError) and not file.parent.exists():
         return f"{file}: there is no folder {file.parent}; create it, or name another file"
