@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Self
 
-from marey_client.errors import Forbidden, Invalid, LeaseLost, MareyError, Unauthenticated
+from marey_client.errors import Forbidden, Invalid, LeaseLost, MareyError, NotFound, Unauthenticated
 from marey_client.retries import ONCE
 from marey_client.transport import Transport
 from marey_schemas.backoff import Backoff
@@ -112,7 +112,7 @@ class Supervisor:
         while self._running:  # slots that only wait for work hold nothing and may be left
             time.sleep(0.02)
         if self._refusal is not None:
-            log.error("the server refuses this worker: %s", self._refusal)
+            log.error("the server refuses this worker: %s", _explained(self._refusal, self._transport.url))
         if self._failed or self._refusal is not None:
             return FAILED_STATUS
         return INTERRUPTED_STATUS if self._interrupted else 0
@@ -149,7 +149,7 @@ class Supervisor:
                     if isinstance(error, LeaseLost):  # the answer was lost for too long; the server answers again
                         opened = self._open_claim()
                         failures = 1
-                    log.warning("no work: %s", error)
+                    log.warning("no work: %s", _explained(error, self._transport.url))
                     self._stopping.wait(PAUSES.delay_s(failures))
                     continue
                 failures = 0
@@ -249,3 +249,12 @@ class _SlotChild:
             self._child.wait_until_ready()
         self._jobs += 1
         return self._child
+
+
+def _explained(error: Exception, url: str) -> str:
+    """Return the text of an error that stopped a claim, with what to do about a wrong token or address."""
+    if isinstance(error, Unauthenticated | Forbidden):
+        return f"{error} Give it a token of `marey token create NAME --scope work` with --token-file."
+    if isinstance(error, NotFound):
+        return f"{url} has no queue of jobs; set MAREY_SERVER to the address of the server alone, without a path"
+    return str(error)

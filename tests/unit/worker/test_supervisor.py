@@ -12,9 +12,12 @@ from tests.support.fake_server import FakeServer
 from tests.support.present import present
 
 from marey_client.credentials import write_private
+from marey_client.errors import error_of
 from marey_schemas.encoding.digests import digest_of
+from marey_schemas.problems import Problem
 from marey_schemas.queue.jobs import Progress
 from marey_schemas.queue.worker_protocol import FailRequest
+from marey_worker import supervisor
 from marey_worker.commands import main
 
 
@@ -421,3 +424,16 @@ def test_fault_points_kill_the_worker_where_they_say(server: FakeServer, start_w
     job = server.submit("add", {"a": 1, "b": 1})
     assert worker.process.wait(60) == -signal.SIGKILL
     assert (job in server.completed) == (point == "worker.after_complete")
+
+
+@pytest.mark.parametrize(
+    ("status", "told"),
+    [
+        (401, "Refused. Give it a token of `marey token create NAME --scope work` with --token-file."),
+        (404, "http://server.test/api has no queue of jobs; set MAREY_SERVER to the address of the server alone"),
+        (503, "Refused."),
+    ],
+)
+def test_a_worker_says_what_to_do_about_a_wrong_token_or_address(status: int, told: str) -> None:
+    error = error_of(Problem(type="t", title="Refused", status=status, detail="Refused.", instance="r", code="refused"))
+    assert supervisor._explained(error, "http://server.test/api").startswith(told)
