@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.errors import FormatError
 from marey_motion.formats.bvh_hierarchy import BvhHeader, read_header
 from marey_motion.formats.bvh_writer import write_bvh
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
@@ -29,6 +30,8 @@ __all__ = ["read_bvh", "write_bvh"]
 FORMAT = "bvh"
 # Offsets and positions of the same joint agree to this part of the largest offset where exporters rounded both.
 _PRINTED_DIGITS = 1e-6
+_LARGEST_ANGLE_DEG = 2.0**53
+"""Above this angle, 64-bit numbers are more than a degree apart."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
     )
     if len(values):
         require_unpackable(len(values), len(offsets), values.size, file)
+        _require_directions(source, values, channel_columns(channels), file)
         _fill_motion(source, values, channel_columns(channels))
         source.frame_rate_hz = frame_rate_hz or frame_rate_of(header.frame_time_s, file, warnings)
     return source
@@ -165,6 +169,21 @@ def _warn_of_layout(header: BvhHeader, frames: int, wrapped: bool, warnings: lis
         warnings.append(CheckWarning("frames-wrapped", message))
     if frames == 0:
         warnings.append(CheckWarning("no-frames", "the file contains no frames; only its skeleton was read"))
+
+
+def _require_directions(source: SourceMotion, values: NDArray[np.float64], columns: ChannelColumns, file: str) -> None:
+    """Raise `FormatError` for an angle that is so large that a 64-bit number cannot contain its direction."""
+    if max(values.max(initial=0.0), -values.min(initial=0.0)) <= _LARGEST_ANGLE_DEG:
+        return
+    for frame, column in np.argwhere(np.abs(values) > _LARGEST_ANGLE_DEG):
+        for joint in np.flatnonzero((columns.turns == column).any(axis=1)):
+            raise FormatError(
+                f"frame {frame}: an angle of {values[frame, column]:.3g} degrees has no direction, because "
+                "numbers of this size are rounded by more than a degree; repair or cut this frame",
+                code="value-range",
+                file=file,
+                joint=source.joint_names[joint],
+            )
 
 
 def _fill_motion(source: SourceMotion, values: NDArray[np.float64], columns: ChannelColumns) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -278,6 +279,15 @@ class TestRefusals:
         error = refusal(data)
         assert words in str(error)
         assert (error.file, error.line, error.joint) == ("take.bvh", line, joint)
+
+    @pytest.mark.parametrize("angle", ["1e16", "-1e308"])
+    def test_an_angle_without_a_direction_is_refused(self, angle: str) -> None:
+        error = refusal(bvh([ROW, ROW.replace("50", angle)]))
+        assert re.search(r"^frame 1: an angle of .* has no direction.*repair or cut", str(error).partition(": ")[2])
+        assert (error.code, error.joint) == ("value-range", "Arm")
+
+    def test_a_large_position_is_no_angle(self) -> None:
+        assert read(bvh([ROW.replace("1 ", "1e16 ", 1)])).root_positions is not None
 
     @pytest.mark.parametrize("frame_time", ["0", "-0.01", "1e-9", "30", "33.3333"])
     def test_frame_times_that_give_no_rate_name_the_option(self, frame_time: str) -> None:
