@@ -515,6 +515,26 @@ def test_who_interrupts_an_upload_is_told_how_to_go_on(
     assert "repeating the command sends only the missing ones" in capsys.readouterr().err
 
 
+def test_an_upload_that_leaves_motion_out_fails_although_all_else_went_in(
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("walk.bvh", "run.fbx"):
+        (tmp_path / name).write_text("x")
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        if request.url.path.endswith("/blobs/missing"):
+            return httpx.Response(200, json={"missing": []})
+        return httpx.Response(200, json={"entries": [{"name": "walk.bvh", "status": "created", "frames": 1}]})
+
+    monkeypatch.setattr(uploading, "connect", lambda context: script.marey())
+    script.answers = [httpx.Response(200, json=PROJECT), answer, answer]
+    with pytest.raises(Refused):
+        uploading.upload(NO_OPTIONS, [tmp_path], "lab", {})
+    told = capsys.readouterr()
+    assert "left out: 1 FBX: not readable here, export as BVH (run.fbx)" in told.err
+    assert told.out == "1 file: 1 created; 1 frame\n"
+
+
 def test_who_interrupts_a_download_is_told_what_is_complete(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def export(folder: Path, **_: object) -> Path:
         if exported:
