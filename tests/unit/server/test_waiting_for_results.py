@@ -12,7 +12,7 @@ from marey_schemas.access import MemberChange, Role, UserCreate
 from marey_schemas.queue.jobs import JobCreate
 from marey_server.access.principal import SYSTEM
 from marey_server.store import members, users
-from marey_server.store.jobs import result_cache
+from marey_server.store.jobs import propagation, result_cache
 from marey_server.store.jobs.reaper import share_waiting
 from marey_server.store.retention import Retention, retire
 from marey_server.store.tables import staged_output
@@ -251,6 +251,19 @@ def test_jobs_that_waited_for_a_result_that_is_not_shared_compute_it_side_by_sid
         desk.complete(lease, shareable=False)
     assert states(desk, waiting) == {"succeeded": 2}
     assert {len(desk.outputs(job)) for job in waiting} == {1}
+
+
+def test_a_result_that_is_not_shared_is_not_shared_later_either(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 2)
+    submit(desk)
+    waiting = [submit(desk) for _ in range(5)]
+    lease = desk.claim()
+    desk.stage(lease, "total")
+    desk.complete(lease, shareable=False)
+    assert states(desk, waiting) == {"queued": 2, "waiting": 3}
+    while desk.database.write(SYSTEM, propagation.propagate_rest):
+        pass
+    assert states(desk, waiting) == {"queued": 5}
 
 
 def test_the_result_of_a_worker_with_another_version_of_the_kind_is_not_shared(desk: Desk) -> None:
