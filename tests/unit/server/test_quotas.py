@@ -3,6 +3,7 @@
 import os
 import random
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
@@ -29,7 +30,7 @@ from marey_server.store.credentials import tokens
 from marey_server.store.database import connections
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.items import Draft
-from marey_server.store.jobs import reading
+from marey_server.store.jobs import reading, submission
 from marey_server.store.transaction import Quotas, Transaction
 
 LIMIT = 3
@@ -170,6 +171,26 @@ def test_tasks_of_a_job_that_gets_its_inputs_later_count_as_well(desk: Desk) -> 
         "The job would have 2 tasks, but its author may have only 0 more unfinished jobs (quota `user_jobs`). Retry "
         "the job when some have ended.",
     )
+    desk.database.quotas = Quotas(user_jobs=9)
+    desk.submit_many(*[JobCreate(kind="errand")] * 3)
+    with pytest.raises(QuotaExceededProblem, match="9 unfinished jobs"):
+        desk.submit()
+
+
+@pytest.mark.every_database
+def test_submissions_at_once_never_exceed_the_quota_of_unfinished_jobs(desk: Desk) -> None:
+    desk.database.quotas = Quotas(user_jobs=LIMIT)
+    jobs = [desk.submit() for _ in range(LIMIT)]
+    for one in jobs:
+        desk.cancel(one)  # now each submission that may not rely on the stored number counts
+
+    def submit_slowly(tx: Transaction) -> None:
+        submission.submit(tx, desk.project, [JobCreate(kind="errand")])
+        time.sleep(0.1)  # so that others count before this transaction is committed
+
+    futures = [desk.database.submit_write(desk.user, submit_slowly) for _ in range(2 * LIMIT)]
+    errors = [future.exception(60) for future in futures]
+    assert [type(error) for error in errors if error is not None] == [QuotaExceededProblem] * LIMIT
 
 
 def test_inputs_of_submitted_jobs_are_limited_per_day_even_if_the_jobs_are_cancelled(desk: Desk) -> None:
