@@ -93,11 +93,9 @@ def require_room_for_jobs(tx: Transaction, more: int) -> None:
     number is corrected, only when it would exceed the quota. Concurrent checks of one user run one after another.
     """
     user_id = tx.principal.user_id
-    if user_id is None:
+    if user_id is None or tx.principal.kind != "user":
         return
-    if tx.principal.kind != "user":  # attempts have no quotas
-        note_jobs(tx, user_id, more)
-    elif not tx.run(_ADD_JOBS, {"of_user": user_id, "more": more, "most": tx.quotas.user_jobs}):
+    if not tx.run(_ADD_JOBS, {"of_user": user_id, "more": more, "most": tx.quotas.user_jobs}):
         tx.execute(select(user.c.id).where(user.c.id == user_id).with_for_update(key_share=True))
         used = _require_counted(tx, "user_jobs", user_id, more)
         tx.execute(update(user).where(user.c.id == user_id).values(jobs_bound=used + more))
