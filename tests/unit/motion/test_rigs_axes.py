@@ -319,8 +319,11 @@ def test_the_stated_axes_of_a_known_rig_are_those_that_its_hinges_show(mocap: Pa
     moved = guess_axes(clip.skeleton, mapping, clip)
     assert all(moved[joint] == stated[joint] for name, joint in mapping.joints.items() if name != "root")
     shown = guess_axes(clip.skeleton, replace(mapping, rig=None), clip)
-    for joint in (mapping.joints[f"{side}_{part}"] for side in ("left", "right") for part in STEADY):
-        assert np.dot(stated[joint].swing, shown[joint].swing) > 0.9, joint
+    agreeing = {name: np.dot(stated[joint].swing, shown[joint].swing) for name, joint in mapping.joints.items()}
+    for name in (f"{side}_{part}" for side in ("left", "right") for part in STEADY):
+        assert agreeing[name] > 0.9, name
+    for name in agreeing.keys() - {"root"}:  # a take holds other joints in any way, but not reversed
+        assert agreeing[name] > 0.4 or name.endswith("_finger_tip"), name
 
 
 def test_a_rig_that_contradicts_the_stated_axes_of_its_names_is_read_from_a_motion(mocap: Path) -> None:
@@ -334,3 +337,22 @@ def test_a_rig_that_contradicts_the_stated_axes_of_its_names_is_read_from_a_moti
     assert axes_from_motion(body, map_joints(body)) == frozenset()
     assert map_joints(other).rig == "bandai-namco"
     assert "LowerArm_L" in axes_from_motion(other, map_joints(other))
+
+
+@pytest.mark.parametrize("tilt_rad", [0.0, 0.2])
+def test_the_stated_axes_of_a_known_rig_turn_with_its_rest_pose_and_its_bones(mocap: Path, tilt_rad: float) -> None:
+    from marey_motion.formats import read_motion
+
+    path = mocap / FOLDED["bandai-namco"]
+    body = present(read_motion(path.read_bytes(), path.name).clip).skeleton
+    stated = guess_axes(body, map_joints(body))["LowerArm_L"]
+    shoulder, wrist = body.index_of("UpperArm_L"), body.index_of("Hand_L")
+    rest, offsets = body.rest_rotations.copy(), body.offsets.copy()
+    rest[shoulder] = quaternions.from_axis_angle(Z, np.array(0.3))
+    tilt = quaternions.from_axis_angle(np.array(stated.swing), np.array(tilt_rad))
+    offsets[wrist] = quaternions.rotate_vectors(tilt, offsets[wrist])
+    other = replace(body, rest_rotations=rest, offsets=offsets)
+
+    found = guess_axes(other, map_joints(other))["LowerArm_L"]
+    np.testing.assert_allclose(found.twist, offsets[wrist] / np.linalg.norm(offsets[wrist]), atol=1e-6)
+    np.testing.assert_allclose(found.swing, stated.swing, atol=1e-6)

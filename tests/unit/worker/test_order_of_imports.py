@@ -17,6 +17,7 @@ from marey_motion.formats import read_motion
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.importing.files import mapping_part
 from marey_motion.rigs import guess_axes, map_joints
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.queue.job_params import RetargetParams
@@ -34,16 +35,21 @@ TAKES = {
 }
 
 
-def retargeted(folder: Path, clip: Clip, mapping: Any, *, onto: bool = False) -> tuple[np.ndarray[Any, Any], list[str]]:
+def retargeted(
+    folder: Path, clip: Clip, mapping: Any, *, onto: bool = False, after: Clip | None = None
+) -> tuple[np.ndarray[Any, Any], list[str]]:
     """Retarget a clip whose skeleton has this `mapping`, and return the poses and the codes of the checks.
 
-    With `onto`, another walk is retargeted to the skeleton of the clip instead.
+    With `onto`, another walk is retargeted to the skeleton of the clip instead. `after` is another clip of the same
+    skeleton that the same job retargets before.
     """
     project = ProjectInMemory(folder)
     walk = generate_gait(1.4, 0.0, 1.0, 30.0)
     other = game_skeleton() if not onto else walk.skeleton
     moving, target = (walk, clip.skeleton) if onto else (clip, other)
-    add_clip(project, "take", moving)
+    for name, one in (("before", after), ("take", moving)):
+        if one is not None:
+            add_clip(project, name, one)
     project.parts["skeleton_b", 1, "hierarchy"] = skeleton_to_document(target).model_dump(by_alias=True)
     project.parts["skeleton_b" if onto else "skeleton_a", 1, "mapping"] = mapping
     skeleton = {"item": "skeleton_b", "revision": 1, "kind": Kind.SKELETON, "name": "b", "collection": "rigs"}
@@ -53,7 +59,7 @@ def retargeted(folder: Path, clip: Clip, mapping: Any, *, onto: bool = False) ->
         patched.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
         patched.setattr(skeleton_cache, "_plans", LruCache(max_entries=4))
         retarget.run(project, RetargetParams())
-    (made,) = project.staged
+    *_, made = project.staged
     return np.asarray(made.parts["motion"]["poses"]), [check["code"] for check in made.parts["info"].get("checks", [])]
 
 
@@ -103,12 +109,39 @@ def test_axes_that_neither_rest_pose_nor_names_tell_are_read_from_the_clip(tmp_p
     assert "axes-guessed" in codes
 
 
+def test_axes_that_are_read_from_each_clip_undo_the_turned_frames_of_its_joints(tmp_path: Path) -> None:
+    """The two takes are one motion, with other frames of the forearms."""
+    takes = [folded(generate_gait(1.4, 0.0, 2.0, 30.0), raised) for raised in (0.0, 0.9)]
+    mapping = documents_of(takes)[0]
+    (first, _), (second, _) = [retargeted(tmp_path, take, mapping) for take in takes]
+    assert np.degrees(_turned(first, second, "lowerarm_l").max()) < 1.0
+
+    beside, _ = retargeted(tmp_path, takes[1], mapping, after=takes[0])
+    np.testing.assert_array_equal(beside, second)
+
+
 def test_axes_that_a_person_has_stated_are_used_as_they_are(tmp_path: Path) -> None:
     takes = [folded(generate_gait(1.4, 0.0, 2.0, 30.0), raised) for raised in (0.0, 0.9)]
     stated = [one | {"method": "manual", "confidence": 1.0} for one in documents_of(takes)[1:]]
 
     (first, codes), (second, _) = [retargeted(tmp_path, takes[1], one) for one in stated]
     assert "axes-from-clip" not in codes
-    arm = 3 + 4 * game_skeleton().index_of("lowerarm_l")
-    turned = quaternions.angle_between(first[:, arm : arm + 4], second[:, arm : arm + 4])
-    assert np.degrees(turned.max()) > 5.0
+    assert np.degrees(_turned(first, second, "lowerarm_l").max()) > 5.0
+
+
+def test_a_joint_map_without_hips_and_shoulders_is_read_with_the_axes_that_it_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
+    project = ProjectInMemory(tmp_path)
+    add_clip(project, "take", generate_gait(1.4, 0.0, 1.0, 30.0))
+    axes = {"Head": {"twist": (0.0, 1.0, 0.0), "swing": (1.0, 0.0, 0.0)}}
+    project.parts["skeleton_a", 1, "mapping"] = {"joints": {"head": "Head"}, "axes": axes}
+    rig = skeleton_cache.Rig.as_stored(RevisionRef(item="skeleton_a", revision=1))
+    assert skeleton_cache.read_mapped(project, rig).axes.keys() == {"Head"}
+
+
+def _turned(first: np.ndarray[Any, Any], second: np.ndarray[Any, Any], joint: str) -> np.ndarray[Any, Any]:
+    """Return the angles in radians between the rotations of a joint in two motions of the game skeleton."""
+    place = 3 + 4 * game_skeleton().index_of(joint)
+    return quaternions.angle_between(first[:, place : place + 4], second[:, place : place + 4])
