@@ -220,10 +220,11 @@ class Imports:
             for entry in self.run(tuple(sent[file.name] for file in portion), options):
                 entries.setdefault(entry.name, entry)
             notify("importing", len(entries), len(files))
-        # A graph may have been sent before the portion with its models.
-        again = tuple(sent[name] for name, one in entries.items() if one.error and one.error.code == NO_MODEL)
-        if again and len(portions) > 1:
-            entries |= {entry.name: entry for entry in self.run(again, options)}
+        if len(portions) > 1:  # a graph may have been sent before the portion with its models
+            refused = {name for name, one in entries.items() if one.error and one.error.code == NO_MODEL}
+            for portion in batches([file for file in named if file.name in refused]):
+                again = self.run(tuple(sent[file.name] for file in portion), options)
+                entries |= {entry.name: entry for entry in again}
         return list(entries.values())
 
     def restore(self, found: FoundFiles, entries: Sequence[ImportEntry], *, notice: Notice | None = None) -> int:

@@ -293,8 +293,9 @@ def test_after_a_failure_no_further_file_is_sent(tmp_path: Path) -> None:
     assert len(full.sent) < 100
 
 
-def test_a_graph_that_was_sent_before_its_models_is_sent_again(script: ScriptedServer, tmp_path: Path) -> None:
-    for name in ["graph.json", *(f"model {number:02d}_mm.json" for number in range(FILES_PER_IMPORT))]:
+def test_graphs_that_were_sent_before_their_models_are_sent_again(script: ScriptedServer, tmp_path: Path) -> None:
+    graphs = [f"graph {number:03d}.json" for number in range(FILES_PER_IMPORT + 1)]
+    for name in [*graphs, "model_mm.json"]:
         (tmp_path / name).write_text(name)
     portions: list[list[str]] = []
 
@@ -308,7 +309,7 @@ def test_a_graph_that_was_sent_before_its_models_is_sent_again(script: ScriptedS
         error = {"code": NO_MODEL, "detail": "no model"}
         entries = [
             {"name": name, "status": "failed", "error": error}
-            if name == "graph.json" and len(portions) == 1
+            if name in graphs and len(portions) <= 2
             else {"name": name, "status": "created"}
             for name in portions[-1]
         ]
@@ -316,6 +317,18 @@ def test_a_graph_that_was_sent_before_its_models_is_sent_again(script: ScriptedS
 
     script.answers = [answer] * 10
     entries = script.marey().project("lab").imports.upload(find_files([tmp_path]).files)
-    assert len(portions) == 3
-    assert portions[-1] == ["graph.json"]
-    assert [entry.status for entry in entries] == ["created"] * (FILES_PER_IMPORT + 1)
+    assert portions == [graphs[:-1], [graphs[-1], "model_mm.json"], graphs[:-1], graphs[-1:]]
+    assert [entry.status for entry in entries] == ["created"] * (FILES_PER_IMPORT + 2)
+
+
+def test_a_graph_whose_models_are_nowhere_is_sent_once_if_all_files_were_sent_together(
+    script: ScriptedServer, tmp_path: Path
+) -> None:
+    (tmp_path / "graph.json").write_text("graph")
+    refused = {"name": "graph.json", "status": "failed", "error": {"code": NO_MODEL, "detail": "no model"}}
+    script.answers = [
+        httpx.Response(200, json={"missing": []}),
+        httpx.Response(200, json={"entries": [refused]}),
+    ]
+    (entry,) = script.marey().project("lab").imports.upload(find_files([tmp_path]).files)
+    assert entry.status == "failed"
