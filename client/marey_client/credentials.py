@@ -161,14 +161,13 @@ def require_address(url: str) -> None:
         return  # without httpx, which takes long to load, and which shell completion does not need
     import httpx
 
-    named = False
     try:
         parts, _ = urlsplit(url), httpx.URL(url)
-        named = parts.username is not None
+        named = "@" in parts.netloc
         fits = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
     except (httpx.InvalidURL, ValueError):
-        fits = False
-    if named:  # errors and logs would show the password
+        fits = named = False
+    if named or ("@" in url and not fits):  # errors and logs would show the password
         raise BadAddress(
             f"the address of a server must not contain a user name or a password; write it like {DEFAULT_URL}, and log "
             "in with `marey login`"

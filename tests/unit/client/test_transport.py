@@ -254,9 +254,18 @@ def test_what_is_no_address_is_refused_before_anything_is_sent(url: str) -> None
         Marey(url, "marey_secret")
 
 
-def test_an_address_with_a_password_is_refused_without_repeating_it() -> None:
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://ada:enigma@127.0.0.1:8460",
+        "http://ada:enigma@127.0.0.1:port",
+        "ada:enigma@127.0.0.1",
+        "http://a:enigma@[",
+    ],
+)
+def test_an_address_with_a_password_is_refused_without_repeating_it(url: str) -> None:
     with pytest.raises(errors.BadAddress, match="must not contain a user name or a password") as refused:
-        Marey("http://ada:enigma@127.0.0.1:8460", "marey_secret")
+        Marey(url, "marey_secret")
     assert "enigma" not in str(refused.value)
 
 
