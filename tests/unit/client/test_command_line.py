@@ -20,7 +20,7 @@ import typer
 from tests.support.command_line import run_here
 from tests.support.scripted_server import ScriptedServer, problem
 
-from marey_client.cli import projects, with_global_options_first
+from marey_client.cli import projects, skeletons, with_global_options_first
 from marey_client.cli.access import tokens
 from marey_client.cli.addresses import Address, folder_or_item, require_item
 from marey_client.cli.app import OTHER_NAMES, app, with_one_command
@@ -40,6 +40,7 @@ from marey_client.credentials import Credential, Logins, read_logins, store_logi
 from marey_client.errors import BadCredentialFile, Forbidden, Invalid, NotFound, Unauthenticated
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.marey import Marey
+from marey_schemas.documents.skeletons import SkeletonMapping
 from marey_schemas.imports import ImportEntry
 from marey_schemas.items import LineageEdge, Staleness
 from marey_schemas.kinds import Kind
@@ -547,7 +548,20 @@ def test_who_interrupts_a_download_is_told_what_is_complete(tmp_path: Path, caps
     chosen = [downloading._Exported(item, None, "", name) for name in ("walk", "turn")]
     with pytest.raises(KeyboardInterrupt):
         downloading._download_all(chosen, tmp_path, {})
-    assert "at least 1 file of 2 are complete" in capsys.readouterr().err
+    assert f"files that are complete in {tmp_path}: at least 1 of 2; no file is cut off" in capsys.readouterr().err
+
+
+def test_a_joint_without_axes_is_given_both_of_its_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+    item = mock.Mock(mapping=lambda: SkeletonMapping(joints={"left_elbow": "LeftForeArm"}))
+    monkeypatch.setattr(skeletons, "connect", mock.MagicMock())
+    monkeypatch.setattr(skeletons, "require_item", lambda *_: item)
+    with pytest.raises(WrongUsage, match="'LeftForeArm' has no axes yet; give it both `--twist` and `--swing`"):
+        skeletons.joint_axes(mock.Mock(), "lab/rig", "LeftForeArm", twist="2,0,0")
+    skeletons.joint_axes(mock.Mock(), "lab/rig", "LeftForeArm", twist="2,0,0", swing="0,1,0")
+    (stated,) = item.put_mapping.call_args.args
+    assert stated.method == "manual"
+    assert stated.axes["LeftForeArm"].twist == (1.0, 0.0, 0.0)
+    assert stated.axes["LeftForeArm"].swing == (0.0, 1.0, 0.0)
 
 
 def test_a_token_whose_file_does_not_fit_on_the_disk_is_never_made(

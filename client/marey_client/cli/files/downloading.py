@@ -190,8 +190,8 @@ def _download_all(
                 advance("downloading", len(written) + len(refused), len(chosen))
     except KeyboardInterrupt:
         print_message(
-            f"interrupted; at least {counted(len(written), 'file')} of {len(chosen)} are complete in {output}, and no "
-            "file is cut off; repeating the command writes all files again"
+            f"interrupted; files that are complete in {output}: at least {len(written)} of {len(chosen)}; no file is "
+            "cut off; repeating the command writes all files again"
         )
         raise
     return written, refused
