@@ -40,7 +40,7 @@ CODES = {
     "the source's pelvis contradicts this line.",
     "dropped-joints-followed": "Retargeted bones of spine or neck were turned, because only one of the skeletons has "
     "some joints of spine or neck.",
-    "axes-from-clip": "Axes of the source skeleton are unknown; they were read from the retargeted clip.",
+    "axes-from-clip": "Axes of the source skeleton are unknown; they were read from the source clip.",
     "axes-guessed": "Axes of the target skeleton are unknown; they were guessed.",
     "below-floor": "Hands or feet of the retargeted clip are below the floor on which the source stands.",
     "feet-kept": "Feet of the retargeted clip were moved, so that they stay in place while the source's feet do so.",
