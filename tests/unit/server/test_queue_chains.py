@@ -187,13 +187,34 @@ def test_dependants_of_a_job_that_succeeds_are_queued_in_short_transactions(
     assert Counter(desk.state(one) for one in others) == {"queued": 9}
 
 
-def test_each_step_down_a_chain_counts_as_an_end(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 4)
+def _chain(desk: Desk) -> list[str]:
+    """Submit 13 jobs of which each depends on the one before."""
     chain = [desk.submit()]
     for _ in range(12):
         chain.append(desk.submit(after=[chain[-1]]))
+    return chain
+
+
+def test_each_step_down_a_chain_counts_as_an_end(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 4)
+    chain = _chain(desk)
     desk.cancel(chain[0])
     assert Counter(desk.state(one) for one in chain) == {"cancelled": 1, "failed": 2, "waiting": 10}
+
+
+def test_jobs_that_end_in_a_later_transaction_come_after_those_that_others_have_left(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 4)
+    chains = [_chain(desk) for _ in range(2)]
+    for name, chain in zip(("ann", "bea"), chains, strict=True):
+        actor = replace(desk.user, user_name=name)
+        desk.database.write(actor, reading.cancel_job, chain[0], desk.policy)
+    failed = []
+    for _ in range(4):
+        desk.database.write(SYSTEM, propagate_rest)
+        failed.append([sum(desk.state(one) == "failed" for one in chain) for chain in chains])
+    assert failed == [[3, 2], [3, 3], [4, 3], [4, 4]]
 
 
 def test_a_parent_job_ends_with_its_last_task_however_few_ends_a_transaction_propagates(
