@@ -25,7 +25,7 @@ from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 from marey_server.http.validation import decode_body, validate_body
 from marey_server.motions import importing
-from marey_server.motions.importing import PreparedImport, SourceFile, UnclearFiles
+from marey_server.motions.importing import PreparedImport, SourceFile, WaitingFiles
 from marey_server.store import blobs, projects
 from marey_server.store.blob_backings import SPOOLED_BYTES, Spool
 from marey_server.store.jobs import submission
@@ -174,15 +174,15 @@ class ProjectImports(Resource):
         plans, order = await self.compute(importing.plan, [file.name for file in self.files])
         by_name = {file.name: file for file in reversed(self.files)}
         prepare = partial(self._prepare, by_name, options, skeleton)
-        unclear = UnclearFiles()
+        waiting = WaitingFiles()
         entries = await self._import_all(
-            project, ((place, partial(prepare, plans[place], None)) for place in order), unclear
+            project, ((place, partial(prepare, plans[place], None)) for place in order), waiting
         )
         entries |= await self._import_all(
             project,
             (
                 (place, partial(_ready, file) if axis is None else partial(prepare, plans[place], axis))
-                for place, file, axis in unclear.files()
+                for place, file, axis in waiting.files()
             ),
             None,
         )
@@ -191,11 +191,11 @@ class ProjectImports(Resource):
         return [entries[place] for place in range(len(plans))]
 
     async def _import_all(
-        self, project: str, works: Iterable[Work], unclear: UnclearFiles | None
+        self, project: str, works: Iterable[Work], waiting: WaitingFiles | None
     ) -> dict[int, ImportEntry]:
         """Read files in child processes while earlier files are stored; return the entries by place in the import.
 
-        Files that need other files (see `UnclearFiles`) are recorded in `unclear`, if it is given, and not stored.
+        Files that wait for other files are recorded in `waiting`, if it is given, and not stored.
         """
         entries: dict[int, ImportEntry] = {}
         reading = deque(works)
@@ -211,7 +211,7 @@ class ProjectImports(Resource):
                     place, task = ahead[0]
                     file = await task
                     ahead.popleft()
-                    if unclear is None or not unclear.take(place, file):
+                    if waiting is None or not waiting.take(place, file):
                         ready[place] = file
                 if storing is not None:
                     entries |= await storing

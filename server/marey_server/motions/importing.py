@@ -163,7 +163,7 @@ def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> 
     return PreparedImport(name, tuple(sources), drafts, found.checks, found.frames, graph=graph, axis=found.axis)
 
 
-class UnclearFiles:
+class WaitingFiles:
     """Files of an import that need other files: graphs of models, and files that do not show which axis points up.
 
     They wait until all other files have been read and stored: a graph refers to models, and another file with the same
