@@ -81,7 +81,8 @@ def plan_between(context: Context, source: Rig, target: Rig, scale: float | None
     mapped = read_mapped(context, source)
 
     def plan() -> RetargetPlan:
-        return plan_retarget(*mapped.seen_in(clip)[:3], *read_mapped(context, target)[:3], scale=scale)
+        seen, to = mapped.seen_in(clip), read_mapped(context, target)
+        return plan_retarget(seen.skeleton, seen.mapping, seen.axes, to.skeleton, to.mapping, to.axes, scale=scale)
 
     return plan() if mapped.guessed else _plans.get_or_make((source, target, scale), plan)
 
