@@ -173,7 +173,7 @@ async def listening(
             try:
                 yield Running(app, address, server)
                 await _linger(app.services, connections, linger_s)
-            finally:  # before the end of housekeeping, which waits for a write
+            finally:  # first, because the end of housekeeping can wait long for a write
                 await _drain(app.services, server, connections)
     finally:
         app.services.close()

@@ -146,7 +146,7 @@ class Transaction:
 
     @property
     def actor(self) -> str | None:
-        """Who has caused the events of this transaction: the principal, or the actor for whom work is continued."""
+        """The actor in events: that of the principal, or of the earlier transaction whose work this one continues."""
         return self.continued_for or self.principal.actor
 
     def beside(self, principal: Principal) -> Transaction:
