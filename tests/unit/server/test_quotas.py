@@ -5,12 +5,12 @@ import random
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import fields, replace
 from typing import Any
 
 import pytest
-from sqlalchemy import event
+from sqlalchemy import event, update
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab, skeleton_tree
@@ -20,6 +20,8 @@ from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.jobs import ItemInput, JobCreate
+from marey_server import faults
+from marey_server.access.principal import SYSTEM
 from marey_server.errors import QuotaExceededProblem
 from marey_server.motions import importing
 from marey_server.motions.importing import PreparedImport, SourceFile
@@ -31,6 +33,7 @@ from marey_server.store.database import connections
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.items import Draft
 from marey_server.store.jobs import reading, submission
+from marey_server.store.tables import user
 from marey_server.store.transaction import Quotas, Transaction
 
 LIMIT = 3
@@ -150,6 +153,39 @@ def test_a_submission_does_not_count_the_unfinished_jobs_again_while_there_is_ro
         desk.submit()
     assert len(counts) == 1
     with pytest.raises(QuotaExceededProblem, match="6 unfinished jobs"):
+        desk.submit()
+
+
+@pytest.mark.every_database
+def test_the_first_count_waits_for_tasks_that_are_being_stored(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After an upgrade, nobody has counted the jobs yet. On SQLite, writes follow one another in any case."""
+    if desk.database.is_sqlite:
+        return
+    maker = desk.submit("sum")
+    desk.submit("square", inputs={"things": [{"job": maker}]})
+    desk.database.write(SYSTEM, lambda tx: tx.execute(update(user).values(jobs_bound=None)))
+    desk.database.quotas = Quotas(user_jobs=5)
+    lease = desk.claim(job=maker)
+    desk.stage(lease, *(f"sum{number}" for number in range(5)))
+    storing, go_on = threading.Event(), threading.Event()
+
+    def hold(name: str) -> None:
+        if name == "late_inputs.before_commit":
+            storing.set()
+            assert go_on.wait(60)
+
+    monkeypatch.setattr(faults, "point", hold)
+    with ThreadPoolExecutor() as pool:
+        completing = pool.submit(desk.complete, lease)
+        assert storing.wait(60)
+        try:
+            submitting = pool.submit(desk.submit)
+            wait([submitting], 0.5)
+        finally:
+            go_on.set()
+        completing.result(60)
+        submitting.result(60)
+    with pytest.raises(QuotaExceededProblem, match="5 unfinished jobs"):  # three tasks, their parent, and another job
         desk.submit()
 
 

@@ -6,7 +6,6 @@ time; see `require_room_for_jobs`.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,6 +83,14 @@ _ADD_JOBS = Prepared(
     .returning(user.c.id)
 )
 
+_NOTE_JOBS = Prepared(
+    update(user)
+    .where(user.c.id == bindparam("of_user"))
+    .values(jobs_bound=user.c.jobs_bound + bindparam("more"))
+    .returning(user.c.id)
+)
+"""Locks the row of a user also while the number is null, so that a concurrent first count waits for these jobs."""
+
 
 def require_room_for_jobs(tx: Transaction, more: int) -> None:
     """Raise `QuotaExceededProblem` if the caller would exceed the quota `user_jobs` by adding `more` unfinished jobs.
@@ -103,7 +110,7 @@ def require_room_for_jobs(tx: Transaction, more: int) -> None:
 
 def note_jobs(tx: Transaction, user_id: str, more: int) -> None:
     """Note that a user has `more` unfinished jobs, even if this exceeds the quota `user_jobs`."""
-    tx.run(_ADD_JOBS, {"of_user": user_id, "more": more, "most": sys.maxsize})
+    tx.run(_NOTE_JOBS, {"of_user": user_id, "more": more})
 
 
 def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
