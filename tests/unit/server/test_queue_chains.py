@@ -18,7 +18,14 @@ from marey_schemas.queue import job_kinds
 from marey_schemas.queue.jobs import ItemInput, JobCreate, JobState, Progress
 from marey_schemas.queue.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem, NotFoundProblem
+from marey_server.errors import (
+    ConflictProblem,
+    ForbiddenProblem,
+    InvalidProblem,
+    LeaseLostProblem,
+    NotFoundProblem,
+    UnavailableProblem,
+)
 from marey_server.store import blobs, events, garbage, items, members, users
 from marey_server.store.database.connections import Database
 from marey_server.store.items.drafts import Draft
@@ -226,6 +233,26 @@ def test_a_parent_job_ends_with_its_last_task_however_few_ends_a_transaction_pro
         desk.complete(desk.claim())
     assert desk.state(whole) == "succeeded"
     assert not desk.database.write(SYSTEM, propagate_rest)
+
+
+def test_a_retry_waits_until_all_dependants_have_ended_and_includes_them(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 2)
+    first = desk.submit()
+    others = [desk.submit(after=[first]) for _ in range(3)]
+    last = desk.submit(after=[others[0]])
+    desk.cancel(first)
+    for _ in range(3):
+        with pytest.raises(UnavailableProblem) as refused:
+            desk.database.write(desk.user, retrying.retry_job, first)
+        assert (refused.value.error_code, refused.value.headers) == ("still-ending", {"Retry-After": "1"})
+        assert desk.database.write(SYSTEM, propagate_rest)
+    while desk.database.write(SYSTEM, propagate_rest):
+        pass
+    desk.database.write(desk.user, retrying.retry_job, first)
+    everything = desk.database.read(desk.user, reading.list_jobs, desk.project).items
+    assert {one.retry_of for one in everything} == {None, first, *others, last}
 
 
 def test_a_job_can_only_come_after_jobs_of_its_project(desk: Desk) -> None:

@@ -12,7 +12,7 @@ from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
 from marey_schemas.queue.jobs import FailureReason, Job, JobState
 from marey_schemas.queue.scripts import SCRIPT
 from marey_server.access import roles
-from marey_server.errors import ConflictProblem
+from marey_server.errors import ConflictProblem, UnavailableProblem
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.ids import new_id
 from marey_server.store.jobs import commits
@@ -40,7 +40,8 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
 
     Raises `ConflictProblem` for a task, for a job that has not ended or has succeeded, and if one of the jobs cannot
     run again, for example because an input was purged. Raises `ForbiddenProblem` for a job, or an unsuccessful
-    dependency, of another user, unless the caller is a maintainer.
+    dependency, of another user, unless the caller is a maintainer. Raises `UnavailableProblem` if the end of one of the
+    jobs is still being propagated to the dependants.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
@@ -109,6 +110,12 @@ class _Family:
         return dict(zip(self._rows, made, strict=True))
 
     def _take(self, rows: Mapping[str, Row[Any]], needs: Mapping[str, dict[str, str]]) -> None:
+        if any(row.propagation_rank is not None for row in rows.values()):
+            raise UnavailableProblem(
+                "Jobs that depend on these jobs are still being ended; try again in a few seconds.",
+                code="still-ending",
+                headers={"Retry-After": "1"},
+            )
         self._rows |= rows
         self._needs |= needs
         if len(self._rows) > MOST_AT_ONCE:
