@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from tests.support.present import present
 from tests.support.queue_desk import SUM, Desk, document
 from tests.support.store_fixtures import declared, requiring
 
-from marey_schemas.access import MemberChange, Role, UserCreate
+from marey_schemas.access import MemberChange, ProjectCreate, Role, UserCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_kinds
 from marey_schemas.queue.jobs import ItemInput, JobCreate, JobState, Progress
@@ -26,12 +26,14 @@ from marey_server.errors import (
     NotFoundProblem,
     UnavailableProblem,
 )
-from marey_server.store import blobs, events, garbage, items, members, users
+from marey_server.store import blobs, events, garbage, items, members, projects, users
 from marey_server.store.database.connections import Database
+from marey_server.store.database.prepared import padded
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import propagation, reading, result_cache, retrying
 from marey_server.store.jobs.propagation import propagate_rest
 from marey_server.store.jobs.reaper import share_waiting
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import staged_output
 from marey_server.store.transaction import Transaction
 
@@ -253,6 +255,70 @@ def test_a_retry_waits_until_all_dependants_have_ended_and_includes_them(
     desk.database.write(desk.user, retrying.retry_job, first)
     everything = desk.database.read(desk.user, reading.list_jobs, desk.project).items
     assert {one.retry_of for one in everything} == {None, first, *others, last}
+
+
+@pytest.mark.every_database
+def test_later_transactions_leave_projects_alone_whose_purges_they_do_not_hold_off(
+    desk: Desk, open_database: Callable[[], Database], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On SQLite, where writes run one after another, no other write marks jobs meanwhile."""
+    if desk.database.is_sqlite:
+        return
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 2)
+    elsewhere = open_database()
+    desk.database.write(desk.user, projects.create_project, ProjectCreate(name="other"))
+    chains: list[list[str]] = []
+    for desk.project in ("lab", "other"):
+        first = desk.submit()
+        second = desk.submit(after=[first])
+        chains.append([first, second, desk.submit(after=[second])])
+    held: list[tuple[str, ...]] = []
+
+    def hold_off_late(tx: Transaction, *ids: str) -> None:
+        held.append(ids)
+        if len(held) == 1:
+            elsewhere.write(desk.user, reading.cancel_job, chains[1][0])
+        hold_off_purges(tx, *ids)
+
+    desk.cancel(chains[0][0])
+    monkeypatch.setattr(propagation, "hold_off_purges", hold_off_late)
+    assert desk.database.write(SYSTEM, propagate_rest)
+    assert [desk.state(last) for *_, last in chains] == ["failed", "waiting"]
+    while desk.database.write(SYSTEM, propagate_rest):
+        pass
+    assert [desk.state(last) for *_, last in chains] == ["failed", "failed"]
+
+
+@pytest.mark.every_database
+def test_jobs_that_share_a_result_no_more_are_left_alone_by_later_transactions(
+    desk: Desk, open_database: Callable[[], Database], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On SQLite, where writes run one after another, nothing happens between two statements of one."""
+    if desk.database.is_sqlite:
+        return
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 2)
+    source = desk.submit("sum")
+    others = [desk.submit(after=[source]) for _ in range(2)]
+    lease = desk.claim(job=source)
+    sharing = [desk.submit("sum") for _ in range(3)]
+    desk.complete(lease, shareable=False)
+    assert {desk.state(one) for one in others} == {"queued"}
+    between, housekeeping = open_database(), open_database()
+    shared: list[bool] = []
+
+    def share_first(ids: Collection[str]) -> list[str]:
+        if set(sharing) <= set(ids) and not shared:  # the dependants are known, and not locked
+            shared.append(True)
+            between.write(SYSTEM, share_waiting)
+        return padded(ids)
+
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 4)
+    monkeypatch.setattr(propagation, "padded", share_first)
+    while housekeeping.write(SYSTEM, propagate_rest):
+        pass
+    assert shared
+    assert Counter(desk.state(one) for one in sharing) == {"queued": 1, "waiting": 2}
+    assert {desk.job(one).cached_from for one in sharing if desk.state(one) == "waiting"} <= set(sharing)
 
 
 def test_a_job_can_only_come_after_jobs_of_its_project(desk: Desk) -> None:

@@ -62,12 +62,15 @@ def propagate_rest(tx: Transaction) -> bool:
     """
     tx.lock("propagation")
     most = {"most": MOST_AT_ONCE}
-    hold_off_purges(tx, *{row.project_id for row in tx.execute(_REST, most)})
+    projects = {row.project_id for row in tx.execute(_REST, most)}
+    hold_off_purges(tx, *projects)
     found = tx.execute(_REST, most).all()  # again, because a purge may have deleted some
     if not found:
         return False
     how, rank = found[0].propagation, found[0].propagation_rank
-    rows = list(takewhile(lambda row: row.propagation == how, found))
+    rows = list(takewhile(lambda row: row.propagation == how and row.project_id in projects, found))
+    if not rows:  # the first was marked in the meantime, in a project that may be purged now
+        return True
     ended = [replace(as_ended(row), shareable=how["shareable"]) for row in rows]
     unmark = update(job).where(job.c.id.in_([one.id for one in ended]))
     tx.execute(unmark.values(propagation=null(), propagation_rank=None))
@@ -219,7 +222,9 @@ def _move_dependants(tx: Transaction, ended: Sequence[Ended]) -> tuple[list[Ende
     upstream: dict[str, list[Ended]] = {}
     for row in tx.run(_RELEASE, {"ended": padded(ends), "dependants": padded(ids)}):
         upstream.setdefault(row.job_id, []).append(ends[row.on_job_id])
-    return _move(tx, tx.run(_WAITING_JOBS, {"ids": padded(ids)}), upstream), len(ids) < MOST_AT_ONCE
+    # Without those that another transaction has released since: they do not share the result of these jobs any more.
+    waiting = tx.run(_WAITING_JOBS, {"ids": padded(upstream)}) if upstream else []
+    return _move(tx, waiting, upstream), len(ids) < MOST_AT_ONCE
 
 
 def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
