@@ -191,15 +191,13 @@ def _print_numbers(walks: Sequence[ComparableClip], truth: Floats, analysis: Stu
             "groups", *([walks[each].name for each in order.order if order.groups[each] == group] for group in (0, 1))
         )
     for fit in analysis.fits:
-        first = fit.parts[0].component
-        print(
-            f"{first.shaping}, exponent {first.exponent:.2f}, shares {fit.metric.shares}: rmse {fit.quality.rmse:.4f}"
-        )
+        print(f"{fit.parts[0].component.shaping}, shares {fit.metric.shares}: rmse {fit.quality.rmse:.4f}")
         for part in fit.parts:
             one = part.component
             weights = " ".join(f"{name} {share:.3f}" for name, share in one.weights.items())
             print(
-                f"  {one.measurement:10} rmse {part.quality.rmse:.4f} c {one.constant:.3f} N {one.norm:.3f} {weights}"
+                f"  {one.measurement:10} rmse {part.quality.rmse:.4f} exponent {one.exponent:.2f} c {one.constant:.3f} "
+                f"N {one.norm:.3f} {weights}"
             )
 
 
