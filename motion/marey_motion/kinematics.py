@@ -321,11 +321,13 @@ def forward_vectors(positions: AnyFloats, left: Sequence[int], right: Sequence[i
 
     Raises
     ------
-    MotionError    if there is no pair of joints
+    MotionError    if there are no joints, or not as many left as right ones
     """
     if not left or len(left) != len(right):
         raise MotionError(
-            "computing a heading needs at least one pair of a left and a right joint", code="heading-undefined"
+            f"computing a heading needs as many left as right joints, at least one of each, not {len(left)} left and "
+            f"{len(right)} right joints",
+            code="heading-undefined",
         )
     lateral = np.sum(positions[:, list(left)].astype(np.float64) - positions[:, list(right)], axis=1)
     return np.stack((-lateral[:, 2], lateral[:, 0]), axis=1)

@@ -148,7 +148,8 @@ def marey(
     server: Annotated[
         str | None,
         typer.Option(
-            envvar=list(SERVER_VARIABLES), help="Address of the server; default: the server of your last login."
+            envvar=list(SERVER_VARIABLES),
+            help="Address of the server. Default: the server of your last login, else a server on this machine.",
         ),
     ] = None,
     token_file: Annotated[

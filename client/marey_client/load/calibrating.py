@@ -41,8 +41,9 @@ class Calibration:
     `claim_s` and `complete_s` are the mean durations of the two requests of a single worker, in seconds; `variation` is
     the standard deviation of these durations divided by the mean. `busy_s` is the time per job when `CROWDED` workers
     compete. `some_per_s` is the number of jobs per second of `SOME` workers. `work_s` is the time per job that a single
-    worker spends outside its requests; it is longer than planned on a busy machine. All values are computed from
-    all rounds.
+    worker spends outside its requests; it is longer than planned on a busy machine. `processor_s` and `database_bytes`
+    are the processor time of the server and the growth of the database per job. All values are computed from all
+    rounds.
     """
 
     claim_s: float

@@ -24,7 +24,7 @@ from marey_motion.editing.ground import heights_of_soles
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_ending_at
 from marey_motion.editing.inverse_kinematics.solving import solve_two_bone
 from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget
-from marey_motion.errors import EditError, MappingError
+from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.rigs import JointAxes, JointMapping
 from marey_motion.rigs.standard import SIDES
@@ -70,11 +70,7 @@ def find_feet(skeleton: Skeleton, mapping: JointMapping, axes: Mapping[str, Join
     for side in SIDES:
         *_, ankle = mapping.indices(skeleton, (f"{side}_hip", f"{side}_knee", f"{side}_ankle"))
         leg = limb_ending_at(skeleton, mapping, ankle, axes)
-        if leg is None:
-            raise MappingError(
-                "the mapped hip, knee and ankle are not a chain of joints in this order; correct the joint mapping",
-                where=f"{side}_ankle",
-            )
+        assert leg is not None, "all three joints are mapped"
         toe = f"{side}_toe"
         feet.append(Foot(leg, mapping.indices(skeleton, (toe,))[0] if toe in mapping.joints else ankle))
     return tuple(feet)

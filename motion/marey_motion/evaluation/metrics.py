@@ -90,7 +90,7 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
     if ticks != reference.tick_count or rate != reference.rate_hz:
         raise MotionError(
             f"the record of the trial has {ticks} ticks at {rate:g} Hz, but the reference trajectory has "
-            f"{reference.tick_count} ticks at {reference.rate_hz:g} Hz",
+            f"{reference.tick_count} ticks at {reference.rate_hz:g} Hz; give the record and the reference of one trial",
             where=trial.name,
         )
     steps = np.diff(record.positions, axis=0)

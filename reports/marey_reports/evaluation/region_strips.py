@@ -70,7 +70,7 @@ def poses_of(clip: Clip) -> tuple[Clip, ...]:
 
 
 def region_chapter(posed: Sequence[PosedTrial]) -> Section:
-    """Write the chapter: one picture with a row of poses for each trial."""
+    """Write the chapter on regions: a picture with a row of poses for each trial in `posed`, and a table of them."""
     text = element(
         "p",
         "For each region, poses at even intervals of the trial that exceeds its limits most, of one in the middle of "

@@ -24,9 +24,10 @@ class NotComputable(Exception):
 def capacity(*, costs: Path | None = None, **demand: Any) -> dict[str, Any]:
     """Return what the processing of planned clips needs: the load of each part of the installation, and bytes to store.
 
-    The result also has the date and machine of the measured costs. `costs` is a file of costs, by default that of this
-    package. `demand` contains the fields of `PlannedWork`. Raises `NotComputable` if the file or an amount is not
-    valid.
+    The result also names the part that is busy first (`first`), and has the number of clips per day at which it is busy
+    all the time (`clips_per_day`), the predicted jobs per second of 2, 8 and 32 workers, and the date and machine of
+    the measured costs. `costs` is a file of costs, by default that of this package. `demand` contains the fields of
+    `PlannedWork`. Raises `NotComputable` if the file or an amount is not valid.
     """
     try:
         measured = MeasuredCosts.read(costs or MEASURED)

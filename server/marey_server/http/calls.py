@@ -160,9 +160,10 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
 
 
 def _require_participation(access: Access, principal: Principal) -> None:
-    """Let only participants of studies perform the operations for participants, and no other operations.
+    """Require that an operation for participants has a participant as its caller, and that other operations do not.
 
-    Raises `ForbiddenProblem` for all other callers and operations.
+    Operations that anyone may perform are always allowed. Called only if the caller is a participant, or if the
+    operation is for participants. Raises `ForbiddenProblem`.
     """
     if access is Access.ANYONE:
         return

@@ -312,7 +312,7 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_folder(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault if the record of what is checked out in a dataset's folder is missing."""
+    """Return a fault if the record of what is checked out in a dataset's folder is missing or damaged."""
     try:
         manifest = read_manifest(tx, row)
         if manifest is not None and manifest.partial:

@@ -20,7 +20,11 @@ from marey_client.cli.terminal.typed_values import assignment, json_or_text, rea
 if TYPE_CHECKING:
     from marey_schemas.queue.scripts import ScriptRun
 
-script = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Run commands of Git commits, and compare runs.")
+script = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="Run scripts (commands in the code of a Git commit), and compare their runs.",
+)
 
 OWN_COLUMNS = ("job", "state", "commit", "seed", "author", "created_at", "finished_at")
 """Names of columns that every script has, in addition to its parameters and logged fields."""

@@ -114,7 +114,13 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
         nodes.append((name, parents.get(name), listed[name]))
         waiting.extend(reversed(text_list(listed[name], "children", file)))
     if len(nodes) != len(listed):
-        raise FormatError("the joints are not a tree: some joints are not connected to the root", file=file)
+        below = {name for name, _, _ in nodes}
+        raise FormatError(
+            f"the joints are not a tree: this joint is its own ancestor or below such a joint, and not below the root "
+            f"{roots[0]!r}; correct the lists `children`",
+            file=file,
+            joint=next(name for name in listed if name not in below),
+        )
     return nodes
 
 
