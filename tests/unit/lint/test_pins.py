@@ -28,6 +28,14 @@ def required(extra: str) -> set[str]:
     return names
 
 
+def test_no_tornado_is_allowed_that_leaves_cancelled_requests_without_an_answer() -> None:
+    """A stopping server cancels requests; before 6.6, Tornado did not answer these, and logged their tracebacks."""
+    wanted = map(Requirement, PYPROJECT["project"]["optional-dependencies"]["server"])
+    (tornado,) = (one for one in wanted if one.name == "tornado")
+    assert "6.5.10" not in tornado.specifier
+    assert "6.6" in tornado.specifier
+
+
 def test_every_pin_has_a_version_and_a_hash() -> None:
     unhashed = [name for pins in PINS.values() for name, text in pins.items() if "--hash=sha256:" not in text]
     assert unhashed == []
