@@ -27,7 +27,7 @@ from marey_server.store.datasets.proposals import WaitingMerges
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
 from marey_server.store.jobs.finishing import commit_deferred
-from marey_server.store.jobs.propagation import propagate_rest
+from marey_server.store.jobs.propagation import postpone_rest, propagate_rest
 from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.object_upkeep.moving import move_uploads
@@ -179,10 +179,17 @@ async def _propagate_ends(services: Services, _holder: str, *, listener: Listene
     """Propagate the ends of jobs that other transactions have left, in short transactions.
 
     First wait until there are such ends, but at most `longest_wait_s` seconds, because another process may have ended.
+    After an unexpected error, the ends concerned must wait until all others are propagated.
     """
     await listener.wait(longest_wait_s)
-    while await _write(services, propagate_rest):
-        pass
+    try:
+        while await _write(services, propagate_rest):
+            pass
+    except ApiProblem:
+        raise
+    except Exception:
+        await _write(services, postpone_rest)
+        raise
 
 
 def _leads(tx: Transaction, holder: str) -> bool:

@@ -3,10 +3,12 @@
 import asyncio
 import os
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 from tests.support.patience import PATIENCE_S
+from tests.support.queue_desk import Desk
 
 from marey_server.app import create_app
 from marey_server.process import housekeeping
@@ -15,7 +17,10 @@ from marey_server.process.settings import Settings
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client
 from marey_server.store.datasets.proposals import WaitingMerges
+from marey_server.store.jobs import late_inputs, propagation
+from marey_server.store.jobs.endings import Ended
 from marey_server.store.jobs.policy import QueuePolicy
+from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, wakeups
 
 
@@ -140,3 +145,35 @@ def test_copies_of_index_files_that_the_store_has_deleted_are_removed(
             assert not copy.exists()
 
     asyncio.run(until_removed())
+
+
+def test_ends_that_cannot_be_propagated_do_not_delay_those_of_other_jobs(
+    desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(housekeeping, "LONGEST_TICK_S", 0.02)
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 2)
+    pin = late_inputs.pin_late_inputs
+
+    def pin_faultily(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
+        if faulty in ids:
+            raise RuntimeError("a fault of the server")
+        return pin(tx, ids)
+
+    monkeypatch.setattr(late_inputs, "pin_late_inputs", pin_faultily)
+    one, other = desk.submit("sum"), desk.submit()
+    waiting = [[desk.submit(after=[first]) for _ in range(3)] for first in (one, other)]
+    faulty = desk.submit("square", inputs={"things": [{"job": one}]})
+    leases = {lease.job: lease for lease in desk.claim_many()}
+    desk.stage(leases[one], "sum")
+    for first in (one, other):
+        desk.complete(leases[first])
+    assert [desk.state(last) for *_, last in waiting] == ["waiting", "waiting"]
+    app = create_app(Settings(data=tmp_path, port=0), desk.database)
+
+    async def until_propagated() -> None:
+        async with housekeeping.running_housekeeping(app.services), asyncio.timeout(PATIENCE_S):
+            while await asyncio.to_thread(desk.state, waiting[1][-1]) == "waiting":
+                await asyncio.sleep(0.02)
+
+    asyncio.run(until_propagated())
+    assert (desk.state(waiting[1][-1]), desk.state(faulty)) == ("queued", "waiting")

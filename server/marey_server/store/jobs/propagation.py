@@ -90,6 +90,20 @@ def propagate_rest(tx: Transaction) -> bool:
     return True
 
 
+def postpone_rest(tx: Transaction) -> None:
+    """Put the ends that `propagate_rest` would propagate next behind all others, after an unexpected error."""
+    tx.lock("propagation")
+    found = tx.execute(_REST, {"most": 1}).first()
+    if found is not None:
+        same = update(job).where(job.c.propagation_rank == found.propagation_rank)
+        tx.execute(same.values(propagation_rank=_next_rank(tx)))
+
+
+def _next_rank(tx: Transaction) -> int:
+    last = select(func.max(job.c.propagation_rank)).where(job.c.propagation_rank.is_not(None))
+    return (tx.execute(last).scalar() or 0) + 1
+
+
 _REST = (
     select(*ENDED_COLUMNS, job.c.propagation, job.c.propagation_rank)
     .where(job.c.propagation_rank.is_not(None))
@@ -125,8 +139,7 @@ def _leave(tx: Transaction, ended: Sequence[Ended], *, announced: bool, rank: in
     if not ended:
         return
     if rank is None:
-        last = select(func.max(job.c.propagation_rank)).where(job.c.propagation_rank.is_not(None))
-        rank = (tx.execute(last).scalar() or 0) + 1
+        rank = _next_rank(tx)
     for shareable in (True, False):
         how = {"actor": tx.actor, "shareable": shareable, "announced": announced}
         for some in in_lists([end.id for end in ended if end.shareable == shareable]):
