@@ -194,6 +194,16 @@ def test_a_wrong_field_of_a_skeleton_is_named(joint: int, change: dict[str, Any]
         read(document, None)
 
 
+def test_a_joint_that_is_not_below_the_root_is_named() -> None:
+    document = json.loads(json.dumps(TWO_BONES))
+    lost = {"offset": [0, 0, 0], "rotation": [-1, 0, 0, 0]}
+    for name, child in (("left", "right"), ("right", "left")):
+        document["jointDescs"].append({**lost, "name": name, "targetName": name, "children": [child]})
+    with pytest.raises(FormatError, match="not below the root 'hip'") as refused:
+        read(document, None)
+    assert refused.value.joint == "left"
+
+
 @pytest.mark.parametrize(
     "data",
     [
