@@ -1,5 +1,6 @@
 """Connected jobs: dependencies, fan-outs, shared results, and retries."""
 
+import asyncio
 import re
 from collections import Counter
 from collections.abc import Callable, Collection
@@ -36,6 +37,7 @@ from marey_server.store.jobs.reaper import share_waiting
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import staged_output
 from marey_server.store.transaction import Transaction
+from marey_server.store.wakeups import ENDS_TO_PROPAGATE, wakeups
 
 AT_ONCE = 4
 """Greatest number of jobs that get a shared result in one transaction, with the fixture `few_at_once`."""
@@ -209,6 +211,18 @@ def test_each_step_down_a_chain_counts_as_an_end(desk: Desk, monkeypatch: pytest
     chain = _chain(desk)
     desk.cancel(chain[0])
     assert Counter(desk.state(one) for one in chain) == {"cancelled": 1, "failed": 2, "waiting": 10}
+
+
+def test_ends_that_are_left_wake_housekeeping(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(propagation, "MOST_AT_ONCE", 4)
+    chain = _chain(desk)
+
+    async def cancel() -> bool:
+        with wakeups.listen([ENDS_TO_PROPAGATE]) as listener:
+            desk.cancel(chain[0])
+            return await listener.wait(1.0)
+
+    assert asyncio.run(cancel())
 
 
 def test_jobs_that_end_in_a_later_transaction_come_after_those_that_others_have_left(
