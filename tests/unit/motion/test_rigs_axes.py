@@ -16,6 +16,7 @@ from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs import JointMapping, axes_from_motion, guess_axes, map_joints, rest_pose_doubts
 from marey_motion.rigs.axes import JointAxes
+from marey_motion.rigs.conventions import conventional_axes
 from marey_motion.skeleton import EndSite, Skeleton
 
 X, Y, Z = np.eye(3)
@@ -356,3 +357,12 @@ def test_the_stated_axes_of_a_known_rig_turn_with_its_rest_pose_and_its_bones(mo
     found = guess_axes(other, map_joints(other))["LowerArm_L"]
     np.testing.assert_allclose(found.twist, offsets[wrist] / np.linalg.norm(offsets[wrist]), atol=1e-6)
     np.testing.assert_allclose(found.swing, stated.swing, atol=1e-6)
+
+
+def test_a_bone_with_a_joint_in_between_has_the_stated_twist() -> None:
+    """The offset of the elbow is in the frame of the joint in between, which may be turned."""
+    offsets = np.array([[0.0, 1.4, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
+    arm = Skeleton(("Shoulder", "Between", "Elbow"), (-1, 0, 1), offsets, quaternions.identity(3))
+    joints = {"left_shoulder": 0, "left_elbow": 2}
+    found = conventional_axes(arm, "bandai-namco", joints, {"left_shoulder": "left_elbow"})
+    np.testing.assert_array_equal(found["left_shoulder"][0], X)
