@@ -362,7 +362,8 @@ def test_the_stated_axes_of_a_known_rig_turn_with_its_rest_pose_and_its_bones(mo
 def test_a_bone_with_a_joint_in_between_has_the_stated_twist() -> None:
     """The offset of the elbow is in the frame of the joint in between, which may be turned."""
     offsets = np.array([[0.0, 1.4, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
-    arm = Skeleton(("Shoulder", "Between", "Elbow"), (-1, 0, 1), offsets, quaternions.identity(3))
+    parents = np.array([-1, 0, 1], dtype=np.int32)
+    arm = Skeleton(("Shoulder", "Between", "Elbow"), parents, offsets, quaternions.identity(3))
     joints = {"left_shoulder": 0, "left_elbow": 2}
     found = conventional_axes(arm, "bandai-namco", joints, {"left_shoulder": "left_elbow"})
     np.testing.assert_array_equal(found["left_shoulder"][0], X)
