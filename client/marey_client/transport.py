@@ -44,6 +44,9 @@ LIMITS = httpx.Limits(max_connections=32, max_keepalive_connections=16)
 TRIES_TO_REACH = 3
 """Number of attempts for the first request: a server that has never answered is probably not running."""
 
+_BROKEN = (httpx.NetworkError, httpx.RemoteProtocolError)
+"""Failures of connections to a program that listens; `httpx.NetworkError` includes failures to connect."""
+
 log = logging.getLogger(__name__)
 
 
@@ -234,7 +237,10 @@ class Transport:
             except httpx.TransportError as error:
                 failure = Unreachable(f"{self.url} does not answer: {explain_silence(self.url, error)}")
                 failure.__cause__ = error
-                again, wait_s = repeatable or isinstance(error, NEVER_ARRIVED), None
+                arrived = not isinstance(error, NEVER_ARRIVED)
+                if arrived and isinstance(error, _BROKEN):  # also by a server that stops during the request
+                    self._reached.set()
+                again, wait_s = repeatable or not arrived, None
             delay_s = self.retries.delay_s(tried, wait_s)
             late = time.monotonic() - started + delay_s > self.retries.total_s
             most = self.retries.tries if self._reached.is_set() else min(self.retries.tries, TRIES_TO_REACH)

@@ -46,6 +46,12 @@ def test_a_read_is_sent_again_when_the_connection_is_lost(script: ScriptedServer
     assert len(script.waited) == 2
 
 
+@pytest.mark.parametrize("broken", [LOST, httpx.RemoteProtocolError("Server disconnected")])
+def test_a_server_that_stops_during_the_first_request_is_waited_for(script: ScriptedServer, broken: Exception) -> None:
+    script.answers = [broken, *[NEVER_CONNECTED] * transport.TRIES_TO_REACH, ok(PROJECT)]
+    assert script.marey().project("lab").read().name == "lab"
+
+
 @pytest.mark.parametrize("name", ["a\n", "a?b=c", "a#b", "a%00", "é", "a b"])
 def test_a_name_of_any_characters_stands_in_the_address_as_it_is(script: ScriptedServer, name: str) -> None:
     script.answers = [ok(PROJECT)]
