@@ -188,7 +188,11 @@ def as_token(text: str) -> str:
 
 
 def read_secret(path: Path) -> str:
-    """Return the token in a file. Raises `BadCredentialFile` if it has no token, or if other users can read it."""
+    """Return the token in a file.
+
+    Raises `BadCredentialFile` if the file cannot be read, if it does not contain exactly one token, or if other users
+    can read it.
+    """
     try:
         mode = path.stat().st_mode
         text = path.read_text(encoding="ascii").strip()

@@ -392,7 +392,8 @@ def read_tree(response: httpx.Response) -> Any:
         return decode_tree(response.content, media_type_of(response), max_bytes=MAX_ANSWER_BYTES)
     except CodecError as error:
         raise UnexpectedAnswer(
-            f"{response.request.url.path}: the server's answer cannot be decoded: {error}"
+            f"{response.request.url.path}: this client cannot decode the server's answer ({error}); update the older "
+            "of the two: `marey --version` shows the version of the client"
         ) from error
 
 

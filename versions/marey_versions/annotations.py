@@ -182,8 +182,9 @@ def merge_keyframes(
     """Combine the keyframes that two sides have added and removed.
 
     The result has the keyframes that both sides have kept, and those that one side has added. Changes exclude each
-    other if both sides have removed the same keyframe of the base, and have added different keyframes in its place. A
-    keyframe with the frame or the label of the removed keyframe counts as added in its place.
+    other if both sides have removed the same keyframe of the base, and have not added the same keyframes in its place:
+    for example if one side has moved it, and the other has deleted it. A keyframe with the frame or the label of the
+    removed keyframe counts as added in its place.
 
     Returns
     -------

@@ -36,9 +36,9 @@ def df(
     projects: Annotated[list[str] | None, typer.Argument(help="Projects; default: all that you may read.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show how many items and bytes projects contain, and their limits, the largest project first.
+    """Show how many items and bytes projects contain, and their limits on bytes; most bytes first.
 
-    Deleted items do not count; `marey purge` frees what they occupy.
+    With --json, also the limits on items. Deleted items do not count; `marey purge` frees what they occupy.
     """
     with connect(context) as marey:
         names = projects or [one.name for one in marey.projects()]

@@ -75,7 +75,9 @@ def sample(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the random numbers; the same seed gives the same motions.")
     ] = 0,
-    format: Annotated[str, typer.Option(help=f"Format of the files: {one_of(SAMPLE_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
+    format: Annotated[  # noqa: A002
+        str, typer.Option(help=f"Format of the files: {one_of(SAMPLE_FORMATS)}. json puts all motions into one file.")
+    ] = DEFAULT_FORMAT,
     out: Annotated[Path | None, output_option("Folder of the files; default: the current folder.")] = None,
     into: Annotated[
         str | None, typer.Option(help="Create clips in this folder of the model's project, instead of files.")

@@ -36,7 +36,8 @@ def mean_interval(values: Sequence[float]) -> MeanInterval:
 
     Returns
     -------
-    MeanInterval    in the unit of the measurements; an end that is too large for a float is None
+    MeanInterval    in the unit of the measurements; both ends are None for fewer than `LEAST_REPLICATES` values, and
+        an end that is too large for a float is None
     """
     count, largest = len(values), max(map(abs, values)) or 1.0
     # Divided by the largest, so that sums and squares of huge values stay finite.

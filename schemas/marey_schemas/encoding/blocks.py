@@ -66,9 +66,10 @@ class _Layout:
         return slice(index * self.group_columns, min((index + 1) * self.group_columns, self.columns))
 
     def lead(self, group: int) -> int | None:
-        """Return the number of columns of a group before its first quaternion; None if the shape excludes quaternions.
+        """Return how many columns of a group of columns come before the first quaternion that begins in it.
 
-        Poses have 3 + 4k columns, a translation and a quaternion per joint; rotations have a last axis of four.
+        `group` is the number of the group. Returns None if the array cannot contain quaternions: if it is not float32,
+        or if its shape is neither that of poses, (F, 3 + 4 J), nor one with a last axis of 4.
         """
         if self.spec.dtype != "<f4":
             return None

@@ -15,10 +15,11 @@ Handedness = Literal["right", "left"]
 
 
 class ImportOptions(Options):
-    """Facts that the user knows about the files to import.
+    """Facts that the user knows about the files to import, and choices for the import.
 
-    An absent fact is inferred from the file; the file is refused if the fact is ambiguous. `marey_motion.read_motion`
-    uses the facts about the content of a file: unit, axes, frame rate, rest pose and floor.
+    If unit, upward axis or frame rate is absent, it is inferred from the file; the file is refused if unit or upward
+    axis is ambiguous. Handedness is not inferred: absent means right-handed. `marey_motion.read_motion` uses the facts
+    about the content of a file: unit, axes, frame rate, rest pose and floor.
 
     Examples
     --------

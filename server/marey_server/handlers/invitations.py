@@ -72,7 +72,10 @@ class ServerInvitations(Resource):
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", body=AccountInvitationCreate, answer=NewInvitation, status=201)
     async def post(self, body: AccountInvitationCreate) -> Rendered:
-        """Invite people to create an account and to join a project; the code is shown only once."""
+        """Invite people to create an account and, if the request names a project, to join it.
+
+        The code is shown only once.
+        """
         return await self.answer_with(
             lambda made: Reply(made, location=f"/invitations/{made.id}", headers=WITH_SECRET),
             issuing.create_account_invitation,

@@ -306,7 +306,10 @@ def _secret_in(file: Any) -> str:
 
 
 def _fail(what: str, reason: str) -> NoReturn:
-    raise provider_unavailable(f"The {what} of the identity provider cannot be used: {reason}.")
+    raise provider_unavailable(
+        f"The {what} of the identity provider cannot be used: {reason}. Try again in a minute; if that fails, an "
+        "administrator finds out more with `marey doctor`."
+    )
 
 
 def _refused(detail: str) -> UnauthenticatedProblem:

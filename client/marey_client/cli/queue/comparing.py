@@ -61,7 +61,7 @@ def compare(
     means: Annotated[
         bool,
         typer.Option(
-            "--means", help="Print one row for all runs that differ only by their seeds, with the means of fields."
+            "--means", help="Print one row for each setting, with the means of the fields over its runs (seeds)."
         ),
     ] = False,
     every_column: Annotated[bool, typer.Option("--all-columns", help="Show columns with equal values, too.")] = False,
@@ -92,7 +92,7 @@ def compare(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Compare the succeeded runs of a script: a table of the differences, or charts.
+    """Compare the succeeded runs of a script: print a table of the differences, and with --chart also draw charts.
 
     Runs that differ only by their seeds are replicates of one setting. Charts show the number n of replicates, their
     mean, and for 3 or more replicates the 95 % confidence interval of the mean.

@@ -172,7 +172,10 @@ def _with_possible_content(
 def _possible_contents(
     project_id: str, queries: Sequence[Query]
 ) -> tuple[Select[*tuple[Any, ...]], Select[*tuple[Any, ...]]]:
-    """Return two SQL queries for content digests: of newest revisions that meet `queries`, and of older revisions."""
+    """Return two SQL queries, which select digests of contents.
+
+    The first selects those of the newest revisions that meet `queries`, the second those of all older revisions.
+    """
     of_project = (
         select(revision.c.content)
         .join(item, item.c.id == revision.c.item_id)

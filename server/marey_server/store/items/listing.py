@@ -95,7 +95,8 @@ def list_items(
     """
     if tx.principal.kind == "attempt" and not filters.looks_up_name:
         raise ForbiddenProblem(
-            "A running job can list only items of a given name: send the parameter `name`.", code="not-for-attempts"
+            "A running job can list only items of one name: send the parameter `name` with a whole name, without `*`.",
+            code="not-for-attempts",
         )
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)

@@ -10,7 +10,7 @@ from marey_schemas.documents.studies import StudyDocument
 from marey_schemas.kinds import Kind
 from marey_server.errors import NotFoundProblem
 from marey_server.store import documents, projects
-from marey_server.store.items.reading import find_item, no_item
+from marey_server.store.items.reading import find_item
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import document, revision_part
 from marey_server.store.transaction import Transaction
@@ -46,5 +46,9 @@ def load_design(tx: Transaction, item_id: str, revision: int) -> StudyDocument:
     )
     digest = tx.execute(statement).scalar()
     if digest is None:
-        raise no_item(Kind.STUDY, f"{item_id} at revision {revision}")
+        raise NotFoundProblem(
+            f"The study {item_id} has no revision {revision} that this version of Marey can read; use a newer "
+            "revision.",
+            code="no-item",
+        )
     return StudyDocument.model_validate(documents.load_body(tx, digest))
