@@ -223,6 +223,15 @@ def test_a_changed_byte_is_found_and_the_member_named(member: ArchiveMember, dat
         checked(made.write())
 
 
+@pytest.mark.parametrize("spaced", [lambda data: data[:-1] + b"\t", lambda data: b" " + data], ids=["end", "start"])
+def test_changes_that_another_program_has_written_otherwise_are_refused(spaced: Callable[[bytes], bytes]) -> None:
+    made = example()
+    member = ArchiveMember(MemberKind.CHANGES, made.head)
+    made.members[member] = spaced(made.members[member])
+    with pytest.raises(BadArchive, match=f"{member.name}: the lines are not in canonical form"):
+        checked(made.write())
+
+
 def added_member(made: Example) -> None:
     made.members[ArchiveMember(MemberKind.FILE, digest_of(b"more"))] = b"more"
 
@@ -246,7 +255,7 @@ def bad_document(made: Example) -> str:
     ("damage", "message"),
     [
         (added_member, "added later; export the archive again"),
-        (broken_text, "not valid"),
+        (broken_text, "not a list of changes"),
         (other_shape, "the dtype or shape given here differs"),
     ],
 )

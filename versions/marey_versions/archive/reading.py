@@ -11,6 +11,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.names import is_digest
 from marey_schemas.queue.facets import is_facet_name
@@ -147,13 +148,21 @@ class Archive:
     def changes(self, digest: str) -> dict[str, EntryChange]:
         """Return the entries that differ between a commit and its first parent, by key."""
         member = ArchiveMember(MemberKind.CHANGES, digest)
+        data = self._read(member)
         try:
-            lines = [json.loads(line) for line in self._read(member).splitlines()]
-            return {key_of(str(one["path"]), str(one["kind"])): _change(one) for one in lines}
+            lines = [json.loads(line) for line in data.splitlines()]
+            changes = {key_of(str(one["path"]), str(one["kind"])): _change(one) for one in lines}
+            same = b"".join(canonical_json(one) + b"\n" for one in lines) == data
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise BadArchive(
                 f"{member.name}: the content of the member is not a list of changes; export the archive again"
             ) from error
+        if not same:
+            raise BadArchive(
+                f"{member.name}: the lines are not in canonical form, so another program wrote or changed them; export "
+                "the archive again"
+            )
+        return changes
 
     def facets(self) -> dict[str, dict[str, float]]:
         """Return the facets (numbers that jobs have published about revisions) by content digest of the revision.
