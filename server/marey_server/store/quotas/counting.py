@@ -83,14 +83,6 @@ _ADD_JOBS = Prepared(
     .returning(user.c.id)
 )
 
-_NOTE_JOBS = Prepared(
-    update(user)
-    .where(user.c.id == bindparam("of_user"))
-    .values(jobs_bound=user.c.jobs_bound + bindparam("more"))
-    .returning(user.c.id)
-)
-"""Locks the row of a user also while the number is null, so that a concurrent first count waits for these jobs."""
-
 
 def require_room_for_jobs(tx: Transaction, more: int) -> None:
     """Raise `QuotaExceededProblem` if the caller would exceed the quota `user_jobs` by adding `more` unfinished jobs.
@@ -109,8 +101,11 @@ def require_room_for_jobs(tx: Transaction, more: int) -> None:
 
 
 def note_jobs(tx: Transaction, user_id: str, more: int) -> None:
-    """Note that a user has `more` unfinished jobs, even if this exceeds the quota `user_jobs`."""
-    tx.run(_NOTE_JOBS, {"of_user": user_id, "more": more})
+    """Note that a user has `more` unfinished jobs, even if this exceeds the quota `user_jobs`.
+
+    The row of the user is locked even if the number is null, so that a concurrent first count waits for these jobs.
+    """
+    tx.execute(update(user).where(user.c.id == user_id).values(jobs_bound=user.c.jobs_bound + more))
 
 
 def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
