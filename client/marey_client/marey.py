@@ -92,7 +92,10 @@ class Marey:
         return self.transport.post(BrowserSignIn, "/sign-ins", request, repeatable=False)
 
     def finish_sign_in(self, sign_in: str, request: BrowserSignInCode) -> NewToken:
-        """Return the token of a sign-in for the code that the browser got. Raises `NotFound` if it is not valid."""
+        """End a sign-in with the code that the browser got, and return its token.
+
+        Raises `NotFound` if the code is wrong, or if the sign-in has expired.
+        """
         return self.transport.post(NewToken, f"/sign-ins/{sign_in}/token", request, repeatable=False)
 
     def accept_invitation(self, code: str) -> AcceptedInvitation:

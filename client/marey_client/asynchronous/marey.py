@@ -55,7 +55,10 @@ class AsyncMarey(Connection):
         return await self._run(self._sync.begin_sign_in, request)
 
     async def finish_sign_in(self, sign_in: str, request: BrowserSignInCode) -> NewToken:
-        """Return the token of a sign-in for the code that the browser got. Raises `NotFound` if it is not valid."""
+        """End a sign-in with the code that the browser got, and return its token.
+
+        Raises `NotFound` if the code is wrong, or if the sign-in has expired.
+        """
         return await self._run(self._sync.finish_sign_in, sign_in, request)
 
     async def accept_invitation(self, code: str) -> AcceptedInvitation:

@@ -99,7 +99,11 @@ def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | Non
             lines.position, lines.number = position, number
             return degrees, rate_hz
         elif not words[0].startswith((b"#", b":")):
-            raise lines.error(f"an AMC file begins with :FULLY-SPECIFIED, not {excerpt(line)!r}", code="not-amc")
+            raise lines.error(
+                f"{excerpt(line)!r} cannot be in the header of an AMC file: its lines begin with # or :, and the first "
+                "frame with its number; choose an AMC file, or export it again",
+                code="not-amc",
+            )
 
 
 def _fill_motion(source: SourceMotion, skeleton: AsfSkeleton, values: NDArray[np.float64], degrees: bool) -> None:

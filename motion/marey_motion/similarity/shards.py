@@ -102,7 +102,7 @@ class Shard:
 
         Raises
         ------
-        MotionError    if the file is not a shard, or if its runs have other lengths
+        MotionError    if the file is not a shard, or if its numbers of rows and balls are not those of `runs`
         """
         with path.open("rb", buffering=0) as file:
             mapped = mmap(file.fileno(), 0, access=ACCESS_READ) if os.fstat(file.fileno()).st_size else b""

@@ -116,7 +116,9 @@ class MetricComponent(Request):
     @model_validator(mode="after")
     def _check_classes(self) -> Self:
         if self.measurement == "angles" and (wrong := [name for name in WITHOUT_ANGLES if name in self.weights]):
-            raise ValueError(f"weights: angles have no class {wrong[0]}; remove it")
+            raise ValueError(
+                f"weights: the measurement angles has no weight for the joint class {wrong[0]}; remove this weight"
+            )
         if not sum(self.weights.values()) > 0:
             raise ValueError("weights: at least one weight must be above 0")
         return self

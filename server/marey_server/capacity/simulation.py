@@ -299,7 +299,10 @@ class _Simulation:
         self._again(number, wait_s=0.0)
 
     def _again(self, number: int, *, wait_s: float) -> None:
-        """Queue a job again after a failed or lost attempt, or end it as failed if no attempts are left."""
+        """Queue a job again `wait_s` seconds after a failed or lost attempt, or end it as failed.
+
+        It ends if no attempts are left, or if too many attempts were lost before their first heartbeat.
+        """
         history = self._histories[number]
         over = history.attempts >= self._jobs[number].max_attempts or history.unstarted > self._policy.max_unstarted
         history.failed = over

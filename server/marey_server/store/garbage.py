@@ -167,7 +167,10 @@ def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_
 
 
 def _sweep_strays(database: Database, grace_us: int) -> int:
-    """Delete files of blobs that have no row in the database, after rollbacks or deletions; return their number."""
+    """Delete files that are older than `grace_us` and belong to no blob, or to a blob that is now in object storage.
+
+    Rollbacks and deletions leave such files. Return the number of deleted files.
+    """
     return sum(
         database.write(SYSTEM, _remove_stray, digest)
         for digest in database.blobs.stray_digests(older_than_s=grace_us / 1_000_000)

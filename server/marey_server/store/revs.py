@@ -1,7 +1,7 @@
 """Changes of rows on the condition that nobody else has changed them since they were read.
 
 The column `rev` of a row is a number that grows with each change. A change names the `rev` that it expects. This
-condition is part of the UPDATE statement; if no row is returned, the condition was false.
+condition is part of the UPDATE statement; if no row is returned, the row has another `rev`, or does not exist.
 """
 
 from __future__ import annotations

@@ -195,7 +195,7 @@ def test_gaps_in_the_numbers_of_frames_are_told() -> None:
         (AMC[: AMC.index("thigh 40 50 61")], 11, "thigh", "cut off"),
         (AMC[: AMC.index(" 61")] + "\n", 11, "thigh", "cut off"),
         (":FULLY-SPECIFIED\n:DEGREES\n", 2, None, "no frames"),
-        ("rubbish", 1, None, ":FULLY-SPECIFIED"),
+        ("rubbish", 1, None, "header of an AMC file"),
     ],
 )
 def test_what_is_wrong_in_an_amc_is_named_with_its_line(amc: str, line: int, joint: str | None, words: str) -> None:

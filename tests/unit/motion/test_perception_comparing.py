@@ -86,7 +86,7 @@ def test_every_built_in_metric_is_one_of_its_own_and_knows_its_origin() -> None:
 def test_a_metric_that_makes_no_sense_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         MetricDocument(**(dict(PAPER) | changes))
-    with pytest.raises(ValueError, match="angles have no class hand"):
+    with pytest.raises(ValueError, match="no weight for the joint class hand"):
         MetricComponent(measurement="angles", shaping="euclid", constant=0, norm=1, weights={"hand": 1.0}, share=1)
 
 

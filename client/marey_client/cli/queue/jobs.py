@@ -237,7 +237,8 @@ def retry_job(
 ) -> None:
     """Submit a failed or cancelled job again.
 
-    Unsuccessful jobs that the job needs, and jobs that did not run because the job failed, are submitted again, too.
+    Unsuccessful jobs that the job needs are submitted again, too, and so are jobs that did not run only because one of
+    all these jobs did not succeed.
     """
     with connect(context) as marey:
         ended = follow(marey, marey.jobs.retry(job_id), wait=wait, as_json=as_json)

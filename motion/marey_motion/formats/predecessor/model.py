@@ -223,7 +223,8 @@ def _basis(part: Document, what: str, file: str) -> SplineBasis:
     knots = model_numbers(field_of(part, "knots", list, file), file, f"{what}: knots")
     if knots.ndim != 1 or not 0 < len(knots) <= MOST_FRAMES or np.abs(knots).max() > MOST_FRAMES:
         raise FormatError(
-            f"{what}: there may be at most {MOST_FRAMES} knots, and no knot may be above {MOST_FRAMES}", file=file
+            f"{what}: the knots must be a list of 1 to {MOST_FRAMES} numbers from -{MOST_FRAMES} to {MOST_FRAMES}",
+            file=file,
         )
     degree = part.get("degree", DEGREE)
     if isinstance(degree, bool) or not isinstance(degree, int) or not 1 <= degree < 10:

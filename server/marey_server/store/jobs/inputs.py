@@ -246,7 +246,7 @@ def _entries_of(
 
 
 def _within(path: str) -> ColumnElement[bool]:
-    """Return the SQL condition that a path is below `path`.
+    """Return the SQL condition that a path is `path` or below it.
 
     The paths are compared as texts, because LIKE would ignore case on SQLite.
     """
