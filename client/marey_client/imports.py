@@ -21,6 +21,7 @@ from marey_schemas.encoding.digests import digest_of_file
 from marey_schemas.formats import IMPORTED_ENDINGS, LengthUnit
 from marey_schemas.formats.companions import pair_companions, stem_of
 from marey_schemas.imports import (
+    NO_MODEL,
     FileName,
     ImportAnswer,
     ImportEntry,
@@ -41,8 +42,6 @@ OTHER_MOTION = (
 FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20
 UPLOADS_AT_ONCE = 8
-NO_MODEL = "no-model"
-"""Code of the refusal of a graph whose models are not in the project."""
 
 _FILE_NAME: TypeAdapter[str] = TypeAdapter(FileName)
 

@@ -96,6 +96,9 @@ class Made(Protocol):
         """Whether the revision before the new one has another skeleton."""
 
 
+NO_MODEL = "no-model"
+"""Code of the refusal of a graph whose models are not in the project."""
+
 SKELETON_DIFFERS = Refusal(
     code="skeleton-differs",
     detail="an item of this name exists with another skeleton; import the file into another folder, or give it a new "

@@ -16,6 +16,7 @@ from marey_motion.errors import FormatError
 from marey_motion.importing.items import ImportedGraph, ImportedItem
 from marey_schemas.documents.graphs import ModelGraph
 from marey_schemas.documents.originals import original_of
+from marey_schemas.imports import NO_MODEL
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import first_reason
 
@@ -93,4 +94,4 @@ def _find_model(find: FindModels, name: str, collection: str) -> dict[str, Any]:
     places = ", ".join(one.path for one in models)
     there = f"{count} models are called {name!r} ({places})" if count else f"no model is called {name!r}"
     advice = "import the models first, into the collection of the graph"
-    raise FormatError(f"The graph has a node for the model {name!r}, but {there}; {advice}.", code="no-model")
+    raise FormatError(f"The graph has a node for the model {name!r}, but {there}; {advice}.", code=NO_MODEL)

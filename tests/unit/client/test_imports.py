@@ -15,7 +15,6 @@ from tests.support.scripted_server import ScriptedServer
 from marey_client import errors
 from marey_client.imports import (
     FILES_PER_IMPORT,
-    NO_MODEL,
     Imports,
     LocalFile,
     batches,
@@ -23,6 +22,7 @@ from marey_client.imports import (
     left_out_texts,
     refusal_text,
 )
+from marey_schemas.imports import NO_MODEL
 from marey_schemas.options.imports import ImportOptions
 
 
