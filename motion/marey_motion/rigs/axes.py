@@ -124,7 +124,7 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
         if standard in conventional:
             twist, swing = conventional[standard]
         else:
-            body = rest if _part(standard) in rest.readable_parts else moving
+            body = moving if standard in rest.doubtful else rest
             twist = _twist(standard, body)
             swing = body.in_joint(standard, _swing(standard, body))
         axes[skeleton.joint_names[rest.joints[standard]]] = JointAxes(_triple(twist), _triple(_across(swing, twist)))
@@ -149,11 +149,7 @@ def axes_from_motion(skeleton: Skeleton, mapping: JointMapping) -> frozenset[str
     """
     rest = _resting_body(skeleton, mapping)
     known = _conventional(rest, mapping)
-    return frozenset(
-        mapping.joints[standard]
-        for standard in rest.joints
-        if standard != "root" and standard not in known and _part(standard) not in rest.readable_parts
-    )
+    return frozenset(mapping.joints[name] for name in rest.doubtful if name != "root" and name not in known)
 
 
 def doubtful_joints(skeleton: Skeleton, mapping: JointMapping) -> frozenset[str]:
@@ -172,19 +168,16 @@ def doubtful_joints(skeleton: Skeleton, mapping: JointMapping) -> frozenset[str]
     ------
     MappingError    if the mapping lacks the joints that define left and up, or if joints of an arm coincide
     """
-    rest = _resting_body(skeleton, mapping)
-    return frozenset(mapping.joints[name] for name in rest.joints if _part(name) not in rest.readable_parts)
+    return frozenset(mapping.joints[name] for name in _resting_body(skeleton, mapping).doubtful)
 
 
 def _conventional(rest: _PosedBody, mapping: JointMapping) -> dict[str, tuple[Floats, Floats]]:
     """Find the axes that a known rig gives the joints of those parts that its rest pose does not show."""
-    names = (name for name in STANDARD_JOINTS if name in rest.joints)
-    doubtful = [name for name in names if _part(name) not in rest.readable_parts]
-    if not doubtful:
+    if not rest.doubtful:
         return {}
-    ends = {name: end for name in doubtful if (end := bone_end(name, rest.joints)) is not None}
+    ends = {name: end for name in rest.doubtful if (end := bone_end(name, rest.joints)) is not None}
     known = conventional_axes(rest.skeleton, mapping.rig, rest.joints, ends)
-    return {name: known[name] for name in doubtful if name in known}
+    return {name: known[name] for name in rest.doubtful if name in known}
 
 
 def bone_end(standard: str, joints: Collection[str]) -> str | None:
@@ -220,9 +213,7 @@ def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ..
     ------
     MappingError    if the mapping lacks the joints that define left and up, or if joints of an arm coincide
     """
-    rest = _resting_body(skeleton, mapping)
-    parts = dict.fromkeys(_part(standard) for standard in STANDARD_JOINTS if standard in rest.joints)
-    return tuple(part for part in parts if part not in rest.readable_parts)
+    return tuple(dict.fromkeys(_part(name) for name in _resting_body(skeleton, mapping).doubtful))
 
 
 def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
@@ -322,6 +313,12 @@ class _PosedBody:
                 middle: Floats = self.positions[:, [self.joints[joint] for joint in joints]].mean(axis=1)
                 return middle
         return None
+
+    @cached_property
+    def doubtful(self) -> tuple[str, ...]:
+        """Standard joints, in their order, of the parts whose swing axes cannot be read from these frames."""
+        names = (name for name in STANDARD_JOINTS if name in self.joints)
+        return tuple(name for name in names if _part(name) not in self.readable_parts)
 
     @cached_property
     def readable_parts(self) -> frozenset[str]:
