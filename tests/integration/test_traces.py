@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from tests.support.command_line import run_here
 from tests.support.database_fixtures import copied_sqlite
 from tests.support.motion_files import bvh
+from tests.support.patience import wait_until
 from tests.support.rest_server import Server, running
 from tests.support.server_process import MareyProcess
 from tests.support.webhook_receiver import Open, Receiver
@@ -195,6 +197,11 @@ def told(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [text for text in map(logging.LogRecord.getMessage, caplog.records) if "traces" in text]
 
 
+def is_exporting() -> bool:
+    """Return whether a thread of this process still sends spans."""
+    return any(thread.name.startswith("OtelBatch") for thread in threading.enumerate())
+
+
 @pytest.mark.parametrize("answers", ["never", "with an error"])
 def test_a_collector_that_does_not_work_stops_nobody_and_does_not_flood_the_log(
     answers: str, open_receiver: Open, sqlite_template: Path, tmp_path: Path,
@@ -202,7 +209,9 @@ def test_a_collector_that_does_not_work_stops_nobody_and_does_not_flood_the_log(
 ) -> None:  # fmt: skip
     receiver = open_receiver(status=400, silent=answers == "never")
     monkeypatch.setenv("OTEL_BSP_SCHEDULE_DELAY", "20")
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_TIMEOUT", "1")
     monkeypatch.setattr(export, "CLOSE_S", 0.2)
+    monkeypatch.setattr(logging.getLogger("opentelemetry"), "handlers", [])  # the limit of another test's messages
     with serving(sqlite_template, tmp_path, traces_endpoint=receiver.url) as server:
         owner = server.client(server.make_project("lab"))
         for _ in range(50):
@@ -215,6 +224,7 @@ def test_a_collector_that_does_not_work_stops_nobody_and_does_not_flood_the_log(
     else:
         assert receiver.received
     assert len(told(caplog)) == 1
+    wait_until(lambda: not is_exporting())  # its last message must not reach the log of another test
 
 
 def test_the_trace_of_a_program_is_passed_on_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
