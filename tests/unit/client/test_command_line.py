@@ -37,7 +37,7 @@ from marey_client.cli.terminal.following import clips_at, follow, print_ended
 from marey_client.cli.terminal.invocation import connect
 from marey_client.cli.terminal.output import ago, print_table
 from marey_client.credentials import Credential, Logins, read_logins, store_login, write_private
-from marey_client.errors import BadCredentialFile, Forbidden, Invalid, NotFound, Unauthenticated
+from marey_client.errors import BadCredentialFile, Forbidden, Invalid, NotFound, Unauthenticated, Unreachable
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.marey import Marey
 from marey_schemas.documents.skeletons import SkeletonMapping
@@ -421,6 +421,15 @@ def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(
     told = capsys.readouterr().err
     assert "job_1 continues on the server" in told
     assert "marey job cancel job_1" in told
+
+
+@pytest.mark.parametrize("answer", [httpx.ConnectError("refused"), problem(401, "bad-token")])
+def test_who_loses_the_server_while_waiting_for_a_job_is_told_the_job(script: ScriptedServer, answer: Any) -> None:
+    script.answers = [answer] * 20
+    running = a_job(id="job_1", kind="retarget", state=JobState.RUNNING, progress=None)
+    with pytest.raises((Unreachable, Unauthenticated)) as lost:
+        follow(script.marey(), running)
+    assert sentence(lost.value).endswith("this does not stop job_1; `marey job show job_1` shows it")
 
 
 def test_a_job_that_is_not_waited_for_is_named(script: ScriptedServer, capsys: pytest.CaptureFixture[str]) -> None:

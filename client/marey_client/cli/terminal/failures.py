@@ -92,21 +92,20 @@ def interrupted_by_sigterm() -> Iterator[None]:
 
 
 def sentence(error: BaseException) -> str:
-    """Return an error as one line of text.
+    """Return an error and its notes as one line of text.
 
-    For an error that the server sent, the line also contains the code, the request id, the address of the server, and
-    the notes of the error.
+    For an error that the server sent, the line also contains the code, the request id and the address of the server.
     """
     from marey_client.errors import NotFound, RequestFailed
 
-    text = " ".join(_text_of(error).split()) or type(error).__name__
+    text, notes = " ".join(_text_of(error).split()) or type(error).__name__, getattr(error, "__notes__", ())
     if not isinstance(error, RequestFailed):
-        return text
+        return "; ".join([text, *notes])
     where = f" at {error.server}" if error.server else ""
     whole = f"{text} ({error.code}, request {error.request_id}{where})" if error.request_id else text
     if error.anonymous and (isinstance(error, NotFound) or error.code == "unauthenticated"):
         return f"{whole}; {ANONYMOUS_HINT}"
-    return "; ".join([whole, *getattr(error, "__notes__", ())])
+    return "; ".join([whole, *notes])
 
 
 def _text_of(error: BaseException) -> str:

@@ -120,6 +120,8 @@ def follow(
     units with the name `unit`. Without `wait`, print the job's id and return None. Raises `JobUnsuccessful` if the job
     did not succeed.
     """
+    from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable
+
     if not wait:
         print_json(submitted) if as_json else typer.echo(submitted.id)
         return None
@@ -139,6 +141,9 @@ def follow(
             f"{seen.id} continues on the server; `marey job show {seen.id}` shows it, "
             f"`marey job cancel {seen.id}` stops it"
         )
+        raise
+    except (Unreachable, UnexpectedAnswer, RequestFailed) as error:
+        error.add_note(f"this does not stop {seen.id}; `marey job show {seen.id}` shows it")
         raise
 
 
