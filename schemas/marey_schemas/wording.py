@@ -31,6 +31,12 @@ def part_of(shown: int, total: int, noun: str) -> str:
     return counted(total, noun) if shown == total else f"{shown:,} of {counted(total, noun)}"
 
 
+def listed(names: Sequence[str]) -> str:
+    """Return names as text; of more than `NAMES_SHOWN` names, the first ones and the number of the others."""
+    more = len(names) - NAMES_SHOWN
+    return ", ".join(names[:NAMES_SHOWN]) + (f" and {more:,} more" if more > 0 else "")
+
+
 def one_of(names: Sequence[str]) -> str:
     """Return the names of a choice as text: "bvh, npz or json"."""
     return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))

@@ -44,6 +44,7 @@ from marey_client.bridges.version import (
     version_to_export,
 )
 from marey_client.errors import CannotExport
+from marey_schemas.wording import listed
 
 if TYPE_CHECKING:
     from marey_client.progress import OnProgress
@@ -53,7 +54,6 @@ NO_ACTION = "motion"
 """Task (a text for each episode in LeRobot) of the clips whose take record names no action."""
 RATE_TOLERANCE = 1e-4
 """Greatest relative difference of frame rates that count as equal, because files state rates with few digits."""
-NAMES_SHOWN = 10
 
 
 class CommonRig(NamedTuple):
@@ -170,11 +170,9 @@ class _Writing:
 
     def _refusal(self, differing: Sequence[str]) -> str:
         assert self.rig is not None
-        shown = ", ".join(differing[:NAMES_SHOWN])
-        more = f" and {len(differing) - NAMES_SHOWN} more" if len(differing) > NAMES_SHOWN else ""
         return (
             "all clips of a LeRobotDataset need the same skeleton and frame rate, but these differ from "
-            f"{self.first} ({self.rig.rate_hz:g} Hz): {shown}{more}; retarget clips with another skeleton (marey "
+            f"{self.first} ({self.rig.rate_hz:g} Hz): {listed(differing)}; retarget clips with another skeleton (marey "
             "retarget), resample clips with another frame rate (marey edit), commit the results, and export them"
         )
 

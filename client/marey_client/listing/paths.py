@@ -10,7 +10,7 @@ from marey_client.paging import pages
 from marey_client.transport import Transport
 from marey_schemas.items import Collection, Item
 from marey_schemas.kinds import Kind
-from marey_schemas.wording import NAMES_SHOWN, nearest
+from marey_schemas.wording import listed, nearest
 
 MOST_COMPARED = 10_000
 """Greatest number of names in a folder with which a misspelt name is compared."""
@@ -43,8 +43,7 @@ def missing_path(transport: Transport, project: str, kind: Kind, path: str) -> s
     if near:
         hint = f"did you mean {f'{folder}/{near}'.lstrip('/')!r}?"
     elif known:
-        more = f" and {len(known) - NAMES_SHOWN:,} more" if len(known) > NAMES_SHOWN else ""
-        hint = f"it has {', '.join(known[:NAMES_SHOWN])}{more}"
+        hint = f"it has {listed(known)}"
     else:
         hint = f"no {kind.plural} are directly in it"
     return f"there is no {kind} {name!r} in {folder or project}; {hint}"

@@ -8,7 +8,7 @@ from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.training_report import ExampleReport, TrainingReport
 from marey_schemas.options.modelling import ModelOptions
-from marey_schemas.wording import NAMES_SHOWN
+from marey_schemas.wording import listed
 
 FEW_EXAMPLES_PER_DIMENSION = 2
 DEEP_BELOW_FLOOR_CM = 2.0
@@ -73,12 +73,11 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
             )
     outliers = sorted((one for one in report.examples if one.outlier), key=_likelihood)
     if outliers:
-        names = ", ".join(one.name for one in outliers[:NAMES_SHOWN])
-        more = f" and {len(outliers) - NAMES_SHOWN} more" if len(outliers) > NAMES_SHOWN else ""
+        names = listed([one.name for one in outliers])
         found.append(
             ModelWarning(
                 "outliers",
-                f"these examples are unlike the others: {names}{more}; check whether they show the same action",
+                f"these examples are unlike the others: {names}; check whether they show the same action",
             )
         )
     return found

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from marey_schemas.kinds import Kind
-from marey_schemas.wording import NAMES_SHOWN
+from marey_schemas.wording import listed
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import Message, pack_tree, unpack_tree
 from marey_server.store import items
@@ -99,7 +99,7 @@ def write_walk_graph(source: WalkSource, trial: str | None, form: WalkGraphForma
         detail = f"The walk graph of this evaluation cannot be computed: {reason}. Run the evaluation again."
         raise InvalidProblem(detail, code="not-a-walk") from error
     if trial is not None and trial not in records:
-        known = ", ".join([*list(records)[:NAMES_SHOWN], *(["..."] if len(records) > NAMES_SHOWN else [])])
+        known = listed(list(records))
         raise NotFoundProblem(f"The evaluation has no trial {trial!r}; it has {known}.", code="no-trial")
     trials = list(records) if trial is None else [trial]
     graph = walk_graph(clips, [records[one] for one in trials])
