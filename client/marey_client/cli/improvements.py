@@ -177,7 +177,7 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
         (f"{counted(len(document['fillings']), 'clip')} would fill gaps in the coverage", document["fillings"]),
         ("Order in which to add clips", document["additions"]),
     )  # fmt: skip
-    _print_sections(sections, unused)
+    _print_sections(sections, document)
     if (chance := document["chance"].get("offset_mean")) is not None:
         typer.echo(
             f"By chance alone, the mean distance from the path varies by {100 * chance:.2f} cm between replicates "
@@ -197,8 +197,18 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
         typer.echo("No clip was found that can be removed, or that would fill a gap in the coverage.")
 
 
-def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unused: Mapping[str, Any]) -> None:
-    """Print lists of suggestions with reasons; below a list of unused clips, print the effect of removing them all."""
+def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], document: Mapping[str, Any]) -> None:
+    """Print lists of suggestions with reasons.
+
+    Below a list of unused clips, print the effect of removing them all; below clips to add, how their quality compares
+    with that of the set.
+    """
+    unused = document["unused"]
+    below = (
+        (unused["clips"], unused["confirmed_clips"]),
+        (unused["ranges"], unused["confirmed_ranges"]),
+        (document["fillings"], document["quality"]),
+    )
     for heading, entries in sections:
         if not entries:
             continue
@@ -207,9 +217,9 @@ def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
             typer.echo(f"  {entry['reason']}")
         if len(entries) > SHOWN:
             typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
-        for name in ("clips", "ranges"):
-            if entries is unused[name] and (effect := unused[f"confirmed_{name}"]) is not None:
-                typer.echo(f"  {effect['reason']}")
+        for about, note in below:
+            if about is entries and note is not None and note["reason"]:
+                typer.echo(f"  {note['reason']}")
         typer.echo("")
 
 

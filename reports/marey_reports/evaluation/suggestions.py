@@ -121,8 +121,8 @@ def _chapters(found: Suggestions) -> tuple[_Chapter, ...]:
             ),
         ),
         _Chapter(
-            "fillings", "Clips that fill gaps in the coverage", "",
-            tuple(_about(one, reasons.why_filling(one)) for one in found.fillings),
+            "fillings", "Clips that fill gaps in the coverage", reasons.why_look(found.fillings, found.defects),
+            tuple(_about(one, reasons.why_filling(one, found.defects.get(one.source))) for one in found.fillings),
         ),
         _Chapter(
             "additions", "Order in which to add clips", "",

@@ -116,6 +116,33 @@ def test_what_can_go_is_named_and_clips_of_other_skeletons_need_to_be_retargeted
     assert result["needing_retarget"] == 1
 
 
+def sunk(clip: Clip, depth_m: float) -> Clip:
+    """Return the same motion, lower by `depth_m` metres."""
+    poses = clip.poses.copy()
+    poses[:, 1] -= depth_m
+    return replace(clip, poses=poses)
+
+
+def test_a_clip_that_fills_a_gap_is_named_if_its_defects_exceed_those_of_the_set(project: LoggedProject) -> None:
+    clips = project.inputs["clips"]
+    own = evaluated(project, "first", clips[1:2])
+    add_clip(project, "sunk", sunk(generate_gait(1.25, radians(50), 5.0), 0.3))
+    project.inputs = {"evaluation": (own,), "candidates": project.inputs["clips"]}
+    result = suggest.run(project, SuggestParams(removals=0, consider=0, confirmation_replicates=0))
+    document = document_of(project, result)
+    found = {one["name"]: one for one in document["fillings"]}
+    assert found["walks/walk 1.25 50"]["quality"]["excesses"] == []
+    (excess,) = found["walks/sunk"]["quality"]["excesses"]
+    assert (excess["measure"], excess["greatest"]) == ("penetration_max_m", pytest.approx(0.0, abs=0.02))
+    assert excess["value"] == pytest.approx(0.3, abs=0.02)
+    assert found["walks/sunk"]["quality"]["compared"] == 1
+    assert "Look at it before you add it" in found["walks/sunk"]["reason"]
+    page = is_sound(project.blobs[result["report"]["blob"]].decode())
+    assert found["walks/sunk"]["reason"] in page.text
+    assert "look at “walks/sunk” before you add it" in document["quality"]["reason"]
+    assert document["quality"]["reason"] in page.text
+
+
 def test_suggestions_publish_the_harm_of_each_removal(project: LoggedProject) -> None:
     clips = project.inputs["clips"]
     own = evaluated(project, "first", clips)

@@ -14,14 +14,21 @@ from marey_schemas.encoding.codecs import JSON, encode_tree
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context
-from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_clips, refusing_motion_errors
+from marey_worker.job_io.matching_clips import (
+    ClipSet,
+    MatchingClips,
+    evaluated_clip_set,
+    read_evaluated_clips,
+    refusing_motion_errors,
+)
 
 
 @dataclass(frozen=True)
 class EvaluatedSet:
-    """Evaluation with the records of its trials, and a matching database of its clips that has its normaliser."""
+    """Evaluation with the records of its trials, its clips, and a matching database of them with its normaliser."""
 
     result: EvaluationResult
+    clip_set: ClipSet
     clips: MatchingClips
 
     @property
@@ -45,7 +52,9 @@ def read_evaluated_set(context: Context) -> EvaluatedSet:
     """
     (pin,) = context.inputs["evaluation"]
     result, document = read_result(context, pin)
-    return EvaluatedSet(result, read_evaluated_clips(context, pin, document, result.options.database))
+    clip_set = evaluated_clip_set(pin, document)
+    clips = read_evaluated_clips(context, pin, clip_set, document, result.options.database)
+    return EvaluatedSet(result, clip_set, clips)
 
 
 def store_document(context: Context, tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from marey_schemas.lru import LruCache
 from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.queue.job_params import EvaluateParams
 from marey_schemas.queue.worker_protocol import PinnedInput
-from marey_schemas.wording import NAMES_SHOWN, counted, first_reason
+from marey_schemas.wording import counted, first_reason, listed
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
@@ -109,21 +109,24 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
         )
 
 
-def read_evaluated_clips(
-    context: Context, evaluation: PinnedInput, document: Mapping[str, Any], options: DatabaseOptions
-) -> MatchingClips:
-    """Return the matching database of an evaluation's clips, at the revisions that were evaluated.
-
-    The database has the normaliser of the evaluation. Raises `JobRefused` if the evaluation does not list its clips, or
-    the clips cannot be used.
-    """
+def evaluated_clip_set(evaluation: PinnedInput, document: Mapping[str, Any]) -> ClipSet:
+    """Return the clips that an evaluation lists in its `document`. Raises `JobRefused` if it lists none."""
     if "clip_set" not in document:
         raise JobRefused(
             "clips-unknown",
             f"the evaluation {evaluation.path} does not list its clips, because an old version of "
             "Marey created it; evaluate the clips again",
         )
-    wanted = ClipSet.from_tree(document["clip_set"])
+    return ClipSet.from_tree(document["clip_set"])
+
+
+def read_evaluated_clips(
+    context: Context, evaluation: PinnedInput, wanted: ClipSet, document: Mapping[str, Any], options: DatabaseOptions
+) -> MatchingClips:
+    """Return the matching database of an evaluation's clips `wanted`, at the revisions that were evaluated.
+
+    The database has the normaliser of the evaluation. Raises `JobRefused` if the clips cannot be used.
+    """
     normaliser = Normaliser.from_tree(document["normaliser"])
     with refusing_motion_errors():
         return _cache.get_or_make(
@@ -230,7 +233,7 @@ def common_rig(context: Context, wanted: ClipSet, used: Sequence[RevisionRef]) -
         raise JobRefused(
             "several-skeletons",
             f"the clips have {len(others) + 1} different skeletons: {count} of {len(used)} have {place}, but "
-            f"{_listed(odd)} do not; move all clips to one skeleton first, with `marey retarget`",
+            f"{listed(odd)} do not; move all clips to one skeleton first, with `marey retarget`",
         )
     skeleton = max(used, key=lambda ref: ref.revision)
     edited = wanted.rig
@@ -261,8 +264,3 @@ def _pinned_normaliser(context: Context) -> Normaliser | None:
         evaluation = context.document(Kind.EVALUATION, pin.item, pin.revision, "evaluation")
         return Normaliser.from_tree(evaluation["normaliser"])
     return None
-
-
-def _listed(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:NAMES_SHOWN])
-    return f"{shown} and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else shown

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion import documents
 from marey_motion.errors import AnnotationError
-from marey_motion.quality.measuring import ClipQuality, QualityBody, measure_quality
+from marey_motion.quality.measuring import ClipQuality, measure_quality
 from marey_motion.quality.totals import DrawnTotals, changes_from, total_over_clips
 from marey_motion.version import code_version
 from marey_reports.quality.page import draw_quality_figures, quality_csv, render_quality
@@ -36,9 +35,9 @@ from marey_schemas.queue.job_params import QualityParams
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_schemas.wording import counted
 from marey_worker.context import Context, JobRefused
+from marey_worker.job_io.bodies import QualityBodies
 from marey_worker.job_io.evaluated_set import store_document, store_file
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
-from marey_worker.job_io.skeleton_cache import MappedSkeleton, Rig, read_mapped
 from marey_worker.job_io.stored_reports import inputs_of, stored_figure
 
 
@@ -90,8 +89,7 @@ class _Measuring:
         self._facets: dict[str, ItemFacets] = {}
         self._context = context
         self._options = QualityOptions.of(params)
-        self._rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
-        self._bodies: dict[Rig, QualityBody] = {}
+        self._bodies = QualityBodies(context, context.inputs.get("rigs", ()))
         self._contacts = _read_contacts(context)
 
     @property
@@ -117,8 +115,7 @@ class _Measuring:
 
     def _measured(self, pin: PinnedInput, tree: Any, info: Mapping[str, Any] | None) -> tuple[QualityRow, ClipQuality]:
         motion = MotionDocument.model_validate(present(pin, tree))
-        mapped, body = self._body(motion)
-        clip = documents.clip_from_document(motion, mapped.skeleton)
+        clip, body = self._bodies.posed(motion)
         quality = measure_quality(clip, body, self._options, self._contacts_of(pin, clip.frame_count))
         row = QualityRow(
             item=pin.item,
@@ -154,15 +151,6 @@ class _Measuring:
         for segment in segments:
             labelled[segment.start : segment.end] |= CONTACT_LABELS[segment.label]
         return labelled
-
-    def _body(self, motion: MotionDocument) -> tuple[MappedSkeleton, QualityBody]:
-        used = RevisionRef.model_validate(motion.skeleton.model_dump())
-        edited = self._rigs.get(used.item)
-        rig = Rig(used, edited.ref if edited else used)
-        mapped = read_mapped(self._context, rig)
-        if rig not in self._bodies:
-            self._bodies[rig] = QualityBody.of(mapped.skeleton, mapped.mapping, mapped.axes)
-        return mapped, self._bodies[rig]
 
 
 def _read_contacts(context: Context) -> dict[tuple[str, int], list[SegmentDocument]] | None:

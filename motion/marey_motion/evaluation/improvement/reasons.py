@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from marey_motion.evaluation.compare import MetricChange
+from marey_motion.evaluation.improvement.defects import Defects, Excess
 from marey_motion.evaluation.improvement.duplicates import NearDuplicate
 from marey_motion.evaluation.improvement.effects import Effect
 from marey_motion.evaluation.improvement.filling import Addition, FilledCell, Filling
 from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.repeating import PERCENT, RepeatedChange
 from marey_motion.evaluation.improvement.unused import UnusedClip, UnusedRange
+from marey_schemas.documents.quality import MEASURES
+from marey_schemas.wording import counted, listed
 
 
 def why_unused_clip(clip: UnusedClip) -> str:
@@ -138,17 +143,23 @@ def why_duplicate(source: str, pair: NearDuplicate, most_perceived: float | None
     return f"“{gone}” shows {alike} “{stays}” ({distances}): one of them may be enough."
 
 
-def why_filling(filling: Filling) -> str:
-    """Explain the gain of a clip from another collection.
+def why_filling(filling: Filling, defects: Defects | None = None) -> str:
+    """Explain the gain of a clip from another collection, and name its defects that are far greater than in the set.
 
     Parameters
     ----------
     filling : Filling    the clip
+    defects : Defects, optional    its defects beside those of the set, if they were compared
 
     Returns
     -------
-    str    a sentence
+    str    one sentence, or two if there are such defects, or if the clip could not be measured
     """
+    gain, more = _gain_in_words(filling), "" if defects is None else _defects_in_words(defects)
+    return f"{gain} {more}" if more else gain
+
+
+def _gain_in_words(filling: Filling) -> str:
     gain = f"“{filling.name}” from {filling.collection} contains {filling.filled_s:.1f} s of the missing data"
     where = f"most of it at {_cell_in_words(filling.cells[0])}"
     if filling.needs_retarget:
@@ -181,3 +192,50 @@ def _cell_in_words(cell: FilledCell) -> str:
         return f"{cell.speed_m_s:g} m/s straight ahead"
     side = "left" if cell.turn_rate_deg_s > 0.0 else "right"
     return f"{cell.speed_m_s:g} m/s turning {side} at {abs(cell.turn_rate_deg_s):g}°/s"
+
+
+def why_look(fillings: Sequence[Filling], defects: Mapping[str, Defects]) -> str:
+    """Name the clips that would fill gaps and have defects that are far greater than in the set.
+
+    Parameters
+    ----------
+    fillings : sequence of Filling    the clips that would fill gaps
+    defects : mapping of str to Defects    their defects by uid; empty if they were not compared
+
+    Returns
+    -------
+    str    a sentence; empty if `defects` is empty
+    """
+    measured = [one for one in fillings if one.source in defects and defects[one.source].problem is None]
+    if not measured:
+        return (
+            "None of them could be measured, so their quality was not compared with that of the set." if defects else ""
+        )
+    compared = defects[measured[0].source].compared
+    if not compared:
+        return "No clip of the set could be measured, so their quality was not compared with that of the set."
+    worse = [f"“{one.name}”" for one in measured if defects[one.source].excesses]
+    found = "none of them has defects that are far greater"
+    if worse:
+        found = (
+            f"look at {listed(worse)} before you add {'them' if worse[1:] else 'it'}, because of far greater defects"
+        )
+    return (
+        f"The quality of {counted(len(measured), 'clip')} was compared with that of the set "
+        f"({counted(compared, 'clip')}): {found}."
+    )
+
+
+def _defects_in_words(defects: Defects) -> str:
+    """Name the defects that are far greater than in the set; empty if there are none."""
+    if defects.problem is not None:
+        return f"Its quality was not measured: {defects.problem}."
+    if not defects.excesses:
+        return ""
+    return f"Look at it before you add it: {'; '.join(map(_excess_in_words, defects.excesses))}."
+
+
+def _excess_in_words(excess: Excess) -> str:
+    measure = MEASURES[excess.measure]
+    value, greatest = (f"{one:,.{measure.digits}f}" for one in (excess.value, excess.greatest))
+    return f"{measure.title}: {value} {measure.unit}, in the set up to {greatest}"

@@ -7,13 +7,14 @@ to choose what to propose, and confirmed in others (`confirming`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.confirming import Confirmed, confirm
+from marey_motion.evaluation.improvement.defects import Defects
 from marey_motion.evaluation.improvement.duplicates import (
     NearDuplicate,
     NearDuplicates,
@@ -67,6 +68,8 @@ class Suggestions:
         is a sequence in which each is measured after all earlier clips were added
     tried : number of clips that were left out one at a time, and number of all clips that a trial needs
     metric : perceptual metric by which poses and near-duplicates were compared
+    defects : defects of the clips in `fillings` beside those of the set, by uid; empty if they were not measured.
+        `suggest` does not measure them: the caller can add them
     """
 
     result: EvaluationResult
@@ -82,6 +85,7 @@ class Suggestions:
     tried: tuple[int, int]
     metric: MetricDocument | None = None
     confirmed: Confirmed | None = None
+    defects: Mapping[str, Defects] = field(default_factory=dict)
 
 
 def suggest(

@@ -11,8 +11,10 @@ import numpy as np
 from marey_motion.evaluation.compare import Comparison, MetricChange
 from marey_motion.evaluation.improvement import reasons
 from marey_motion.evaluation.improvement.confirming import Confirmed
+from marey_motion.evaluation.improvement.defects import Defects
 from marey_motion.evaluation.improvement.duplicates import NearDuplicate
 from marey_motion.evaluation.improvement.effects import Effect
+from marey_motion.evaluation.improvement.filling import Filling
 from marey_motion.evaluation.improvement.optimise import Optimisation
 from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.suggest import Suggestions
@@ -83,7 +85,8 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
         "redundant": _redundant_to_tree(found),
         "near_duplicates": _duplicates_to_tree(found),
         "similarity": _similarity_to_tree(found.similarity),
-        "fillings": [{**_plain(one), "reason": reasons.why_filling(one)} for one in found.fillings],
+        "fillings": [_filling_to_tree(one, found.defects.get(one.source)) for one in found.fillings],
+        "quality": {"reason": reasons.why_look(found.fillings, found.defects)},
         "additions": [
             {
                 "collection": step.filling.collection,
@@ -96,6 +99,12 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
             for step in found.additions
         ],
     }
+
+
+def _filling_to_tree(filling: Filling, defects: Defects | None) -> Tree:
+    """Convert a clip to add; the field `quality` is left out if the quality was not measured."""
+    measured = {} if defects is None else {"quality": _plain(defects)}
+    return {**_plain(filling), **measured, "reason": reasons.why_filling(filling, defects)}
 
 
 def _unused_effects(confirmed: Confirmed | None) -> Tree:
