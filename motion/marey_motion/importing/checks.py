@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
-from marey_motion.importing.landmarks import Landmarks
+from marey_motion.importing.landmarks import Landmarks, common_ancestor, path_length
 from marey_motion.importing.tracks import Tracks, track
 from marey_schemas.wording import counted
 
@@ -68,6 +68,7 @@ CODES = {
     "in-place-gait": "The body walks in place, as on a treadmill; leave the clip out of the coverage of speeds.",
     "teleport": "The root jumps between two frames.",
     "rotation-jump": "A joint rotates by an implausibly large angle between two frames.",
+    "uneven-limbs": "Left and right leg, or left and right arm, differ much in length; a bone may be missing or wrong.",
     "dead-joints": "Some limbs never move, although other joints do.",
 }
 
@@ -80,6 +81,8 @@ IN_PLACE_FOOT_SPEED_M_S = 0.4
 TELEPORT_SPEED_M_S = 15.0
 REST_JUMP_M_S = 8.0
 """Speed in metres per second: if a point of the body is faster between rest pose and motion, the body jumps there."""
+UNEVEN = 0.8
+"""Length of a limb divided by that of the limb on the other side, below which the limbs are uneven."""
 JUMP_RAD = np.radians(60.0)
 # Cosine of half of an angle that is smaller than JUMP_RAD by more than any rounding error.
 _SURELY_NO_JUMP = np.cos(JUMP_RAD / 2) + 1e-3
@@ -131,7 +134,7 @@ def check_clip(clip: Clip, landmarks: Landmarks | None = None) -> tuple[CheckWar
     warnings = [_position_channels(clip), *_rest_poses(clip, tracks)]
     if tracks.body.soles:
         warnings += [_floor_offset(tracks), _floor_penetration(tracks), *_gait(clip, tracks)]
-    warnings += [_teleports(clip), _rotation_jumps(clip), _dead_joints(clip, tracks)]
+    warnings += [_teleports(clip), _rotation_jumps(clip), *_uneven_limbs(clip, tracks), _dead_joints(clip, tracks)]
     return tuple(warning for warning in warnings if warning is not None)
 
 
@@ -389,6 +392,27 @@ def _rotation_jumps(clip: Clip) -> CheckWarning | None:
         frames=(int(frames[0]), int(frames[-1]) + 2),
         values={"angle_deg": worst, "frame": int(frame) + 1, "count": int(np.count_nonzero(jumps))},
     )
+
+
+def _uneven_limbs(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
+    """Find a leg or an arm that is much shorter than that of the other side; bones that move have their mean offset."""
+    landmarks, skeleton = tracks.body.landmarks, clip.skeleton
+    if not landmarks.by_names:
+        return []
+    if clip.translations is not None:
+        offsets = skeleton.offsets.copy()
+        offsets[list(clip.translated_joints)] = clip.translations.mean(axis=0)
+        skeleton = replace(skeleton, offsets=offsets)
+    found = []
+    for limb, pair in (("leg", landmarks.feet), ("arm", landmarks.hands)):
+        if pair is None or (top := common_ancestor(skeleton.parents, pair)) in pair:
+            continue
+        left, right = (path_length(skeleton, top, end) for end in pair)
+        if min(left, right) < UNEVEN * max(left, right):
+            message = f"the left {limb} is {left:.2f} m long, and the right {limb} {right:.2f} m"
+            names = tuple(skeleton.joint_names[end] for end in pair)
+            found.append(CheckWarning("uneven-limbs", message, joints=names, values={"left_m": left, "right_m": right}))
+    return found
 
 
 def _dead_joints(clip: Clip, tracks: Tracks) -> CheckWarning | None:

@@ -203,6 +203,27 @@ def test_an_arm_that_turns_in_one_frame_only_is_not_dead(walk: Clip) -> None:
     assert found(replace(walk, poses=poses), "dead-joints") is None
 
 
+@pytest.mark.parametrize(("joint", "limb"), [("LeftFoot", "leg"), ("RightForeArm", "arm")])
+def test_a_limb_whose_bone_has_no_length_is_found(walk: Clip, joint: str, limb: str) -> None:
+    offsets = walk.skeleton.offsets.copy()
+    bone = walk.skeleton.index_of(joint)
+    offsets[bone] = 0.0
+    short = replace(walk, skeleton=replace(walk.skeleton, offsets=offsets))
+    warning = found(short, "uneven-limbs")
+    assert warning is not None
+    assert f"left {limb}" in warning.message
+    assert warning.values["left_m"] != pytest.approx(warning.values["right_m"], rel=0.2)
+    # The same bone, whose length the file states in position channels: the limbs are even.
+    moved = np.tile(walk.skeleton.offsets[bone], (walk.frame_count, 1, 1)).astype(np.float32)
+    assert found(replace(short, translations=moved, translated_joints=(bone,)), "uneven-limbs") is None
+
+
+def test_limbs_that_differ_by_a_tenth_are_not_uneven(walk: Clip) -> None:
+    offsets = walk.skeleton.offsets.copy()
+    offsets[walk.skeleton.index_of("LeftFoot")] *= 0.8
+    assert found(replace(walk, skeleton=replace(walk.skeleton, offsets=offsets)), "uneven-limbs") is None
+
+
 def test_checks_change_nothing(walk: Clip) -> None:
     before = walk.poses.copy()
     check_clip(walk)
