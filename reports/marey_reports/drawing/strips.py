@@ -233,7 +233,7 @@ def _points_of(poses: Sequence[Clip]) -> Floats:
 
 
 def _turned(points: Floats, facing: tuple[tuple[int, ...], tuple[int, ...]], headings_rad: Floats) -> Floats:
-    """Turn points (T, P, 3) about the vertical through the origin until each pose faces its heading."""
+    """Turn points (T, P, 3) about the vertical through the origin until each pose faces its heading, if it is known."""
     try:
         ahead = forward_directions(points, *facing)
     except MotionError:

@@ -78,7 +78,7 @@ METRICS = {
         "feet slide in the clips", "m/s", 2, "mean speed of the toes in contact in the clips shown, without transitions"
     ),
     "foot_depth_p95": Metric(
-        "feet sink", "m", 3, "depth of the lower toe below the mean height of toes in contact; 95 % of it is less"
+        "feet sink", "m", 3, "95th percentile of the depth of the lower toe below the mean height of toes in contact"
     ),
     "contacts_per_m": Metric("steps per metre", "1/m", 2, "number of times that a foot comes into contact, per metre"),
     "contacts_per_m_clips": Metric(

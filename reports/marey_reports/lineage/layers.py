@@ -15,7 +15,7 @@ from typing import NamedTuple
 SWEEPS = 12
 """Number of times that the order of all layers is improved."""
 MOST_PASSED = 100_000
-"""Limit of the sum, over all arrows, of the number of layers between source and target of the arrow."""
+"""Greatest total length of all arrows; the length of an arrow is the number of layers from its source to its target."""
 
 
 class Layout(NamedTuple):
@@ -34,7 +34,7 @@ class Layout(NamedTuple):
 def lay_out(count: int, arrows: Sequence[tuple[int, int]]) -> Layout:
     """Return the layers of `count` boxes with arrows between them.
 
-    Raises `ValueError` if the arrows form a cycle, or if they pass through more than `MOST_PASSED` layers in total.
+    Raises `ValueError` if the arrows form a cycle, or if their total length is more than `MOST_PASSED` layers.
     """
     depth = _depths(count, arrows)
     if sum(depth[target] - depth[source] for source, target in arrows) > MOST_PASSED:

@@ -24,7 +24,7 @@ class Sort(StrEnum):
 
 
 class Box(NamedTuple):
-    """Box of the picture with its lines of text; `warning` is true if it shows old or deleted revisions."""
+    """Box of the picture with its lines of text; `warning`: whether a revision in it is outdated, deleted or purged."""
 
     sort: Sort
     lines: tuple[str, ...]

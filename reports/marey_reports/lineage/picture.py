@@ -18,7 +18,7 @@ GROUND = {Sort.START: "#e3eef6", Sort.ITEMS: "#f4f6f8", Sort.JOB: "#ffffff", Sor
 EDGE = {Sort.START: COLOURS[0], Sort.ITEMS: "#9aa3af", Sort.JOB: "#9aa3af", Sort.COMMIT: COLOURS[2]}
 """Colours of the borders of boxes."""
 WARNING = COLOURS[1]
-"""Colour of the border of a box that has old or deleted revisions."""
+"""Colour of the border of a box with outdated, deleted or purged revisions."""
 
 _SIGN, _BOLD_SIGN, _LINE, _PADDING = 0.071, 0.08, 0.16, 0.09
 """Widths of a plain and a bold character, height of a line, and space around the text of a box, in inches."""

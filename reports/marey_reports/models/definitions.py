@@ -33,7 +33,7 @@ _NUMBERS = (
         "left-out error",
         "cm",
         "mean distance of the joints of an example from their positions after a reconstruction from the mean and the "
-        "components of all other examples",
+        "components of the examples of all other takes",
     ),
     (
         "log-likelihood",

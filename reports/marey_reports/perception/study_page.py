@@ -272,8 +272,8 @@ def _reading() -> Content:
         "A difference is a share of trials, between 0 and 1; a trial shows six pairs, and one of them is chosen, so "
         "the mean difference is five sixths.",
         "The noise is the standard error of the differences that follows from the number of trials. A fit with a "
-        "smaller error describes the noise. It contains chance alone, and not how much other people would differ from "
-        "these participants. It is not known (–) if too few answers repeat a pair.",
+        "smaller error describes the noise. The noise contains chance alone, and not how much other people would "
+        "differ from these participants. It is not known (–) if too few answers repeat a pair.",
         "Left out: the error for motions that were left out of the fit, one at a time. If it is much greater than the "
         "error, the weights do not carry over to other motions.",
         "The groups are those of k-means with two groups; every set of motions can be divided in two. Look at the "
