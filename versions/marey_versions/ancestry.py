@@ -28,11 +28,11 @@ _COMMON = _OURS | _THEIRS
 
 
 def nearest_common(commit_of: Callable[[str], HistoricCommit], ours: str, theirs: str) -> list[str]:
-    """Return the nearest common ancestors of two commits, sorted by digest.
+    """Return the nearest common ancestors of two commits, sorted by digest; an empty list if there are none.
 
     A common ancestor is nearest if no other common ancestor descends from it. A commit counts as its own ancestor. The
     search reads commits in the order of decreasing generation. It stops when all commits that are left to read are
-    ancestors of common ancestors. So the time of the search does not depend on the length of the history before them.
+    ancestors of common ancestors. So the history before the common ancestors does not lengthen the search.
 
     Parameters
     ----------

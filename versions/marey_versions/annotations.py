@@ -89,7 +89,10 @@ def merge_annotations(
 
 
 def _merge_member(name: str, base: Any, ours: Any, theirs: Any) -> Any:
-    """Return the merged value of a member of the document; a missing member is None."""
+    """Return the merged value of a member of the document, or the reason why both changes cannot be kept.
+
+    A missing member has the value None.
+    """
     if ours == theirs or theirs == base:
         return ours
     if ours == base:
@@ -140,7 +143,8 @@ def merge_segments(
 
     The result has the segments that both sides have kept, and those that one side has added. Two changes exclude each
     other in two cases. The sides have added different segments that overlap; or both sides have removed a segment, and
-    have not added the same segments in its place.
+    have not added the same segments in its place. An added segment that overlaps the removed segment counts as added in
+    its place.
 
     Parameters
     ----------

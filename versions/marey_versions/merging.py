@@ -350,7 +350,10 @@ def _excludes(base: Any, ours: Any, theirs: Any) -> bool:
 
 
 def _combined(sides: _Sides, taken: Mapping[str, Side]) -> DatasetEntry | None:
-    """Return the entry with the changes of both sides; `taken` contains the side of each clashing part."""
+    """Return the entry with the changes of both sides; None if one side does not have the entry.
+
+    `taken` contains the side of each clashing part.
+    """
     base, ours, theirs = sides.base, sides.ours, sides.theirs
     if ours is None or theirs is None:
         return None
@@ -374,5 +377,5 @@ def _merged_tags(base: DatasetEntry | None, ours: DatasetEntry, theirs: DatasetE
 
 
 def _newer(part: str, of_base: Mapping[str, str], ours: DatasetEntry, theirs: DatasetEntry) -> str | None:
-    """Return a part in the version of the side that has changed it."""
+    """Return the content digest of a part on the side that has changed it; None if this side has removed the part."""
     return (theirs if ours.parts.get(part) == of_base.get(part) else ours).parts.get(part)

@@ -62,7 +62,8 @@ class EntryChange(NamedTuple):
 class Archive:
     """Archive that is open for reading. Each member is read and compared with its digest when it is requested.
 
-    Raises `BadArchive` if the file is not a complete archive, or if the name of a member is not valid.
+    The constructor raises `BadArchive` if the file is not a complete archive, or if the name of a member is not valid.
+    The methods raise `BadArchive` if a member that they need is missing or damaged.
     """
 
     def __init__(self, file: BinaryIO) -> None:
