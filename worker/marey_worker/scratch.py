@@ -52,7 +52,7 @@ def remove_abandoned() -> None:
 
 
 def _is_abandoned(folder: Path) -> bool:
-    """Return whether nobody has locked a folder of this user.
+    """Return whether a folder belongs to this user, has not changed for `YOUNG_S` seconds, and is not locked.
 
     Links are never followed, and other users' folders are left: their owner could put a link in the place of the
     folder while it is being removed.

@@ -74,7 +74,7 @@ WRONG: dict[str, tuple[str | bytes, str]] = {
     "long line": (b'{"a": "' + b"x" * MOST_LINE_BYTES + b'"}', "at most 65,536 bytes"),
     "nested": ('{"a": {"b": 1}}', "a number, a text, true or false"),
     "null": ('{"a": null}', "a number, a text, true or false"),
-    "name": ('{"<b>": 1}', "a name consists of letters"),
+    "name": ('{"<b>": 1}', "a name consists of at most 63 letters"),
     "huge integer": ('{"a": 1' + "0" * 30 + "}", "64 bits"),
     "long text": (json.dumps({"a": "x" * 501}), "at most 500 characters"),
     "fraction as step": ('{"step": 0.5, "a": 1}', "the step in line 1"),

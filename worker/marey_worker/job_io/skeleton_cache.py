@@ -31,7 +31,8 @@ MOST_KEPT = 512
 class MappedSkeleton(NamedTuple):
     """Skeleton with its joint mapping and axes.
 
-    `guessed` are the joints whose axes the skeleton does not show and nobody has stated: a motion shows them better.
+    `guessed` contains the joints whose axes are only guessed, because the skeleton does not show them and no person has
+    stated them. A motion shows these axes better.
     """
 
     skeleton: Skeleton
@@ -75,8 +76,8 @@ def plan_between(context: Context, source: Rig, target: Rig, scale: float | None
     """Return the plan for retargeting a clip from one skeleton to another.
 
     `scale` is the number of metres that the target's pelvis moves per metre of the source's pelvis; None: it is
-    computed from the skeletons. `clip`, on the source's skeleton, shows the axes that the source does not have.
-    Raises `MotionError` if a joint mapping cannot be used, or if joints or axes that the plan needs are missing.
+    computed from the skeletons. `clip` has the source's skeleton; the axes of its `guessed` joints are taken from the
+    clip. Raises `MotionError` if a joint mapping cannot be used, or if joints or axes that the plan needs are missing.
     """
     mapped = read_mapped(context, source)
 

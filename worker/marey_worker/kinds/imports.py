@@ -22,7 +22,10 @@ from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: ImportParams) -> dict[str, Any]:
-    """Import every file of the job; the result has an entry for each file. A faulty file does not affect the others."""
+    """Import every file of the job; the result has an entry for each file. A faulty file does not affect the others.
+
+    Raises `JobRefused` if the skeleton that the parameters name does not exist.
+    """
     return _Importing(context, params).run()
 
 

@@ -40,7 +40,10 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 
 KEPT_SHARE = 0.5
-"""Least share of a full shard whose poses are still needed; the poses of shards with less are copied to new shards."""
+"""Least number of needed poses with which an earlier shard stays as it is, as a share of the poses of a full shard.
+
+The needed poses of all other shards are copied to new shards.
+"""
 LEFT_OUT_NAMED = 100
 """Greatest number of clips named in the log because they cannot be compared."""
 

@@ -116,7 +116,7 @@ class _Retargeting:
         )
 
     def _unknown_axes(self, source: MappedSkeleton, plan: RetargetPlan) -> list[CheckWarning]:
-        """Return warnings of paired joints whose axes neither the skeleton shows nor a user has stated."""
+        """Return warnings about paired joints whose axes the skeleton does not show and no user has stated."""
         target = read_mapped(self._context, self._target)
         both = (
             (source.guessed, [pair.source for pair in plan.pairs], "axes-from-clip", _FROM_CLIP),

@@ -45,8 +45,9 @@ class FetchFailed(Exception):
 def check_out(declared: ScriptDeclaration, folder: Path, environment: Mapping[str, str]) -> None:
     """Write the files of a script's commit to `folder`, from the cache or from the repository.
 
-    Raises `JobRefused` if this worker does not allow the repository, if no branch or tag of the repository contains the
-    commit, or if the commit is too large. Raises `FetchFailed` if the repository cannot be read now.
+    Raises `JobRefused` if this worker has no Git or does not allow the repository, if no branch or tag of it contains
+    the commit, or if the commit is too large or has a file or link that leads out of `folder`. Raises `FetchFailed` if
+    the repository cannot be read now.
     """
     if not is_allowed(declared.repository, read_repositories(environment)):
         detail = f"this worker does not allow the repository {declared.repository}"

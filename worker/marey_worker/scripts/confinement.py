@@ -48,8 +48,9 @@ def adopt_orphans() -> None:
 def confine(writable: Path, *, network: bool) -> None:
     """Limit the files that this process and its future children can open.
 
-    They can write only below `writable`, and read only there and in the folders of programs. Unless `network` is true,
-    TCP is refused as well, if the kernel supports it. Raises `NotConfinedError` if the kernel has no Landlock.
+    Files can be written only below `writable`. They can be read only there, in the folders of programs, and at a few
+    other places of the system. Devices such as /dev/null can be used. Unless `network` is true, TCP is refused as well,
+    if the kernel supports it. Raises `NotConfinedError` if the kernel has no Landlock, or refuses the limits.
     """
     version = landlock_version()
     if version == 0:

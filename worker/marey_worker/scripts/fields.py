@@ -149,7 +149,7 @@ def _fault_of_name(field: str) -> str | None:
     try:
         _FIELD_NAME.validate_python(field)
     except ValidationError:
-        return "a name consists of letters, digits and _, and begins with a letter"
+        return "a name consists of at most 63 letters, digits and _, and begins with a letter"
     return None
 
 
