@@ -112,7 +112,7 @@ def published_entry(entry: ImportEntry, made: Mapping[str, Made]) -> ImportEntry
 
     `made` contains the published revisions by the names of their drafts. If `made` does not contain the file, the file
     is refused, because an item of this name has another skeleton. If the file contains only a skeleton, the entry names
-    the item of the skeleton.
+    the item of the skeleton. Entries of companions, and of files refused for other reasons, are returned unchanged.
     """
     refused = entry.error is not None and entry.error.code == SKELETON_DIFFERS.code
     if entry.status not in ("created", "unchanged") and not refused:

@@ -116,7 +116,10 @@ class LineageGraph(Answer):
 
 
 class LineageGroup(NamedTuple):
-    """Revisions that are shown as one: of one kind, created by one job, and used by the same jobs for the same inputs.
+    """Revisions that are shown as one.
+
+    They have one kind and one distance from the start, were created by one job, and were used by the same jobs for the
+    same inputs.
 
     Parameters
     ----------

@@ -178,7 +178,10 @@ def _shown(value: Any) -> str:
 
 
 def _suggestion(fault: Mapping[str, Any], known: Iterable[str]) -> str:
-    """Return a question that names the known word nearest to the one in a fault; empty if none is similar."""
+    """Return a text to append to the reason of a fault: a question with the known word that is most similar.
+
+    A number with a decimal comma is repeated with a point instead. The text is empty if no known word is similar.
+    """
     typed = fault["loc"][-1] if fault["type"] == "extra_forbidden" else fault.get("ctx", {}).get("tag", fault["input"])
     near = nearest(typed, known) if isinstance(typed, str) else None
     if fault["type"] in ("float_parsing", "int_parsing") and re.fullmatch(r"[-+]?\d+,\d+", str(fault.get("input"))):

@@ -21,7 +21,7 @@ RefName = Annotated[str, StringConstraints(pattern=REF)]
 
 _VERSION = form(
     r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}(?:~[0-9]{1,4})?$",
-    "be a branch, a tag or the digest of a commit, to which ~1 may be appended for the commit before it, and so on",
+    "be a branch, a tag or the digest of a commit; ~1 after it means the commit before, ~2 the one before that",
 )
 Version = Annotated[str, StringConstraints(pattern=_VERSION)]
 """Name of a version: a branch, a tag, or the digest of a commit (the first 8 digits are enough).

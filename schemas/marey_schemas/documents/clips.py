@@ -89,7 +89,7 @@ class Check(Request):
     message: str
     joints: tuple[str, ...] = ()
     frames: tuple[int, int] | None = Field(
-        None, description="Half-open range of frames that the finding is about; null: all frames."
+        None, description="Half-open range of frames that the warning concerns; null: all frames."
     )
     values: dict[str, Any] = Field(default_factory=dict)
 
@@ -172,8 +172,8 @@ def with_earlier_facts(info: Mapping[str, Any], earlier: Mapping[str, Any]) -> d
     If both revisions state the last day of the consent, the earlier day counts. If both revisions state the purposes of
     the consent, only the purposes that occur in both revisions count.
 
-    The earlier messages of warnings are kept if the same file was imported in the same way, and if nothing but the
-    messages differs. So no revision is added because a newer version of Marey words a warning differently.
+    The earlier warnings are kept if the same file was imported in the same way, and if the new warnings differ from
+    them only in their messages. So no revision is added because a newer version of Marey words a warning differently.
     """
     names = [name for name in RecordingFacts.model_fields if info.get(name) is None and earlier.get(name) is not None]
     kept = {**info, **{name: earlier[name] for name in names}}

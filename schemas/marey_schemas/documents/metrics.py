@@ -56,7 +56,10 @@ PUBLISHED: Mapping[Measurement, Mapping[Shaping, tuple[float | None, ...]]] = {
         "sigmoid": (21.993, 0.189, 36.532, 0.000, 0.000, 0.000, 0.000, 0.564, 0.000, 0.306, 0.157),
     },
 }
-"""Figure 5 of Pražák et al. (2009) by measurement and function F: difference, c, N, weights of `JOINT_CLASS_NAMES`."""
+"""Figure 5 of Pražák et al. (2009), by measurement and function F.
+
+The numbers are its column "difference", which is not used, then c, N, and the weights of `JOINT_CLASS_NAMES`.
+"""
 
 _TEXT_AND_TABLE = (
     "The text of the paper says that velocities use hands, thighs and calves; its table has hand, calf and toe, and no "
@@ -147,7 +150,7 @@ class MetricFit(Request):
     left_out_rmse: _Amount | None = Field(
         None,
         description="Root mean square error for motions that were left out of the fit, one motion at a time "
-        "(cross-validation).",
+        "(cross-validation). Null: unknown.",
     )
 
 

@@ -30,7 +30,8 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 class Measure(NamedTuple):
     """Measure of the quality of a clip, such as its foot skate.
 
-    `better` says which values are better: "less", "more", or "neither" for facts that are no defects.
+    `better` says which values are better: "less", "more", or "neither" for facts that are no defects. `digits` is the
+    number of decimals to show, and `misleads` says how a value can mislead its reader.
     """
 
     title: str

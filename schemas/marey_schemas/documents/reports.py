@@ -32,7 +32,7 @@ class StoredFigure(Request):
     """Figure in all its formats: image, vector drawing, and its data as one JSON file and as CSV tables."""
 
     name: FigureName
-    number: str = Field("", description="The corresponding figure of the publication.")
+    number: str = Field("", description="Number of the same figure in a published paper; empty: none.")
     title: str
     caption: str
     trial: TrialName | None = Field(

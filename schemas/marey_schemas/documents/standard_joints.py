@@ -26,5 +26,5 @@ SIDE_JOINTS = (
     *(f"{finger}_finger_{part}" for finger in FINGERS for part in ("root", "base", "mid", "tip", "end")),
 )
 LIMB_ENDS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
-"""Hands and feet, as far as their positions are compared: standard joints that nearly every skeleton has."""
+"""Wrists and ankles, whose positions stand for those of hands and feet, because nearly every skeleton has them."""
 STANDARD_JOINTS = (*CENTRE_JOINTS, *(f"{side}_{joint}" for side in SIDES for joint in SIDE_JOINTS))

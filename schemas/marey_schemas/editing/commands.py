@@ -269,7 +269,7 @@ class FixDrift(NamedCommand):
     frames: Frames | None = Field(None, description=f"{WHOLE_OR_RANGE} The range has at least two frames.")
     profile: Literal["linear", "smooth"] = Field(
         "linear",
-        description="Growth of the correction over the range. linear: the same share in every frame; "
+        description="Growth of the correction over the range. linear: by the same amount in each frame; "
         "smooth: slow at the start and the end.",
     )
 

@@ -62,8 +62,9 @@ class ArrayDifference:
     ) -> ArrayDifference | None:
         """Return the difference of an array from a base; None if the difference would not be smaller than the array.
 
-        Also returns None if dtype, shape or layout of the two arrays differ. `content` and `pointer` name the base;
-        `digest` is the content digest of the array. At most half of the frames are held in memory in decoded form.
+        Also returns None if more than half of the frames differ, or if dtype, shape or layout of the two arrays differ.
+        `content` and `pointer` name the base; `digest` is the content digest of the array. The arrays are decoded block
+        by block, so that at most about half of the frames are in memory in decoded form.
         """
         spec = ArraySpec(array.dtype, array.shape)
         if spec != ArraySpec(base.dtype, base.shape) or not spec.shape:
@@ -132,7 +133,9 @@ class ArrayDifference:
         """Return `frames` and `difference` as arrays; sizes are checked before memory is allocated."""
         count = _length(self.frames)
         if not _is_worthwhile(count, spec):
-            raise ArrayError("bad-array", "an array difference must have fewer bytes than the array that it describes")
+            raise ArrayError(
+                "bad-array", "an array difference must not have more frames or bytes than the array that it describes"
+            )
         numbers = _decoded("frames", self.frames, ArraySpec(INDEX, (count,)))
         if (numbers[1:] <= numbers[:-1]).any() or (count and numbers[-1] >= spec.shape[0]):
             raise ArrayError("bad-array", "the frames of an array difference must be ascending indices of the array")
@@ -164,7 +167,7 @@ def _length(frames: Any) -> int:
 
 
 def _is_worthwhile(count: int, spec: ArraySpec) -> bool:
-    """Return whether a difference with `count` frames has fewer bytes than the array, if both are decoded."""
+    """Return whether a difference with `count` frames has no more frames and bytes than the array, both decoded."""
     itemsize = np.dtype(spec.dtype).itemsize
     return count <= spec.shape[0] and count * (np.dtype(INDEX).itemsize + _columns(spec) * itemsize) <= spec.nbytes
 

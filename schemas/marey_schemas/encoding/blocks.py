@@ -325,7 +325,10 @@ def _columns_by_group(
 
 
 def _column_indices(columns: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return `columns` after replacing each negative index, which counts from the end. Raises `IndexError`."""
+    """Return `columns` after replacing each negative index, which counts from the end.
+
+    Raises `IndexError` for an index outside the array, and if `columns` is not a one-dimensional list of integers.
+    """
     picked = np.asarray(columns)
     if picked.ndim != 1 or (picked.size and picked.dtype.kind not in "iu"):
         raise IndexError("columns must be a one-dimensional list of integers")

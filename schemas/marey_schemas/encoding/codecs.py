@@ -304,7 +304,7 @@ class _Walk:
         return "".join("/" + str(step).replace("~", "~0").replace("/", "~1") for step in self._path)
 
     def visit(self, value: Any) -> Any:
-        """Return the checked and converted value. Raises `CodecError`."""
+        """Return the converted value. Raises `CodecError` if the value is not allowed, or exceeds a limit."""
         if isinstance(value, _FOREIGN):
             raise self._error("bad-type", f"a value of type {type(value).__name__} cannot be encoded")
         if isinstance(value, str):

@@ -28,7 +28,7 @@ def content_size(frame: bytes) -> int:
     try:
         size = zstandard.frame_content_size(frame)
     except zstandard.ZstdError as error:
-        raise CompressionError("it does not begin with a zstd frame") from error
+        raise CompressionError("the data does not begin with a zstd frame") from error
     if size < 0:
         raise CompressionError("the zstd frame does not state the size of its content")
     return size

@@ -40,9 +40,10 @@ def is_partial(value: Any) -> bool:
 def partial_array(array: EncodedArray, base: str, pointer: str, base_digests: Sequence[str]) -> dict[str, Any] | None:
     """Return an array without the tiles that its base has.
 
-    Returns None if the base has no tile of the array, or if the array has another division into tiles.
+    Returns None if the base has no tile of the array, or if `blocks.encode` would divide the array into other tiles.
 
-    `base` and `pointer` name the base, as described above, and `base_digests` lists the digests of its tiles.
+    `base` (the content digest of a revision) and `pointer` name the base, and `base_digests` lists the digests of its
+    tiles.
     """
     tiles, spec = blocks.split(array.data), ArraySpec(array.dtype, array.shape)
     places = {digest: number for number, digest in enumerate(base_digests)}

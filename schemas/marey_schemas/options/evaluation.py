@@ -27,7 +27,7 @@ COVERAGE_LEAST_S = 1.0
 TARGET_PATH_S = 4.0
 """Default duration in seconds of the path to record for a cell without enough data."""
 SETTLING_S = 1.0
-"""Seconds before and after a change of the desired speed or direction in which these are not judged.
+"""Seconds before and after a change of the desired motion in which speed, heading and turn rate are not judged.
 
 The character reacts before a change, too, because it looks one second ahead.
 """
@@ -175,7 +175,10 @@ class EvaluationOptions(Grid):
         return self
 
     def _require_changes(self) -> None:
-        """Check that corners and figures of eight are long enough for a change and for judged time after it."""
+        """Raise `ValueError` if trials of `corners` or `eights` are too short.
+
+        Their duration must exceed the time until the first change plus the time after it that is not judged.
+        """
         periods_s: list[tuple[Family, float, str]] = []
         if "corners" in self.families:
             periods_s.append(("corners", self.switch_every_s, "the first corner comes"))

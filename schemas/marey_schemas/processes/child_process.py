@@ -91,7 +91,7 @@ class ConnectedChild(ABC):
         return resident_bytes(self.pid)
 
     def send(self, message: bytes) -> None:
-        """Send a message. If the child has died, `receive` raises an error after the last message of the child."""
+        """Send a message; no effect if the child has died: `receive` then raises an error after its last message."""
         with self._sending:
             if self._pipe.closed:
                 return
@@ -124,7 +124,7 @@ class ConnectedChild(ABC):
             raise EOFError from error
 
     def kill(self, *, grace_s: float = TERMINATE_S) -> None:
-        """End the process and its descendants: by SIGTERM, and after `grace_s` by SIGKILL."""
+        """End the process and its descendants, by SIGTERM and after `grace_s` seconds by SIGKILL; close its pipe."""
         if self.alive and grace_s > 0:
             self._signal(signal.SIGTERM)
             deadline = time.monotonic() + grace_s
@@ -243,7 +243,10 @@ def exit_status(pid: int) -> int | None:
 
 
 def connect_to_parent() -> Connection:
-    """Return the pipe to the parent; the first argument of this process is the pipe's file descriptor."""
+    """Return the pipe to the parent; the first argument of this process is the pipe's file descriptor.
+
+    From then on, this process ends with its parent, ignores SIGINT, and prints a traceback if it crashes.
+    """
     die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at a terminal reaches the parent, which decides
     faulthandler.enable()

@@ -210,7 +210,7 @@ class ForkedChild(ConnectedChild):
         return self._status
 
     def kill(self, *, grace_s: float = TERMINATE_S) -> None:
-        """End the process and its descendants: by SIGTERM, and after `grace_s` by SIGKILL."""
+        """End the process and its descendants, by SIGTERM and after `grace_s` seconds by SIGKILL; close its pipe."""
         if not self._released:
             super().kill(grace_s=grace_s)
 

@@ -28,7 +28,7 @@ MOST_LIKENESSES = 3
 MOST_ALIKE = 10_000
 """Greatest number of clips that may meet a condition `like(...)`, because the SQL statement contains their ids."""
 DEEPEST = 30
-"""Greatest depth of nested brackets and negations."""
+"""Greatest number of brackets that may be open at the same time."""
 
 Operator = Literal["=", "~", "<", "<=", ">", ">=", "has"]
 """Operators of conditions. The parser expresses `!=` as a negated `=`, and `in` as `=` with several values."""

@@ -76,7 +76,7 @@ class CommitOptions(Options):
     def commit(self) -> OutputsCommit | None:
         """Return the requested commit, or None if the options name no branch.
 
-        Raises `ValueError` if the place of the commit is malformed, or if it is missing beside other options.
+        Raises `ValueError` if `commit_to` is malformed, or if it is missing although another option is given.
         """
         if self.commit_to is not None:
             return OutputsCommit.at(self.commit_to, message=self.commit_message or "", replace=self.commit_replace)

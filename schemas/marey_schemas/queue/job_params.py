@@ -114,8 +114,8 @@ class CutParams(TaggedResults):
             )
         if set("{}/") & set(_NAME_FIELD.sub("", name)):
             raise ValueError(
-                "the pattern of names may contain only {clip}, {label} and {number} (or "
-                "{number:3} for three digits) in braces"
+                "the pattern of names must contain no slash, and no braces but those of "
+                "{clip}, {label} and {number} (or {number:3} for three digits)"
             )
         return name
 

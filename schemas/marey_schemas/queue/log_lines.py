@@ -34,13 +34,13 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Formatter of a log record as one line of text."""
+    """Formatter of a log record as a line of text, which a traceback follows if there is one."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(levelname)-7s %(name)s: %(message)s", datefmt="%H:%M:%S")
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return a log record as text, followed by the ids of its request and of its trace if there are any."""
+        """Return a log record as text; the ids of its request and of its trace are at the end, if there are any."""
         line = super().format(record)
         given = [one for name in ("request_id", "trace_id") if (one := getattr(record, name, None))]
         return f"{line} [{' '.join(given)}]" if given else line

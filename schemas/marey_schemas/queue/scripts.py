@@ -266,7 +266,11 @@ class ScriptDeclaration(Request):
         return self.argv[1] if self.argv[0] == PYTHON else self.argv[0].removeprefix("./")
 
     def words(self, paths: Mapping[tuple[str, str], str], values: Mapping[str, Value]) -> Iterator[str]:
-        """Yield the words of the command; `paths` contains the path of each (input or output, name)."""
+        """Yield the words of the command, with paths and values in place of the placeholders.
+
+        `paths` contains the path of each input and output; its keys are pairs such as ("input", name). `values`
+        contains the value of each parameter.
+        """
         for word in self.argv:
             match = _PLACEHOLDER.fullmatch(word)
             if match is None:

@@ -79,7 +79,7 @@ class Tracer:
 def open_tracer(
     service: str, environment: Mapping[str, str], *, endpoint: str | None = None, share: float | None = None
 ) -> Tracer | None:
-    """Return the sender of the traces of this process; None if no collector is configured.
+    """Return the sender of the traces of this process; None if no collector is configured, or if traces are disabled.
 
     `endpoint` and `share` take precedence over the variables of OpenTelemetry, which are read from `environment`; the
     exporter itself reads further ones (headers, certificates, sizes of batches) from the process. Raises
@@ -116,7 +116,7 @@ def open_optional_tracer(service: str, environment: Mapping[str, str], *, share:
 def full_endpoint(address: str) -> str:
     """Return the address for spans at a collector; an address without a path gets the usual path.
 
-    Raises `TracesUnusable` if it is not an address of HTTP, or contains a password.
+    Raises `TracesUnusable` if it is not an address of HTTP, or contains a user name, password, query or fragment.
     """
     try:
         parts = urlsplit(address)
@@ -128,7 +128,8 @@ def full_endpoint(address: str) -> str:
         raise TracesUnusable(f"{address!r} is not an address of a collector; write it like http://127.0.0.1:4318")
     if parts.username is not None or parts.password is not None or parts.query or parts.fragment:
         raise TracesUnusable(
-            "the address of the collector must contain no password and no query; set OTEL_EXPORTER_OTLP_HEADERS instead"
+            "the address of the collector must contain no user name, password, query or fragment; set "
+            "OTEL_EXPORTER_OTLP_HEADERS instead"
         )
     return address if parts.path.strip("/") else address.rstrip("/") + PATH
 

@@ -56,7 +56,10 @@ class SpanScope:
 
     @contextmanager
     def child(self, declaration: SpanDeclaration, name: str | None = None) -> Iterator[SpanScope]:
-        """Record a span below this one while the `with` block runs; it is the current scope there."""
+        """Record a span below this scope while the `with` block runs, and yield the scope of the new span.
+
+        The yielded scope is the current one in the block. If nothing is recorded, this scope is yielded.
+        """
         if self.emit is None or not self.context.sampled:
             with entering(self):
                 yield self
@@ -108,7 +111,10 @@ def trace_headers(scope: SpanScope | None) -> dict[str, str]:
 
 
 def _foreign_scope() -> SpanScope | None:
-    """Return the active span of a program that uses OpenTelemetry itself; the package is never loaded here."""
+    """Return the scope of the active span if the program uses OpenTelemetry itself, else None.
+
+    The package is never loaded here.
+    """
     module = sys.modules.get("opentelemetry.trace")
     if module is None or not hasattr(module, "get_current_span"):  # it is being loaded
         return None

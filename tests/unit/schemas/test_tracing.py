@@ -30,7 +30,7 @@ def test_a_place_in_a_trace_survives_its_header() -> None:
         ({"OTEL_TRACES_SAMPLER": "traceidratio", "OTEL_TRACES_SAMPLER_ARG": "nan"}, "from 0 to 1"),
         ({"MAREY_TRACES_SHARE": "half"}, "MAREY_TRACES_SHARE"),
         ({"MAREY_TRACES_ENDPOINT": "127.0.0.1:4318"}, "address of a collector"),
-        ({"MAREY_TRACES_ENDPOINT": "http://me:secret@127.0.0.1:4318"}, "no password"),
+        ({"MAREY_TRACES_ENDPOINT": "http://me:secret@127.0.0.1:4318"}, "no user name"),
     ],
 )
 def test_a_wrong_variable_is_named_and_stops_no_command(
