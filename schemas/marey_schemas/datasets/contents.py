@@ -27,7 +27,11 @@ MOST_RECEIVED_CHANGES = 200_000
 
 def _require_time(text: str) -> str:
     """Return the text; raise ValueError unless it is a time in the format that digests of commits require."""
-    if datetime.strptime(text, TIME_OF_COMMIT).strftime(TIME_OF_COMMIT) != text:  # noqa: DTZ007
+    try:
+        is_time = datetime.strptime(text, TIME_OF_COMMIT).strftime(TIME_OF_COMMIT) == text  # noqa: DTZ007
+    except ValueError:
+        is_time = False
+    if not is_time:
         raise ValueError("the time must be written like 2026-11-23T10:00:00.000000Z")
     return text
 
