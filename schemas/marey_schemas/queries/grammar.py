@@ -285,7 +285,7 @@ class _Reader:
             return Condition(field, "=", values, source)
         operator = tree.children[1]
         if str(operator) not in OPERATORS[known.type]:
-            allowed = one_of(OPERATORS[known.type])
+            allowed = one_of([name for name in OPERATORS[known.type] if name != "has"])  # which compares nothing
             raise QueryError(f"the field {field!r} is a {known.type}; compare it with {allowed}", _column(operator))
         value = _value(known, tree.children[2])
         if operator == "!=":

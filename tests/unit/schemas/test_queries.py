@@ -87,7 +87,7 @@ def test_conditions_are_read(text: str, expected: object) -> None:
         ("frames > nan", 10, "not a number"),
         ("framse > 1", 1, "did you mean 'frames'"),
         ("not_x = 1", 1, "there is no field 'not_x'"),
-        ("frames ~ 1", 8, "compare it with"),
+        ("frames ~ 1", 8, "compare it with =, !=, <, <=, >, >= or in"),
         ("subject > 02", 9, "compare it with"),
         ("frames > 1 frames < 2", 12, "expected the end, 'and' or 'or'"),
         ("(has tag", 9, "closing bracket"),
