@@ -65,7 +65,7 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
 
 
 class _Family:
-    """Set of jobs that are retried together, with what each of them depends on."""
+    """Set of jobs that are retried together, with the dependencies of each of them."""
 
     def __init__(self, tx: Transaction, project: ProjectRow) -> None:
         self._tx = tx
@@ -112,7 +112,7 @@ class _Family:
     def _take(self, rows: Mapping[str, Row[Any]], needs: Mapping[str, dict[str, str]]) -> None:
         if any(row.propagation_rank is not None for row in rows.values()):
             raise UnavailableProblem(
-                "Jobs that depend on these jobs are still being ended; try again in a few seconds.",
+                "The end of a job that would be retried is still being processed; try again in a few seconds.",
                 code="still-ending",
                 headers={"Retry-After": "1"},
             )

@@ -90,7 +90,7 @@ def resolve_params(tx: Transaction, project: ProjectRow, params: ScriptParams, a
         raise _invalid(f"{at}/params/script", "no-script", error.detail) from error
     declared = ScriptDeclaration.model_validate(found.declaration)
     if params.declaration not in (None, declared):
-        detail = f"The script {params.script!r} has another declaration now; leave `declaration` out to run that one."
+        detail = f"The script {params.script!r} has another declaration now; omit `declaration` to use the new one."
         raise _invalid(f"{at}/params/declaration", "script-changed", detail)
     faults = [
         FieldError(pointer=f"{at}/params/values/{name}", code="bad-value", detail=f"{fault[0].upper()}{fault[1:]}.")
