@@ -51,8 +51,9 @@ _Place = tuple[str, int]
 def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest) -> CompleteAnswer:
     """End the job with success and publish its staged outputs; a repeated `write_id` gets the same answer.
 
-    If the cancellation of the job was requested, the job is cancelled instead, and nothing is published. Raises
-    `LeaseLostProblem` if the attempt does not hold the job, or has ended the job with another `write_id`.
+    If the cancellation of the job was requested, the job is cancelled instead. If its outputs may not be published or
+    committed, it fails instead. In both cases, nothing is published. Raises `LeaseLostProblem` if the attempt does not
+    hold the job, or has ended the job with another `write_id`.
     """
     require_attempt(tx.principal, job_id, fence)
     hold_off_purges_of_jobs(tx, [job_id])
@@ -195,7 +196,10 @@ def _keep_from_sharing(
 
 
 def _may_share(kind_name: str, request: CompleteRequest) -> bool:
-    """Return whether the worker allows sharing the result and has the version of the job kind that the server knows."""
+    """Return whether the worker allows sharing the result, and has not reported another version of the job kind.
+
+    The version is compared with that of the server. The result is False for a kind that the server does not know.
+    """
     try:
         known = find_kind(kind_name).code_version
     except UnknownKindError:  # an earlier version of the server accepted the job

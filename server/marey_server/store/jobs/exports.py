@@ -16,10 +16,10 @@ from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
 
 ENDED = "consent_ended"
-"""Name of a member of the result of an export job: the ids of the exported clips whose consent had ended.
+"""Name of a member of two kinds of documents.
 
-In the inputs that a worker gets, a clip has a member with this name if its consent has ended: the last day of the
-consent.
+In the result of an export job, the member contains the ids of all clips of the export whose consent had ended. In the
+inputs that a worker gets, each clip whose consent has ended has the member; it contains the last day of the consent.
 """
 
 

@@ -84,8 +84,8 @@ def decide_expired_outcome(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome
     """Decide what happens after an attempt whose lease has expired. A retry is queued without delay.
 
     An attempt that has written nothing does not count as a try, because the answer to its claim may have been lost. If
-    the lease was renewed until the deadline of the job, the worker was alive and did not stop in time. If the lease
-    expired earlier, the worker is lost, even if the server notices this only after the deadline.
+    the lease was renewed until the deadline of the job, the worker was alive and did not stop in time, so the job
+    fails. If the lease expired earlier, the worker is lost, even if the server notices this only after the deadline.
     """
     if row.cancel_requested_us is not None:
         return AttemptOutcome("cancelled", "cancelled")

@@ -128,8 +128,8 @@ def _defer(tx: Transaction, running: ColumnElement[bool], result: Mapping[str, A
 def release_tasks(tx: Transaction, gathered: Collection[str]) -> None:
     """Delete the staged outputs of the tasks of the parent jobs `gathered`, and release the blobs that tasks name.
 
-    The combined results of the parent jobs replace them. Garbage collection may then delete the blobs, and the results
-    of the tasks are no longer cached.
+    The outputs and blobs are not needed any more, because a worker has combined the results of the tasks.
+    Garbage collection may then delete the blobs, and the results of the tasks are no longer cached.
     """
     tasks = select(job.c.id).where(job.c.parent_id.in_(gathered))
     tx.execute(delete(job_blob).where(job_blob.c.job_id.in_(tasks)))

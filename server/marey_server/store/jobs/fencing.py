@@ -52,9 +52,9 @@ HELD = and_(
     job.c.state == RUNNING,
     tuple_(job.c.id, job.c.fence).in_(bindparam("held_attempts", expanding=True)),
 )
-"""SQL condition that one of several attempts still holds its job, as `held`, for prepared statements.
+"""SQL condition for the jobs that are still held by one of several attempts, for prepared statements.
 
-`held_parameters` returns the parameters that name the attempts.
+`held_parameters` returns the parameters that name the attempts. For a single attempt, see `held`.
 """
 
 
@@ -83,9 +83,10 @@ _MAY_WRITE = or_(
 AUTHOR_MAY_RUN: ColumnElement[bool] = or_(
     job.c.author_id.is_(None), exists().where(user.c.id == job.c.author_id, user.c.disabled.is_(False), _MAY_WRITE)
 )
-"""SQL condition that the author of a job still has a role that may submit jobs, or that the job has no author.
+"""SQL condition that a job has no author, or that its author is not disabled and may still submit jobs in the project.
 
-A role in one folder suffices; the transaction that publishes results checks the role in the folders of the results.
+The author must be an administrator, or have a role that may submit jobs. A role in one folder suffices; the transaction
+that publishes results checks the role in the folders of the results.
 """
 
 

@@ -90,13 +90,13 @@ class _JobPlan:
     job_id: str
     project_id: str
     last_purge: int
-    """Time of the last purge of the project when the plan was computed."""
+    """Time of the last purge of the project before the plan was computed, in microseconds; 0 if there was none."""
     wanted: OutputEntries | None = None
-    """Outputs of the job; None if no commit was planned."""
+    """Outputs of the job; None if the job must be cancelled, or must end with `failure`."""
     commit: PlannedCommit | None = None
-    """The planned commit; None if the branch does not exist any more."""
+    """The planned commit; None if `wanted` is None, or if the branch does not exist any more."""
     failure: dict[str, Any] | None = None
-    """Failure with which the job must end, because its commit cannot be computed; None if it can."""
+    """Failure with which the job must end, because its commit is refused or cannot be computed; otherwise None."""
 
     @property
     def chunks(self) -> Mapping[str, bytes]:

@@ -34,7 +34,7 @@ MOST_INPUTS = 100_000
 Pin = dict[str, Any]
 """Input as a job stores it: an exact revision of an item, with the fields of `PinnedInput`.
 
-Before the input exists, it has the field `job`, the id of the job that produces it, instead.
+An input that does not exist yet is stored with the single field `job`: the id of the job that will create the input.
 """
 
 PinnedInputs = dict[str, list[Pin]]

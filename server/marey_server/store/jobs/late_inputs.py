@@ -43,8 +43,8 @@ class LateInputError(Exception):
 def pin_late_inputs(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
     """Pin the outputs of succeeded dependencies as inputs of the waiting jobs, and queue these jobs.
 
-    Returns the jobs that ended now: those for which there are no outputs to read, and those that share an existing
-    result.
+    Returns the jobs that ended now: jobs that failed because of a `LateInputError`, such as a missing input or an
+    exceeded quota, and jobs that share an existing result.
     """
     if not ids:
         return []
@@ -79,7 +79,8 @@ def _ready_for_inputs(tx: Transaction, ids: Sequence[str]) -> Iterable[Row[Any]]
 def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
     """Return the job with its inputs pinned.
 
-    Raises `LateInputError` if this version of the server does not accept the kind or the parameters any more.
+    Raises `LateInputError` if the inputs cannot be pinned, if the paths of the results conflict (`find_clash`), or if
+    this version of the server does not accept the kind, the inputs or the parameters any more.
     """
     try:
         kind = kind_of_job(row.kind, row.params)

@@ -52,7 +52,10 @@ class Submission:
 
 @dataclass
 class NewJob:
-    """Job that is about to be inserted: a single job, a parent job (`size` tasks) or a task (`position`)."""
+    """Job whose row is about to be written: a single job, a parent job (`size` tasks) or a task (`position`).
+
+    The row is inserted; only for a job that has waited for late inputs, the existing row is updated.
+    """
 
     id: str
     project_id: str
@@ -69,7 +72,7 @@ class NewJob:
 
     @property
     def cache_mode(self) -> str:
-        """Setting of the request: whether the job may use a cached result ("use"), or must compute its own."""
+        """Setting of the request: use a cached result ("use"), replace it ("refresh"), or use no cache ("off")."""
         return self.submission.request.cache
 
     @property
@@ -84,7 +87,7 @@ class NewJob:
 
     @property
     def concurrency_key(self) -> str | None:
-        """Concurrency key of the request, or None. Of the jobs of a project with one key, only one runs at a time."""
+        """Concurrency key of the request, or None. Only one job of a project with the same key runs at a time."""
         return self.submission.request.concurrency_key
 
     @property
@@ -98,7 +101,7 @@ class NewJob:
 
 
 def request_of(row: Row[Any]) -> JobCreate:
-    """Return the request with which a job was submitted, without inputs, labels and dependencies."""
+    """Return the request with which a job was submitted, without inputs, labels, dependencies and `commit`."""
     return JobCreate(
         kind=row.kind,
         params=row.params,
@@ -155,10 +158,10 @@ def count_inputs(submission: Submission) -> int:
 
 
 def _spread(head: NewJob) -> list[NewJob]:
-    """Make a job that is split a parent job, and return its tasks.
+    """Split a job into tasks, which makes it a parent job, and return the tasks.
 
-    The tasks are queued if the job was queued, wait if it waits, and are cancelled if it has failed. A job that is not
-    split (`count_tasks`) is unchanged, and the result is empty.
+    The tasks are queued if the job was queued, wait if it waits, and are cancelled if it has failed. A job without
+    tasks (`count_tasks`) is unchanged, and the result is empty.
     """
     if not count_tasks(head.submission):
         return []

@@ -28,7 +28,7 @@ class QueuePolicy:
     """Greatest number of claims of a job whose leases expire before the worker has written anything.
 
     Such claims do not count as attempts, because the answer to the claim may have been lost. Without this limit, a job
-    that kills each worker at once would never end.
+    that kills each worker right after its claim would never end.
     """
     log_limit_bytes: int = 10 * 2**20
     random_unit: Callable[[], float] = random.random
@@ -44,10 +44,10 @@ class QueuePolicy:
         return round(self.end_grace_s * SECOND_US)
 
     def backoff_us(self, failures: int) -> int:
-        """Return the wait in microseconds before a retry, which begins with `first_backoff_s`.
+        """Return the wait in microseconds before a retry, after the given number of failures.
 
-        Each failure makes the wait four times as long, up to `longest_backoff_s`. Up to a quarter of
-        the wait is subtracted at random.
+        The wait after the first failure is `first_backoff_s`. Each further failure makes it four times as long, up to
+        `longest_backoff_s`. Up to a quarter of the wait is subtracted at random.
         """
         backoff = Backoff(
             self.first_backoff_s, self.longest_backoff_s, factor=4.0, jitter=0.25, random_unit=self.random_unit

@@ -37,9 +37,10 @@ from marey_server.store.wakeups import ENDS_TO_PROPAGATE, wakeups
 PAGE = 1000
 """Greatest number of ended jobs in one statement."""
 MOST_AT_ONCE = 200
-"""Number of ended jobs and of steps after which a transaction leaves the other ends to later transactions.
+"""Number of ended jobs and steps, added up, after which a transaction leaves further ends to later transactions.
 
-A step propagates the ends of some jobs. It also moves at most this number of dependants.
+A step propagates the ends of up to `PAGE` jobs. `MOST_AT_ONCE` is also the greatest number of dependants that one step
+updates.
 """
 
 
@@ -47,7 +48,7 @@ def propagate_ends(tx: Transaction, ended: Iterable[Ended]) -> None:
     """Propagate the ends of jobs to dependants, parent jobs and jobs that share a result, until no further job ends.
 
     The parent jobs of `ended` are updated in this transaction. If there are many dependants, later transactions end or
-    queue some of them, in the same order.
+    queue some of them, in the order in which a single transaction would have done this.
     """
     queue = list(ended)
     unmoved, queue = _propagate(tx, queue, required=len(queue), most=MOST_AT_ONCE)
@@ -115,8 +116,8 @@ _REST = (
 def _propagate(tx: Transaction, queue: list[Ended], *, required: int, most: int) -> tuple[list[Ended], list[Ended]]:
     """Propagate the ends of the first `required` jobs in `queue`, and of at most about `most` further jobs.
 
-    Each step counts as another job. Returns the jobs that have dependants left, and the jobs whose ends are still to be
-    propagated.
+    A step propagates the ends of up to `PAGE` jobs, and counts as one job itself. Returns the jobs some of whose
+    dependants are not updated yet, and the jobs whose ends are not propagated yet.
     """
     unmoved: list[Ended] = []
     while queue and (required > 0 or (most > 0 and not unmoved)):
@@ -291,8 +292,9 @@ _END_UNRUNNABLE = Prepared(
 def _end_unrunnable(tx: Transaction, unrunnable: Sequence[tuple[Row[Any], Ended]]) -> list[Ended]:
     """End locked waiting jobs, each because a job on which it depends did not succeed; return the ended jobs.
 
-    `unrunnable` holds each waiting job with this other job. The waiting job fails, or is cancelled if its `on_failure`
-    is `skip`. Its tasks are cancelled. All jobs end in one statement, because other writes wait while thousands end.
+    `unrunnable` pairs each waiting job with the job that did not succeed. The waiting job fails, or is cancelled if its
+    `on_failure` is `skip`. Its tasks are cancelled, and returned, too. All waiting jobs end in one statement, because
+    other writes wait while thousands end.
     """
     parents = [row.id for row, _ in unrunnable if row.size is not None]
     tasks = end_jobs(tx, and_(job.c.parent_id.in_(parents), job.c.state == WAITING), "cancelled") if parents else []

@@ -77,9 +77,9 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     """Claim up to `request.max` queued jobs for the caller, in order of priority.
 
     Each claim of a job increases its fence, the number by which the new attempt is identified. A repeated `claim_id`
-    gets those leases of the earlier claim that are still held. Raises `LeaseLostProblem` if there are none. Raises
-    `ForbiddenProblem` if the caller may not claim jobs or may not announce these labels. Raises `InvalidProblem` if the
-    worker uses another version of the protocol.
+    gets the leases of the earlier claim that are still held. If none of these leases is held, raises
+    `LeaseLostProblem`. Raises `ForbiddenProblem` if the caller may not claim jobs or may not announce these labels.
+    Raises `InvalidProblem` if the worker uses another version of the protocol.
     """
     if request.protocol != PROTOCOL_VERSION:
         detail = (
@@ -131,7 +131,7 @@ _CLAIMED_BEFORE = Prepared(
 def _read_turns(
     tx: Transaction, claim_id: str | None, queries: _ClaimQueries
 ) -> tuple[list[tuple[str, int]], list[Turn]]:
-    """Return the attempts of an earlier claim with the same `claim_id`, and the projects that have jobs.
+    """Return the attempts of an earlier claim with the same `claim_id`, and the projects with jobs for this claim.
 
     The attempts are given by job and fence; there are none without an earlier claim. Concurrent claims with the same
     `claim_id` run one after the other.

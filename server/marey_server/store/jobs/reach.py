@@ -122,7 +122,10 @@ def _ids_in(text: str) -> list[str]:
 
 
 def _named_items(tx: Transaction, pins: Pins) -> frozenset[str]:
-    """Return the ids of the items to which the job of the attempt leads: its inputs refer to them, directly or not."""
+    """Return the ids of the items to which references lead from the inputs and parameters of the attempt's job.
+
+    References of these items to further items are followed, too.
+    """
     job_id = tx.principal.job_id or ""
     found = _named.get(job_id)
     if found is None:

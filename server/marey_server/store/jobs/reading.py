@@ -126,7 +126,11 @@ def _attempt_document(row: Row[Any], *, named: bool) -> Attempt:
 
 
 def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
-    """Return the outputs of a job, or of its tasks in the order of the tasks."""
+    """Return all outputs of a job, or, for a parent job, a page of the outputs of its tasks in the order of the tasks.
+
+    `cursor` and `limit` count tasks, not outputs. If a worker combines the results of the tasks, the outputs are those
+    of the parent job itself, without pages.
+    """
     row, _ = find_job(tx, job_id)
     if row.size is None or row.gathers:
         return Page(items=tuple(JobOutput(**output) for output in row.outputs or ()))
@@ -206,7 +210,8 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     """Cancel a job: at once if it is not running, else when its worker stops or a grace period ends.
 
     A parent job is cancelled with its tasks. A repeated cancellation has no effect. Raises `ConflictProblem` for a
-    job that has succeeded or failed, and `ForbiddenProblem` for a job of another user.
+    job that has succeeded or failed, and `ForbiddenProblem` for a job of another user, unless the caller is a
+    maintainer.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "cancel")
@@ -257,7 +262,11 @@ def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) ->
 
 
 def find_job(tx: Transaction, job_id: str) -> tuple[Row[Any], ProjectRow]:
-    """Return the job and its project; raise `NotFoundProblem` if the caller may not see the project."""
+    """Return the row of a job, with the columns of `select_jobs`, and its project.
+
+    Raises `NotFoundProblem` if there is no such job, if the caller may not see the project, or if the caller is an
+    attempt of another job.
+    """
     row = tx.execute(select_jobs().where(job.c.id == job_id)).one_or_none()
     if row is not None and (tx.principal.kind != "attempt" or tx.principal.job_id == job_id):
         try:

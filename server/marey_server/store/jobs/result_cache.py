@@ -1,8 +1,8 @@
 """Result cache: identical jobs share one computation, finished or still running.
 
 Jobs are identical if they have the same cache key (`layout`). For each job, shared results are published again, into
-the job's own collection. Jobs of different projects share no results. An exported archive is not shared after the
-consent for one of its clips has ended.
+the job's own collection. Jobs of different projects share no results. The result of an export is shared only if the
+consent has ended for the same clips as when the result was computed.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class SharedResult(NamedTuple):
     def is_no_later_than(self, other: Any) -> bool:
         """Return whether this job has finished, or starts no later than the queued job `other` would start.
 
-        The result is false if this job needs a label that `other` does not need: perhaps no worker has this label. This
-        is so even while a worker runs this job, because the worker may be lost.
+        Unless this job has finished, the result is False if it needs a label that `other` does not need: perhaps no
+        worker has this label. This applies even while a worker runs this job, because the worker may be lost.
         """
         if self.finished:
             return True
@@ -187,8 +187,8 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
     """Give waiting jobs the results of the finished jobs that their `cached_from` names; return the jobs that ended.
 
     Of `rows`, only the `id` is read. One transaction publishes the results for a limited number of jobs and outputs;
-    the leading server process does it for the others later. If a result is no longer stored, or cannot be published
-    again, the waiting job is queued, or waits for another identical job.
+    the leading server process publishes the results for the remaining jobs later. If a result is no longer stored, or
+    cannot be published again, the waiting job is queued, or waits for another identical job.
     """
     ended: list[Ended] = []
     unserved: list[str] = []

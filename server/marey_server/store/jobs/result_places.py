@@ -26,9 +26,11 @@ class Clash(NamedTuple):
 
 
 def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str) -> Clash | None:
-    """Return a conflict between the folders and names under which a job would store its results, or None.
+    """Return a conflict that prevents a job from storing its results at their paths, or None.
 
-    The names are not compared if an input is the result of another job, because this result may not exist yet.
+    Conflicts are: `into` and the parameters do not determine the place of the results; a path is too long; two results
+    have the same path; or a result would replace another input. Paths are not compared if an input is the result of
+    another job, because this result may not exist yet.
     """
     unclear = kind.unclear_place(params, into) if kind.unclear_place is not None else None
     if unclear is not None:

@@ -66,11 +66,12 @@ def prepare_output(output: StagedOutput) -> PreparedOutput:
 def stage(
     tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOutput], facets: Sequence[ItemFacets] = ()
 ) -> int:
-    """Store outputs until the attempt completes; they replace staged outputs of the same names. Return their number.
+    """Store outputs until the attempt completes; they replace staged outputs of the same names.
 
-    `facets`, unless empty, replace all facets that the attempt staged before. Raises `LeaseLostProblem` if the attempt
-    does not hold the job, and `InvalidProblem` for sources that are not inputs of the job. Raises the errors of
-    `stored_facets`, too.
+    Returns the number of all outputs that the attempt has staged so far. `facets`, unless empty, replace all facets
+    that the attempt staged before. Raises `LeaseLostProblem` if the attempt does not hold the job. Raises
+    `InvalidProblem` for sources that are not inputs of the job, for two `outputs` of the same name, and for more than
+    `MOST_STAGED` outputs of the attempt. Raises the errors of `stored_facets`, too.
     """
     require_attempt(tx.principal, job_id, fence)
     held = lock_held_job(tx, job_id, fence, job.c.inputs, job.c.kind, job.c.project_id)
