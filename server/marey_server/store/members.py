@@ -32,7 +32,7 @@ def list_members(
 
 
 def read_member(tx: Transaction, project_name: str, user_name: str) -> Member:
-    """Return one member of a project."""
+    """Return one member of a project. Raises `NotFoundProblem` if the user is no member."""
     project_row = projects.require(tx, project_name)
     statement = select(user.c.name, member).join(user, user.c.id == member.c.user_id)
     row = tx.execute(statement.where(member.c.project_id == project_row.id, user.c.name == user_name)).first()
@@ -50,10 +50,11 @@ def put_member(
     expected_rev: ExpectedRev = None,
     absent: bool = False,
 ) -> Member:
-    """Add a member, or change the member's role.
+    """Add a member, or change the member's role; withdraw invitations that the member may no longer issue.
 
-    Raises `NotFoundProblem` if there is no such user, and `ConflictProblem` if the project would lose its last owner.
-    With `absent`, raises `PreconditionFailedProblem` if the user is a member already.
+    Raises `NotFoundProblem` if there is no such user or the user is disabled, and `ConflictProblem` if the project
+    would lose its last owner. With `expected_rev`, the user must be a member already. With `absent`, raises
+    `PreconditionFailedProblem` if the user is a member already.
     """
     project_row = lock_project(tx, project_name)
     lock_places(tx, project_row)
@@ -114,9 +115,9 @@ def find_role(tx: Transaction, project_id: str, user_id: str) -> Role | None:
 
 
 def remove_member(tx: Transaction, project_name: str, user_name: str, *, expected_rev: ExpectedRev) -> None:
-    """Remove a member, with the member's roles in folders.
+    """Remove a member and the member's roles in folders; withdraw the invitations that the user may no longer issue.
 
-    Raises `ConflictProblem` if the project would lose its last owner.
+    Raises `NotFoundProblem` if the user is no member, and `ConflictProblem` if the project would lose its last owner.
     """
     project_row = lock_project(tx, project_name)
     lock_places(tx, project_row)
@@ -146,7 +147,10 @@ def _withdraw_invitations(tx: Transaction, project_row: ProjectRow, user_name: s
 
 
 def lock_project(tx: Transaction, project_name: str) -> ProjectRow:
-    """Return a project after locking its members, so that two owners cannot remove each other at the same time."""
+    """Return a project after locking its row, so that two owners cannot remove each other at the same time.
+
+    Every change of the members of a project locks this row first.
+    """
     project_row = projects.require(tx, project_name)
     tx.execute(select(project.c.id).where(project.c.id == project_row.id).with_for_update(key_share=True))
     return projects.require(tx, project_name)  # the one before may have ended the caller's role

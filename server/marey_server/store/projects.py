@@ -308,7 +308,10 @@ def _too_many_guesses(wait_s: int) -> TooManyRequestsProblem:
 
 
 def create_project(tx: Transaction, request: ProjectCreate) -> Project:
-    """Create a project owned by the caller. Raises `ConflictProblem` if the name is used."""
+    """Create a project owned by the caller.
+
+    Raises `ConflictProblem` if the name is used, and `QuotaExceededProblem` if the caller owns too many projects.
+    """
     principal = tx.principal
     if principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to create a project.")

@@ -61,7 +61,10 @@ class Retired:
 
 
 def retire(database: Database, retention: Retention) -> Retired:
-    """Delete old events, logs, jobs and audit entries; return how many. May run in several processes at once."""
+    """Delete old events, logs, jobs and audit entries; return how many. May run in several processes at once.
+
+    Also deletes old deliveries of webhooks, and replaced secrets of webhooks whose grace period is over.
+    """
     database.write(SYSTEM, forget_old_secrets)
     return Retired(
         events=_retire_events(database, retention.events_days) if retention.events_days else 0,

@@ -122,7 +122,10 @@ class Transaction:
         self.pod_rules = pod_rules
         """Rules by which jobs get a pod of their own; None if the server starts no such pods."""
         self.before_statement: Callable[[], object] = bool
-        """Function that is called before each statement; if it raises an error, the transaction stops."""
+        """Function that is called before each lock, and before each statement that is not prepared.
+
+        If it raises an error, the transaction stops.
+        """
         self.folder_rights: dict[tuple[str, str | None], FolderRights] = {}
         """Rights that this transaction has read, by project and user; see `store.folder_roles.rights`."""
         self.shared_outputs = 0
@@ -150,7 +153,10 @@ class Transaction:
         return self.continued_for or self.principal.actor
 
     def beside(self, principal: Principal) -> Transaction:
-        """Return a transaction for another `principal` on the same connection; the two are committed together."""
+        """Return a transaction for another `principal` on the same connection; the two are committed together.
+
+        After the commit, the caller must call `run_after_commit` of the returned transaction, too.
+        """
         other = Transaction(
             self.connection, principal, self._clock, self.blobs, self.quotas, self.observer, pod_rules=self.pod_rules
         )

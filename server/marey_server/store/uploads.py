@@ -33,7 +33,7 @@ from marey_server.store.transaction import Transaction
 
 MAX_UPLOAD_BYTES = 16 * 2**30
 LIFETIME_US = 7 * DAY_US
-"""Time without a new piece after which an upload is deleted."""
+"""Time in microseconds without a new piece after which an upload is deleted."""
 PIECES_AT_ONCE = 8
 """Number of pieces, each of at most 1 MiB, that one transaction deletes, so that other writes do not wait long."""
 

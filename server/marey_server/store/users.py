@@ -129,10 +129,13 @@ def change_user(
 ) -> User:
     """Change a user: administrators may change all fields, users their own display name and password.
 
-    A new password ends the user's sessions, unless the request says which tokens end. `password_hash` is the hash of
-    `request.password`. `verified_hash` is the stored hash that `request.current_password` matched, or None. Raises
-    `ForbiddenProblem` if users change their own password without the current one, and `PreconditionFailedProblem` if
-    the stored hash is another one now.
+    A new password ends the user's sessions, unless the request says which tokens end. If all tokens end, or if the user
+    is disabled, the user's schedules are paused. `password_hash` is the hash of `request.password`. `verified_hash` is
+    the stored hash that `request.current_password` matched, or None.
+
+    Raises `ForbiddenProblem` if users change their own password without the current one, and
+    `PreconditionFailedProblem` if the stored hash is another one now. Raises `ConflictProblem` if no administrator
+    would remain.
     """
     itself = _require_changes(tx.principal, name, request)
     which: tuple[ColumnElement[bool], ...] = (user.c.name == name,)

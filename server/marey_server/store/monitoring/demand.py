@@ -54,8 +54,8 @@ def read_demand(
     reach : jobs that the workers can run
     workers : names of the workers that exist already
     limit : number of queued jobs at which counting stops
-    others : jobs that the workers of the other pools can run; if several pools can run a job, it counts only for those
-        of them that have the fewest labels
+    others : jobs that the workers of the other pools can run; a job that several pools can run counts only for the
+        pools with the fewest labels
     """
     return Demand(_count_queued(tx, _wanted(reach, others), limit), _count_running(tx, workers))
 
@@ -78,8 +78,8 @@ def _wanted(reach: JobReach, others: Sequence[JobReach]) -> ColumnElement[bool]:
 def _count_queued(tx: Transaction, wanted: ColumnElement[bool], limit: int) -> int:
     """Return the number of jobs that could start now, at most `limit`.
 
-    Of the jobs with the same concurrency key, at most one counts, and none if one of them runs. The jobs of a project
-    with a limit of running jobs count up to this limit.
+    Of the jobs with the same concurrency key, at most one counts, and none if one of them runs. If a project has a
+    limit of running jobs, only as many of its queued jobs count as may run in addition to those that run already.
     """
     startable = and_(job.c.state == QUEUED, job.c.run_at_us <= tx.now_us, wanted)
     waiting = projects_with_queued_jobs()

@@ -182,9 +182,9 @@ class _Running(NamedTuple):
 def list_workers(
     tx: Transaction, heard: Sequence[HeardWorker], policy: QueuePolicy = DEFAULT_POLICY
 ) -> tuple[Worker, ...]:
-    """Return the workers in `heard` and those that run jobs, by name, for administrators only.
+    """Return the workers in `heard` and those that run jobs, sorted by name.
 
-    The names of workers are often names of hosts. Raises `ForbiddenProblem` if the caller is no administrator.
+    Raises `ForbiddenProblem` if the caller is no administrator, because names of workers are often names of hosts.
     """
     require_administrator(tx.principal)
     running = _running_workers(tx, policy)

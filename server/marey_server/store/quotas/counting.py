@@ -87,9 +87,9 @@ _ADD_JOBS = Prepared(
 def require_room_for_jobs(tx: Transaction, more: int) -> None:
     """Raise `QuotaExceededProblem` if the caller would exceed the quota `user_jobs` by adding `more` unfinished jobs.
 
-    Counting all unfinished jobs takes long if there are many. So a number is stored for each user that is not less than
-    their number: it grows with each submission, but does not fall when jobs end. The jobs are counted, and the stored
-    number is corrected, only when it would exceed the quota. Concurrent checks of one user run one after another.
+    Counting all unfinished jobs takes long if there are many. So an upper bound of their number is stored for each
+    user: it grows with each submission, but does not fall when jobs end. Only when the bound would exceed the quota,
+    the jobs are counted, and the bound is corrected. Concurrent checks of one user run one after another.
     """
     user_id = tx.principal.user_id
     if user_id is None or tx.principal.kind != "user":
@@ -101,9 +101,9 @@ def require_room_for_jobs(tx: Transaction, more: int) -> None:
 
 
 def note_jobs(tx: Transaction, user_id: str, more: int) -> None:
-    """Note that a user has `more` unfinished jobs, even if this exceeds the quota `user_jobs`.
+    """Add `more` to the stored bound of a user's unfinished jobs (`require_room_for_jobs`), even beyond the quota.
 
-    The row of the user is locked even if the number is null, so that a concurrent first count waits for these jobs.
+    The row of the user is locked even if the bound is null, so that a concurrent first count waits for these jobs.
     """
     tx.execute(update(user).where(user.c.id == user_id).values(jobs_bound=user.c.jobs_bound + more))
 
