@@ -181,7 +181,7 @@ class IndexFiles:
         """Copy a file of an index that the caller may read; a copy appears only when it is complete.
 
         Raises `NotFoundProblem` if bytes are missing, or if the file does not have the size that the index states. An
-        index may state a wrong size, because anybody may write one, but there is only room for the stated size.
+        index written by hand may state a wrong size, but `missing` has made room only for the stated size.
         """
         digest = stored.blob
         size = tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one()
@@ -222,7 +222,7 @@ class IndexFiles:
         return [path for path in self._folder.iterdir() if len(path.name) == _DIGEST_DIGITS]
 
     def _make_room(self, most_bytes: int, kept: Collection[str]) -> None:
-        """Remove copies that are not in `kept`, the longest unused first, until all have at most `most_bytes`."""
+        """Remove copies that are not in `kept`, the longest unused first, until all files have at most `most_bytes`."""
         copies = sorted(self._others({self.path(digest).name for digest in kept}), key=lambda one: one[1])
         held_bytes = sum(path.stat().st_size for path in self._folder.iterdir())
         for path, _used, size_bytes in copies:

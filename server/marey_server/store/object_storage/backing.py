@@ -78,7 +78,8 @@ class _InTransaction:
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
         """Record in the rows of new blobs which objects contain their bytes.
 
-        The rows must exist. Raises `ObjectsToStore` if the objects are not stored yet, or were stored too long ago.
+        If new blobs do not become objects, store the bytes in `local` instead. The rows must exist. Raises
+        `ObjectsToStore` if the objects are not stored yet, or were stored too long ago.
         """
         if not self.backing.stores_objects:
             self.backing.local.write(connection, contents)
@@ -91,9 +92,10 @@ class _InTransaction:
             name_object(connection, stored[digest])
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """Yield the bytes `start` to `stop - 1` of a blob, fewer if the object is missing.
+        """Yield the bytes `start` to `stop - 1` of a blob, fewer if some are missing.
 
-        Raises `ObjectsToRead` if the bytes are in an object and were not read yet.
+        Raises `ObjectsToRead` if the bytes are in an object and were not read yet. Raises `LookAgain` if local bytes
+        are missing, unless the transaction was already repeated because of `LookAgain`.
         """
         places = self._places(connection, {digest: (start, stop)})
         wanted, one = places[0] if places else (None, None)

@@ -83,7 +83,7 @@ class StoredObject:
 
     @classmethod
     def new(cls, digest: str, began_us: int) -> Self:
-        """Return a name for an object whose transfer begins at the time `began_us` of the database's clock."""
+        """Return an object with a new name, whose transfer begins at the time `began_us` of the database's clock."""
         return cls(digest, f"{began_us:016x}-{secrets.token_hex(8)}")
 
     @classmethod

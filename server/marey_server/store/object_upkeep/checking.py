@@ -30,9 +30,9 @@ class StoreDefect:
 
 
 def check_blob(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a defect if the bytes of a blob are damaged; return none for blobs in object storage.
+    """Return a list with the defect of a blob whose bytes are damaged; it is empty for an intact blob.
 
-    `check_objects` checks those.
+    It is also empty for a blob in object storage, because `check_objects` checks such blobs.
     """
     if row.object_id is not None:
         return []
@@ -40,7 +40,7 @@ def check_blob(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _compare(row: Row[Any], pieces: Iterable[bytes]) -> list[StoreDefect]:
-    """Return a fault if bytes do not have the size and the digest of a blob."""
+    """Return a list with the defect of bytes that do not have the size and the digest of a blob; else an empty list."""
     digest, size = digest_of_chunks(pieces)
     if size != row.size_bytes:
         return [StoreDefect("blob-incomplete", row.digest, f"only {size} of {row.size_bytes} bytes are stored")]

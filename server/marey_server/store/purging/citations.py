@@ -43,8 +43,8 @@ def delete_uncited_ref(
     """Delete a branch or a tag; `citing` are the jobs that `find_citations` has found.
 
     A job that is submitted meanwhile is not affected, because it names its version by digest. Raises the errors of
-    `delete_ref`. Also raises `ConflictProblem` for a cited version that no other tag names: a job that has not ended,
-    or an item that a job made, cites it.
+    `delete_ref`. Also raises `ConflictProblem` if the version is cited, by a job that has not ended or by an item that
+    a job made, and no other tag names the version.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)

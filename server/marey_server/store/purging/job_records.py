@@ -78,7 +78,7 @@ def _forget_in_answers(tx: Transaction, items: Collection[str], jobs: Sequence[s
 
 
 def _without_names(inputs: Mapping[str, Any], items: Collection[str]) -> dict[str, Any]:
-    """Return the inputs of a job without the names and folders of `items`; they get the member `purged` instead.
+    """Return the inputs of a job, in which each of `items` has the member `purged` instead of its name and folder.
 
     An input whose items were distributed over tasks has no list of items, and is unchanged.
     """

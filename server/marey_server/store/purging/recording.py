@@ -122,7 +122,7 @@ def _lock(tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge, *, 
 
 
 def _lock_rows(tx: Transaction, project_row: ProjectRow, ids: Collection[str], *, preview: bool) -> dict[str, Row[Any]]:
-    """Return the rows of those items that are not purged, by id; lock them, except for a preview."""
+    """Return, by id, the rows of the items `ids` that are not purged; lock the rows, except for a preview."""
     if not ids:
         return {}
     mine = (item.c.id.in_(ids), item.c.project_id == project_row.id, item.c.purged_us.is_(None))

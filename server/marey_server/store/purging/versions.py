@@ -120,7 +120,10 @@ class _Names:
         self._proposals = tx.execute(_PROPOSALS.where(proposal.c.dataset_id.in_(chosen))).all() if ids else []
 
     def holder(self, dataset_id: str, commits: Collection[str]) -> DatasetHolder:
-        """Return a dataset as a holder of an item, with what refers to `commits`, the commits that contain the item."""
+        """Return a dataset as a holder of an item; `commits` are the commits of the dataset that contain the item.
+
+        The result names the branches, tags and open proposals that refer to one of these commits.
+        """
         refs = [row for row in self._refs if row.dataset_id == dataset_id and row.digest in commits]
         proposals = [row for row in self._proposals if row.dataset_id == dataset_id and row.head_now in commits]
         return DatasetHolder(

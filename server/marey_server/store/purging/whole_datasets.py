@@ -55,7 +55,7 @@ class PreparedDatasetPurge:
     citing: frozenset[str]
     """Ids of the jobs that read one of `commits`. As the dataset is deleted, only retries of these jobs can follow."""
     chunks: Mapping[str, int]
-    """Digests of the chunks that no other dataset of the server needs, with the times at which they were last stored.
+    """Digests of the chunks that no other dataset of the server needs, with the times when they were last stored (µs).
 
     Besides the chunks of this dataset, they include chunks of earlier partial checkouts that no dataset uses any more.
     """
@@ -99,7 +99,8 @@ def record_dataset_purge(
 ) -> DatasetPurgeAnswer:
     """Delete a deleted dataset for good.
 
-    Raises `ConflictProblem` if the dataset has holders, and `NotFoundProblem` if there is no such dataset.
+    Raises `ConflictProblem` if the dataset has holders, is not deleted, or has other commits than when the purge was
+    prepared. Raises `NotFoundProblem` if there is no such dataset.
     """
     assert not request.preview, "a preview is a read"
     project_row = projects.require(tx, project)
