@@ -208,9 +208,9 @@ class Deliverer:
         return not batch.complete
 
     async def _note_scanned(self, webhook_id: str, position: int, newest: int) -> None:
-        """Remember that no event up to the number `newest` concerns a webhook.
+        """Remember that no event after the number `position`, up to the number `newest`, concerns a webhook.
 
-        The database stores this only from time to time.
+        The database stores this only after more than `SKIPPED_MOST` such events.
         """
         self._scanned[webhook_id] = newest
         if newest - position > outbox.SKIPPED_MOST:

@@ -43,7 +43,7 @@ class RunToCompare(NamedTuple):
 def find_runs(
     tx: Transaction, project: str, name: str, *, sort: str, limit: int = MOST_COMPARED
 ) -> tuple[list[RunToCompare], bool]:
-    """Return the first `limit` succeeded runs of a script in the given order, and whether there are no others.
+    """Return the first `limit` succeeded runs of a script in the given order, and whether these are all of them.
 
     Raises `BadRequestProblem` for an unknown order.
     """

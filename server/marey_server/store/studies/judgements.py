@@ -25,7 +25,7 @@ from marey_server.store.transaction import Transaction
 def list_judgements(
     tx: Transaction, project: str, kind: Kind, item_id: str, *, revision: int, cursor: str | None, limit: int
 ) -> Page:
-    """Return a page of the participants who have begun a revision of a study, each with all trials, without dates.
+    """Return a page of participants who have begun a revision of a study, each with all ended trials, without dates.
 
     Raises `NotFoundProblem` if there is no such study, and `ForbiddenProblem` if the caller's role is too low.
     """

@@ -92,7 +92,10 @@ def _find_link(tx: Transaction, code: str) -> Row[Any]:
 
 
 def welcome(tx: Transaction, code: str, attempt: SignInTry) -> StudyWelcome:
-    """Return what a person with a link sees before consenting. Raises `NotFoundProblem` if the link is not valid."""
+    """Return what a person with a link sees before consenting. Raises `NotFoundProblem` if the link is not valid.
+
+    `attempt` is the try that the caller has counted (`try_of`); if the link is valid, it does not count any more.
+    """
     row = _find_link(tx, code)
     sign_ins.uncount(tx, attempt)
     design = load_design(tx, row.item_id, row.revision)
@@ -105,8 +108,9 @@ def welcome(tx: Transaction, code: str, attempt: SignInTry) -> StudyWelcome:
 def begin(tx: Transaction, request: ParticipationCreate, attempt: SignInTry) -> NewParticipation:
     """Record the consent of a participant, and return the participant's token.
 
-    A repeated request with the same key gets the same token. Raises `NotFoundProblem` if the link is not valid, or if
-    it was used with another key.
+    A repeated request with the same key gets the same token. `attempt` is the try that the caller has counted
+    (`try_of`); if the request succeeds, it does not count any more. Raises `NotFoundProblem` if the link is not valid,
+    or if it was used with another key.
     """
     code, key = request.code.get_secret_value(), request.key.get_secret_value()
     row = _find_link(tx, code)

@@ -20,7 +20,7 @@ from marey_server.store.tables import study_participant, study_trial
 from marey_server.store.transaction import Transaction
 
 GRACE_US = 2_000_000
-"""Time after the deadline of a trial in which an answer still counts, because it may have been sent in time."""
+"""Time in microseconds after the deadline of a trial in which an answer still counts; it may have been sent in time."""
 MOST_TIMEOUTS = 500
 """Greatest number of trials that a participant may leave without an answer."""
 

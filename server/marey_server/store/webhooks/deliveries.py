@@ -37,7 +37,7 @@ def list_deliveries(
 
 
 def read_delivery(tx: Transaction, project: str, webhook_id: str, delivery_id: str) -> WebhookDelivery:
-    """Return a delivery."""
+    """Return a delivery that failed or was requested; raise `NotFoundProblem` for others, which are not stored."""
     return _shown(_find(tx, projects.require(tx, project), webhook_id, delivery_id))
 
 

@@ -27,7 +27,10 @@ from marey_server.store.webhooks.managing import give_up_retries, host_of
 MOST_ATTEMPTS = 8
 """Number of attempts after which a delivery is given up."""
 RETRY = Backoff(first_s=5.0, longest_s=1800.0)
-"""Wait after failed attempts of a webhook; all eight attempts of a delivery take five to eleven minutes together."""
+"""Wait after failed attempts of a webhook; it grows with each failure since the webhook's last success.
+
+The first eight attempts take five to eleven minutes together. After many failures, the wait is 15 to 30 minutes.
+"""
 BATCH = 100
 """Greatest number of deliveries that are read at once."""
 SKIPPED_MOST = 10_000
