@@ -96,9 +96,13 @@ class Jobs:
         """Ask a job to stop; a job that does not run yet is cancelled at once."""
         return self.transport.post(Job, f"{_address(job_id)}/cancel")
 
-    def retry(self, job_id: str) -> Job:
-        """Submit a failed or cancelled job again; return the new job."""
-        return self.transport.post(Job, f"{_address(job_id)}/retry")
+    def retry(self, job_id: str, *, dependants: bool = True) -> Job:
+        """Submit a failed or cancelled job again; return the new job.
+
+        Unsuccessful jobs on which it depends are retried, too. With `dependants`, so are jobs that ended only because
+        this job did not succeed.
+        """
+        return self.transport.post(Job, f"{_address(job_id)}/retry", params={"dependants": dependants})
 
     def attempts(self, job_id: str) -> Iterator[Attempt]:
         """List the attempts to run a job, oldest first."""

@@ -324,6 +324,16 @@ def test_a_retry_takes_along_the_dependants_that_the_caller_may_retry(server: Se
     assert retried() == {failed["id"], own["id"], theirs["id"]}
 
 
+def test_a_retry_without_dependants_leaves_them_as_they_are(owner: httpx.Client) -> None:
+    failed = submit(owner)
+    dependant = submit(owner, after=[failed["id"]])
+    ok(owner.post(f"/jobs/{failed['id']}/cancel"))
+    assert owner.post(f"/jobs/{failed['id']}/retry?dependants=perhaps").status_code == 400
+    again = ok(owner.post(f"/jobs/{failed['id']}/retry?dependants=false"), 202)
+    jobs = ok(owner.get("/projects/lab/jobs"))["items"]
+    assert {one["id"] for one in jobs} == {failed["id"], dependant["id"], again["id"]}
+
+
 def test_anybody_may_list_the_kinds_of_jobs(server: Server) -> None:
     worker = server.make_user("worker", scopes=("work",))
     for anybody in (server.client(), server.client(worker)):

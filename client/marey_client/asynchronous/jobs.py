@@ -64,9 +64,13 @@ class AsyncJobs(Counterpart):
         """Ask a job to stop; a job that does not run yet is cancelled at once."""
         return await self._run(self._sync.cancel, job_id)
 
-    async def retry(self, job_id: str) -> Job:
-        """Submit a failed or cancelled job again; return the new job."""
-        return await self._run(self._sync.retry, job_id)
+    async def retry(self, job_id: str, *, dependants: bool = True) -> Job:
+        """Submit a failed or cancelled job again; return the new job.
+
+        Unsuccessful jobs on which it depends are retried, too. With `dependants`, so are jobs that ended only because
+        this job did not succeed.
+        """
+        return await self._run(self._sync.retry, job_id, dependants=dependants)
 
     def attempts(self, job_id: str) -> AsyncIterator[Attempt]:
         """List the attempts to run a job, oldest first."""

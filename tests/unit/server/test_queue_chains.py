@@ -2,6 +2,7 @@
 
 import asyncio
 import re
+import time
 from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -269,6 +270,40 @@ def test_a_retry_waits_until_all_dependants_have_ended_and_includes_them(
     desk.database.write(desk.user, retrying.retry_job, first)
     everything = desk.database.read(desk.user, reading.list_jobs, desk.project).items
     assert {one.retry_of for one in everything} == {None, first, *others, last}
+
+
+@pytest.mark.every_database
+def test_more_jobs_than_one_transaction_retries_can_be_retried_one_by_one(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retrying, "MOST_AT_ONCE", 3)
+    first = desk.submit()
+    others = [desk.submit(after=[first]) for _ in range(4)]
+    desk.cancel(first)
+    for job in (first, others[0]):
+        with pytest.raises(ConflictProblem, match=r"More than 3 jobs .* \(`dependants=false`\)") as refused:
+            desk.database.write(desk.user, retrying.retry_job, job)
+        assert refused.value.error_code == "too-many"
+    again = desk.database.write(desk.user, retrying.retry_job, first, dependants=False)
+    made = [desk.database.write(desk.user, retrying.retry_job, job) for job in others]
+    assert [(job.retry_of, job.after) for job in made] == [(job, (again.id,)) for job in others]
+    assert len(desk.database.read(desk.user, reading.list_jobs, desk.project).items) == 2 * 5
+
+
+@pytest.mark.every_database
+def test_dependants_that_are_not_retried_do_not_take_the_places_of_those_that_are(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retrying, "MOST_AT_ONCE", 2)
+    first = desk.submit()
+    cancelled = [desk.submit(after=[first]) for _ in range(3)]
+    time.sleep(0.002)  # ids sort by their milliseconds
+    last = desk.submit(after=[first])
+    for job in (*cancelled, first):
+        desk.cancel(job)
+    desk.database.write(desk.user, retrying.retry_job, first)
+    everything = desk.database.read(desk.user, reading.list_jobs, desk.project).items
+    assert {one.retry_of for one in everything} == {None, first, last}
 
 
 @pytest.mark.every_database

@@ -232,16 +232,22 @@ def cancel_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -
 def retry_job(
     context: typer.Context,
     job_id: JobId,
+    dependants: Annotated[
+        bool,
+        typer.Option(
+            "--dependants/--no-dependants", help="Also submit the jobs again that did not run only because of this job."
+        ),
+    ] = True,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Submit a failed or cancelled job again.
 
-    Unsuccessful jobs that the job needs are submitted again, too, and so are jobs that did not run only because one of
-    all these jobs did not succeed.
+    Unsuccessful jobs that the job needs are submitted again, too, and by default so are jobs that did not run only
+    because one of all these jobs did not succeed.
     """
     with connect(context) as marey:
-        ended = follow(marey, marey.jobs.retry(job_id), wait=wait, as_json=as_json)
+        ended = follow(marey, marey.jobs.retry(job_id, dependants=dependants), wait=wait, as_json=as_json)
     if ended is not None:
         print_ended(ended, as_json)
 

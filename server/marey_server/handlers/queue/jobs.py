@@ -333,20 +333,34 @@ class JobCancellation(Resource):
         return await self.answer(reading.cancel_job, job, self.services.queue_policy)
 
 
+class RetryQuery(Request):
+    """Query parameters for retrying a job."""
+
+    dependants: bool = Field(True, description="Also retry jobs that ended only because this job did not succeed.")
+
+
 class JobRetry(Resource):
     """Retry of a job."""
 
     path = "/jobs/{job}/retry"
     tag = "Jobs"
 
-    @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job, status=202, idempotency="key", in_folders=True)
-    async def post(self, job: str) -> Rendered:
+    @writes(
+        access=Access.CONTRIBUTOR,
+        scope="jobs",
+        answer=Job,
+        status=202,
+        idempotency="key",
+        in_folders=True,
+        query=RetryQuery,
+    )
+    async def post(self, job: str, query: RetryQuery) -> Rendered:
         """Submit a failed or cancelled job again with the same inputs; the answer is the new job.
 
-        Unsuccessful jobs on which the job depends are retried, too, and so are jobs that ended only because this job
-        did not succeed. So the rest of a pipeline continues.
+        Unsuccessful jobs on which the job depends are retried, too, and by default so are jobs that ended only because
+        this job did not succeed. So the rest of a pipeline continues.
         """
-        return await self.answer_with(accepted, retrying.retry_job, job)
+        return await self.answer_with(accepted, retrying.retry_job, job, dependants=query.dependants)
 
 
 RESOURCES: tuple[type[Resource], ...] = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Select, select
+from sqlalchemy import ColumnElement, Row, Select, or_, select, true
 
 from marey_schemas.access import Role
 from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
@@ -27,21 +27,22 @@ from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction, in_lists
 
 MOST_AT_ONCE = 1000
+"""Greatest number of jobs that one transaction retries."""
 UNSUCCESSFUL = ("failed", "cancelled")
 
 
-def retry_job(tx: Transaction, job_id: str) -> Job:
+def retry_job(tx: Transaction, job_id: str, *, dependants: bool = True) -> Job:
     """Submit a failed or cancelled job again, and return the new job.
 
     The new job has the same inputs, and can share the results of tasks of the old job that have succeeded. If other
     jobs should have created an input but did not, the retries of these jobs create it. Unsuccessful dependencies are
-    retried before the job. Dependants that ended only because of this job are retried after it, so that the rest of a
-    pipeline continues; dependants that the caller may not retry are left out.
+    retried before the job. With `dependants`, jobs that ended only because of this job are retried after it, so that
+    the rest of a pipeline continues; dependants that the caller may not retry are left out.
 
-    Raises `ConflictProblem` for a task, for a job that has not ended or has succeeded, and if one of the jobs cannot
-    run again, for example because an input was purged. Raises `ForbiddenProblem` for a job, or an unsuccessful
-    dependency, of another user, unless the caller is a maintainer. Raises `UnavailableProblem` if the end of one of the
-    jobs is still being propagated to the dependants.
+    Raises `ConflictProblem` for a task, for a job that has not ended or has succeeded, if more than `MOST_AT_ONCE` jobs
+    would be retried, and if one of the jobs cannot run again, for example because an input was purged. Raises
+    `ForbiddenProblem` for a job, or an unsuccessful dependency, of another user, unless the caller is a maintainer.
+    Raises `UnavailableProblem` if the end of one of the jobs is still being propagated to the dependants.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
@@ -59,7 +60,8 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
         )
     family = _Family(tx, project)
     family.add_with_needed([job_id])
-    family.add_dependants()
+    if dependants:
+        family.add_dependants()
     made = family.submit()
     return made[job_id]
 
@@ -81,6 +83,7 @@ class _Family:
             for row in rows.values():
                 require_own(self._tx, row, self._project, "retry")
             self._take(rows, _needs(self._tx, rows))
+            self._require_few("first retry the jobs on which it depends")
             needed = {latest for needs in map(self._needs.__getitem__, rows) for latest in needs.values()}
             states = _states(self._tx, needed - self._rows.keys())
             ids = [one for one, state in states.items() if state in UNSUCCESSFUL]
@@ -95,6 +98,7 @@ class _Family:
             missing = {one for one, state in _states(self._tx, others).items() if state in UNSUCCESSFUL}
             behind = [one for one in rows if not missing & set(needs[one].values())]
             self._take({one: rows[one] for one in behind}, {one: needs[one] for one in behind})
+            self._require_few("retry it without its dependants (`dependants=false`), then each of them")
 
     def submit(self) -> dict[str, Job]:
         """Submit the jobs again; return the new jobs by the ids of the old ones."""
@@ -118,10 +122,10 @@ class _Family:
             )
         self._rows |= rows
         self._needs |= needs
+
+    def _require_few(self, advice: str) -> None:
         if len(self._rows) > MOST_AT_ONCE:
-            detail = (
-                f"More than {MOST_AT_ONCE} jobs depend on each other here; first retry the jobs on which others depend."
-            )
+            detail = f"More than {MOST_AT_ONCE:,} jobs would be retried together with this job; {advice}."
             raise ConflictProblem(detail, code="too-many")
 
     def _ended_because_of(self, ids: Collection[str]) -> Iterable[Row[Any]]:
@@ -130,6 +134,8 @@ class _Family:
         Jobs that have a retry already, or that the caller may not retry, are left out.
         """
         later = job.alias("later")
+        reason = job.c.failure["reason"].as_string()
+        whole = roles.includes(self._project.role, Role.MAINTAINER)
         statement = (
             select(job)
             .join(job_dependency, job_dependency.c.job_id == job.c.id)
@@ -138,16 +144,14 @@ class _Family:
                 job.c.state.in_(UNSUCCESSFUL),
                 job.c.cancel_requested_us.is_(None),
                 job.c.parent_id.is_(None),
+                or_(reason.is_(None), reason == FailureReason.DEPENDENCY_FAILED.value),
+                true() if whole else job.c.author_id == self._tx.principal.user_id,
                 ~select(later.c.id).where(later.c.retry_of == job.c.id).exists(),
             )
             .order_by(job.c.id)
             .limit(MOST_AT_ONCE + 1)
         )
-        whole = roles.includes(self._project.role, Role.MAINTAINER)
-        for row in self._tx.execute(statement):
-            could_not_run = row.failure is None or row.failure["reason"] == FailureReason.DEPENDENCY_FAILED
-            if could_not_run and row.id not in self._rows and (whole or row.author_id == self._tx.principal.user_id):
-                yield row
+        return [row for row in self._tx.execute(statement) if row.id not in self._rows]
 
 
 # -- one of them -------------------------------------------------------------------------------------------------------
