@@ -43,7 +43,8 @@ def _compare(row: Row[Any], pieces: Iterable[bytes]) -> list[StoreDefect]:
     """Return a list with the defect of bytes that do not have the size and the digest of a blob; else an empty list."""
     digest, size = digest_of_chunks(pieces)
     if size != row.size_bytes:
-        return [StoreDefect("blob-incomplete", row.digest, f"only {size} of {row.size_bytes} bytes are stored")]
+        detail = f"{size} bytes are stored, but the row of the blob states {row.size_bytes}"
+        return [StoreDefect("blob-incomplete", row.digest, detail)]
     intact = digest == row.digest
     return [] if intact else [StoreDefect("blob-corrupt", row.digest, "the bytes do not have this digest")]
 
