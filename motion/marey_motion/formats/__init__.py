@@ -64,8 +64,9 @@ def read_motion(
     ------
     UnknownFormat    if no reader knows the file
     AmbiguousUnits    if the unit of length or the upward axis cannot be determined and must be given in `options`
-    FormatError    if the file is invalid (the error names file, line and joint), or if it contains neither a motion nor
-        a skeleton
+    ContradictedOption    if the motion contradicts the unit, the upward axis or the frame rate in `options`
+    FormatError    if the file is invalid (the error names file, line and joint), if its format is known but has no
+        reader, or if it contains neither a motion nor a skeleton
 
     Examples
     --------
@@ -111,7 +112,8 @@ def read_source(
     Raises
     ------
     UnknownFormat    if no reader knows the file
-    FormatError    if the file is invalid; the error names file, line and joint
+    FormatError    if the file is invalid (the error names file, line and joint), or if its format is known but has no
+        reader
     """
     content = bytes(data)
     row = detect_format(content, name)

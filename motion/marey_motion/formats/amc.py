@@ -48,7 +48,7 @@ def read_amc(
 
     Raises
     ------
-    FormatError    if the file is invalid; the error names the line, and the bone if there is one
+    FormatError    if `companion` is None or a file is invalid; the error names the line, and the bone if there is one
     """
     if companion is None:
         message = "an AMC file contains angles but no skeleton; import it together with its ASF file"

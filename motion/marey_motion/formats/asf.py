@@ -80,7 +80,7 @@ class AsfSkeleton:
     root_orientation: NDArray[np.float64]
 
     def offsets(self) -> NDArray[np.float64]:
-        """Compute the offset of each joint from its parent.
+        """Compute the offset of each joint from its parent; the offset of the root is its position in the rest pose.
 
         Returns
         -------
@@ -171,7 +171,7 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
 
     Returns
     -------
-    AsfSkeleton    bones, the root first
+    AsfSkeleton    bones, the root first; calls with the same content may share it, so it must not be changed
 
     Raises
     ------

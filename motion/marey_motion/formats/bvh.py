@@ -1,6 +1,6 @@
 """Reader of BVH (Biovision hierarchy); the writer is in `bvh_writer`.
 
-Rotations are intrinsic, in degrees, in the order of a joint's CHANNELS; a joint may have any number of rotation
+Rotations are intrinsic, in degrees, in the order of a joint's CHANNELS; a joint may have up to three rotation
 channels, before or after its position channels. A position channel replaces the joint's OFFSET on its axis.
 """
 
@@ -59,7 +59,7 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
     Returns
     -------
-    SourceMotion    F frames of J joints
+    SourceMotion    F frames of J joints; a source without motion if the file contains no frames
 
     Raises
     ------
@@ -172,7 +172,7 @@ def _warn_of_layout(header: BvhHeader, frames: int, wrapped: bool, warnings: lis
 
 
 def _require_directions(source: SourceMotion, values: NDArray[np.float64], columns: ChannelColumns, file: str) -> None:
-    """Raise `FormatError` for an angle that is so large that a 64-bit number cannot contain its direction."""
+    """Raise `FormatError` for an angle above `_LARGEST_ANGLE_DEG`, because it is rounded by more than a degree."""
     if max(values.max(initial=0.0), -values.min(initial=0.0)) <= _LARGEST_ANGLE_DEG:
         return
     for frame, column in np.argwhere(np.abs(values) > _LARGEST_ANGLE_DEG):

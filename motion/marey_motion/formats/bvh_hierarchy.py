@@ -2,7 +2,7 @@
 
 The reader is strict about the meaning of the data, but accepts the layouts of all exporters. Indentation is free, a
 brace may be on the line of the joint or on a separate line, and keywords may be in upper or lower case. End sites may
-have names, and joints may have any number of channels in any order.
+have names, and joints may have any of the six channels in any order.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def read_header(lines: TextLines) -> BvhHeader:
 
     Returns
     -------
-    BvhHeader    joints, channels and frame time
+    BvhHeader    joints, channels and frame time; its lists are shared with the cache and must not be changed
 
     Raises
     ------

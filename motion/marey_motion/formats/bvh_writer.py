@@ -53,8 +53,9 @@ def write_bvh(
 
     Raises
     ------
-    FormatError    if a length in that unit has more than twelve digits before the decimal point, or if the frame rate
-        is less than 1 Hz or more than 100 kHz
+    FormatError    if a length in that unit has more than twelve digits before the decimal point, if the frame rate is
+        less than 1 Hz or more than 100 kHz, or if `rotation_order` does not contain x, y and z once each
+    MotionError    if the name of the unit is not known, or its length is not positive
     """
     if fold_positions:
         clip = with_folded_positions(clip)
@@ -195,6 +196,10 @@ def format_table(values: NDArray[np.float64]) -> bytes:
     Returns
     -------
     bytes    F lines
+
+    Raises
+    ------
+    FormatError    if a number has more than twelve digits before the decimal point
     """
     largest = float(np.abs(values).max(initial=0.0))
     if not largest < _LARGEST:

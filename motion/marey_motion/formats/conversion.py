@@ -51,7 +51,7 @@ def convert(
 
     Parameters
     ----------
-    source : SourceMotion    the file in its own unit and axes
+    source : SourceMotion    the file in its own unit and axes; the function sets its motion to None to save memory
     file : str    name of the file, for messages
     options : ImportOptions    facts given by the user
     sibling_axis : str, optional    upward axis of other files with this skeleton; used if the file does not determine
@@ -66,6 +66,7 @@ def convert(
     AmbiguousUnits    if neither the file nor the options state the unit or the upward axis, and the size and pose of
         the body do not determine it
     ContradictedOption    if the motion clearly contradicts a given unit, upward axis or frame rate
+    FormatError    if a length or the frame rate is out of range, or if the numbers are not a valid skeleton or clip
     """
     _check_range(source, file)
     try:
@@ -121,7 +122,10 @@ def _check_range(source: SourceMotion, file: str) -> None:
     for values in (source.offsets, tips, source.root_positions, source.translations):
         if values is not None and np.abs(values).max(initial=0.0) > _LARGEST_LENGTH:
             largest = np.abs(values).max()
-            message = f"the file contains a length of {largest:.3g} units; the limit is {_LARGEST_LENGTH:.0e}"
+            message = (
+                f"the file contains a length of {largest:.3g} units; the limit is {_LARGEST_LENGTH:.0e}; correct this "
+                "length in the file"
+            )
             raise FormatError(message, code="value-range", file=file)
 
 

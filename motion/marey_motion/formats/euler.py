@@ -46,7 +46,7 @@ def _half_angle(angle_deg):
 
 @compiled
 def rotations_from_euler(values, columns, axes, rotations):
-    """Fill local rotations from channel values, with signs that do not jump between frames.
+    """Fill local rotations from channel values; the signs of the quaternions do not jump between frames.
 
     Parameters
     ----------

@@ -111,7 +111,7 @@ def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
     Returns
     -------
-    SourceMotion    F frames of J joints, in metres
+    SourceMotion    F frames of J joints, in metres; a source without motion if the archive contains no frames
 
     Raises
     ------

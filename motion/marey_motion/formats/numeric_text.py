@@ -44,7 +44,11 @@ class NumberTable:
 
 
 class BadNumber(ValueError):
-    """A token that is not a finite decimal number, with its text, its line, and the index of the value in the block."""
+    """A token that is not a finite decimal number.
+
+    `token` is its text, `line` the number of its line, `index` the number of values before it in the block, and
+    `in_line` the number of values before it in its line.
+    """
 
     def __init__(self, token: str, line: int, index: int, in_line: int) -> None:
         super().__init__(f"{token!r} in line {line} is not a finite decimal number")
@@ -69,7 +73,7 @@ def parse_number(text, start):
     -------
     kind : int    `EXACT`; `LONG` for a number that only `float` parses exactly; `MALFORMED` for any other text
     value : float    valid only when `kind` is `EXACT`
-    stop : int    position after the token
+    stop : int    position after the number; for `MALFORMED`, of the first byte that cannot belong to a number
     """
     i = np.uint64(start)
     negative = text[i] == 45
@@ -124,7 +128,7 @@ def parse_number(text, start):
 
 @compiled
 def _scan(text, width, values, long_tokens, state):
-    """Read numbers until the text ends or an array is full, and return 0; return 1 at a malformed number."""
+    """Read numbers until the text ends or `long_tokens` is full, and return 0; return 1 at a malformed number."""
     i, end = np.uint64(state[_POSITION]), np.uint64(text.size)
     line, count, in_line, rows = state[_LINE], state[_VALUES], state[_IN_LINE], state[_ROWS]
     long_count = 0
@@ -246,7 +250,7 @@ def excerpt(token: bytes) -> str:
 
     Returns
     -------
-    str    the excerpt
+    str    the first 40 bytes as text, with an ellipsis if the token is longer
     """
     text = token[:40].decode("utf-8", "replace")
     shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)

@@ -87,7 +87,7 @@ def _digits(word):
 
 @compiled
 def read_plain_numbers(text, values, i, count):
-    """Read plain numbers separated by spaces, up to the first other byte.
+    """Read plain numbers separated by spaces, up to the first byte that is no space and begins no plain number.
 
     Reading also stops before a number that is too close to the end of the text, because bytes are read eight at a time.
 

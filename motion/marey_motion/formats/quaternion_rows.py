@@ -52,7 +52,7 @@ def as_rotations(
 
 
 def _lengths(values: NDArray[np.float64], joint: str, file: str) -> NDArray[np.float64]:
-    """Return the lengths (F,) of the quaternions (F, 4) of a joint, all of which must be rotations."""
+    """Return the lengths (F,) of a joint's quaternions (F, 4); raise `FormatError` if one is zero or not finite."""
     with np.errstate(over="ignore"):  # a length beyond all numbers is refused below
         norms: NDArray[np.float64] = np.linalg.norm(values, axis=1)
     wrong = ~(np.isfinite(norms) & (norms > 1e-6))

@@ -14,7 +14,7 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _EVERY_OTHER_ZERO = b"\0\0"
 MOST_CACHED_BYTES = 1 << 18
-"""Greatest size of the text of a hierarchy that is cached after it was parsed."""
+"""Greatest size in bytes of the text of a skeleton whose parsed form is cached."""
 
 
 class TextLines:

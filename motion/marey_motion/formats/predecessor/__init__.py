@@ -43,11 +43,13 @@ def read_predecessor(
 
     Returns
     -------
-    SourceMotion or SourceDocument    motion in centimetres, or the document of a model, tree, graph or record
+    SourceMotion or SourceDocument    motion or skeleton in centimetres; or the document of a model, tree, graph,
+        annotation, alignment, skeleton model or record; or an empty document for a zipped graph
 
     Raises
     ------
-    FormatError    if a document is invalid; the error names the field, and the joint if there is one
+    FormatError    if a document is invalid (the error names the field, and the joint if there is one), or if a clip is
+        read without its skeleton
     """
     if data.startswith(MARK):
         return SourceDocument("zipped graph", {})

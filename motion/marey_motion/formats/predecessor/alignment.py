@@ -120,8 +120,9 @@ def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[
 def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
     """Make a time function of whole frames strictly increasing.
 
-    If several canonical frames have the same source frame, only the middle one of them keeps this source frame; for the
-    rest, source frames are interpolated linearly.
+    If several canonical frames have the same source frame, only their middle keeps this source frame. Between these
+    middles, source frames are interpolated linearly. The first and the last canonical frame get the first and the last
+    frame of the source.
 
     Parameters
     ----------

@@ -90,7 +90,8 @@ def layer_of_document(
 
     Raises
     ------
-    FormatError    if a section is invalid; the error names label and section
+    FormatError    if a section is invalid (the error names label and section), overlaps another section, or exceeds the
+        clip
     """
     if isinstance(document.get(SEMANTIC), dict):
         found = _frames_by_label(document[SEMANTIC], file)

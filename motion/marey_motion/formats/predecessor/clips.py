@@ -60,7 +60,8 @@ def motion_of_document(
 
     Raises
     ------
-    FormatError    if a document is invalid; the error names the field, and the joint if there is one
+    FormatError    if a document is invalid (the error names the field, and the joint if there is one), or if a clip
+        document is read without a skeleton
     """
     if "poses" not in document and "frames" not in document:
         return read_skeleton_document(document, file)

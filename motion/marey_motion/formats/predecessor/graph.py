@@ -75,7 +75,7 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
 
     Raises
     ------
-    FormatError    naming the invalid node
+    FormatError    naming the invalid node or field
     """
     listed: dict[tuple[str, str], Mapping[str, Any]] = {}
     names: dict[tuple[str, str], Place] = {}

@@ -83,7 +83,7 @@ def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None 
 
     Raises
     ------
-    FormatError    naming the invalid field
+    FormatError    if a field is invalid (the error names it), or if the document has no skeleton and `skeleton` is None
     """
     return model_of_document(decode_document(data, file), file, skeleton=skeleton)
 
@@ -103,7 +103,7 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
 
     Raises
     ------
-    FormatError    naming the invalid field
+    FormatError    if a field is invalid (the error names it), or if the document has no skeleton and `skeleton` is None
     """
     layout = layout_of(document)
     if layout is None:
@@ -248,8 +248,8 @@ def _check_size(frames: int, coefficients: int, what: str, file: str) -> None:
 def _animated(parts: ModelParts, basis: SplineBasis, mean: Floats, skeleton: Skeleton, file: str) -> list[str]:
     """List the joints that the model rotates.
 
-    `mean` (n, D) contains the coefficients of the model's mean motion. Raises `FormatError` if the skeleton lacks a
-    joint, or if all rotations of a frame are zero.
+    `mean` (n, D) contains the coefficients of the model's mean motion. Raises `FormatError` if D does not fit the
+    number of joints, if a joint is listed twice or missing from the skeleton, or if all rotations of a frame are zero.
     """
     animated = parts.animated_joints or list(skeleton.joint_names)
     if mean.shape[1] != 3 + 4 * len(animated):

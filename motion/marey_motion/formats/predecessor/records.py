@@ -95,8 +95,8 @@ def _is_command(entry: Any) -> bool:
 class _Container:
     """Object or list of a document, whose members are searched one after another.
 
-    `above` is the container that contains it, as its member `key`; None for the whole document. `searched` states
-    whether its members are searched for credentials.
+    `above` is the parent container, whose member `key` is this container; None for the whole document. `searched`
+    states whether the members of this container are searched for credentials.
     """
 
     __slots__ = ("_above", "_key", "_pointer", "members", "searched", "secrets")

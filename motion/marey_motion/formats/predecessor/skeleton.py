@@ -72,7 +72,7 @@ def skeleton_document(
     ----------
     skeleton : Skeleton    J joints
     form : str    "database" or "file"
-    model : dict, optional    skeleton model, which the form "file" contains
+    model : dict, optional    skeleton model, which only the form "file" contains
 
     Returns
     -------
@@ -141,7 +141,11 @@ def _nested_nodes(root: Document, file: str) -> list[tuple[str, str | None, Docu
 
 def _source(nodes: list[tuple[str, str | None, Document]], mirrored: bool, file: str) -> SourceMotion:
     if len(nodes) > 2 * MAX_JOINTS:
-        raise FormatLimit(f"the skeleton has {len(nodes)} joints; at most {MAX_JOINTS} are accepted", file=file)
+        raise FormatLimit(
+            f"the skeleton has {len(nodes)} joints and tips, more than twice the limit of {MAX_JOINTS} joints; remove "
+            "joints from the skeleton",
+            file=file,
+        )
     inner = {parent for _, parent, _ in nodes if parent is not None} | {nodes[0][0]}
     indices: dict[str, int] = {}
     parents, offsets, rotations, tips = [], [], [], []
@@ -184,7 +188,7 @@ def source_of_skeleton(skeleton: Skeleton) -> SourceMotion:
 
     Returns
     -------
-    SourceMotion    in centimetres, without motion; joints have the names that they had in their file
+    SourceMotion    in centimetres, without motion; `display_names` are the names of the joints in their file
     """
     return SourceMotion(
         format=FORMAT,

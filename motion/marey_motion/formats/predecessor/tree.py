@@ -54,7 +54,7 @@ def read_predecessor_tree(data: bytes, file: str) -> SampleTree:
 
     Raises
     ------
-    FormatError    naming the invalid node by its path from the root
+    FormatError    naming the invalid field or node
     """
     return tree_of_document(decode_document(data, file), file)
 
@@ -73,7 +73,7 @@ def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
 
     Raises
     ------
-    FormatError    naming the invalid node by its path from the root
+    FormatError    naming the invalid field or node
     """
     samples = number_array(field_of(document, "data", list, file), file, "data")
     if samples.ndim != 2 or not len(samples):

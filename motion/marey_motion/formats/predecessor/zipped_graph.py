@@ -61,7 +61,7 @@ class ZippedModel:
     member : name of the member with the model
     data : content of this member
     tree, tree_member : content of the tree and name of its member; None if there is no tree that can be read
-    keyframes : canonical frame by label: a number, "-1" or "lastFrame", or "middle"
+    keyframes : canonical frame by label: a number, "-1" or "lastFrame" for the last frame, or "middle"
     """
 
     name: str
@@ -108,7 +108,7 @@ def read_zipped_graph(data: bytes, file: str) -> ZippedGraph:
     Raises
     ------
     FormatError    if the archive is damaged or lacks a member, or if a member is invalid; the error names it
-    FormatLimit    if the archive unpacks to more than `MOST_UNPACKED_BYTES`
+    FormatLimit    if the archive unpacks to more than `MOST_UNPACKED_BYTES`, or has too many members or models
     """
     members = _members(data, file)
     definition = _document(members, DEFINITION, file)
@@ -277,13 +277,13 @@ class _Nodes:
         return found
 
     def keyframes(self, place: Place) -> dict[str, Any]:
-        """Return the keyframes of a model that its action lists."""
+        """Return the keyframes of a model, as the file about its action lists them; empty if it lists none."""
         annotations = self._meta[place[0]].get("annotations")
         found = annotations.get(place[1]) if isinstance(annotations, dict) else None
         return found if isinstance(found, dict) else {}
 
     def transitions(self) -> tuple[dict[Place, tuple[Place, ...]], list[str]]:
-        """Return the nodes that follow each node, and the transitions between nodes that do not exist."""
+        """Return the nodes that follow each node, and the transitions from or to nodes that do not exist."""
         follows: dict[Place, dict[Place, None]] = {place: {} for place in self._places}
         unknown = []
         for key, targets in field_of(self._definition, "transitions", dict, self._file).items():
