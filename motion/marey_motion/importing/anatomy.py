@@ -110,7 +110,7 @@ def anatomy_of(skeleton: Skeleton | SourceMotion) -> Anatomy:
 
 
 def _content_key(joints: Skeleton | SourceMotion, end_sites: tuple[EndSite, ...]) -> _SkeletonKey:
-    """Return a key that is equal for skeletons with the same names, parents, offsets and rest rotations."""
+    """Return a key, equal for skeletons with the same names, parents, offsets, rest rotations and `end_sites`."""
     names = tuple(joints.joint_names)
     return (
         names,

@@ -25,9 +25,10 @@ _SAMPLED_FRAMES = 64
 class BodyMeasures:
     """Measures of the body in a file, in the unit and axes of the file.
 
-    `positions` (J, F, 3) are joint positions in sampled frames, `rest` (J, 3) joint positions in the rest pose. `leg`
-    is the length of a leg, None if there are not two feet. Functions that infer the unit or the upward axis append to
-    `evidence` and `warnings`, and set `axis_is_clear` if the body stands along the inferred axis.
+    `positions` (J, F, 3) are joint positions in sampled frames (in the rest pose, with F = 1, if the file has no
+    motion), `rest` (J, 3) joint positions in the rest pose. `leg` is the length of a leg, None if there are not two
+    feet. Functions that infer the unit or the upward axis append to `evidence` and `warnings`, and set `axis_is_clear`
+    if the body stands along the inferred axis.
     """
 
     file: str
@@ -115,7 +116,7 @@ def hip_height_of(body: BodyMeasures, up_axis: UpAxis) -> float:
 
 
 def hip_heights(positions: NDArray[np.float64], landmarks: Landmarks, up_axis: UpAxis = "y") -> NDArray[np.float64]:
-    """Measure the heights of the hips above the lowest positions of feet or toes.
+    """Measure the heights of the hips above the ground, the 5 % quantile of the lowest toes or feet in all frames.
 
     Parameters
     ----------
@@ -134,7 +135,7 @@ def hip_heights(positions: NDArray[np.float64], landmarks: Landmarks, up_axis: U
 
 
 def walks_on_hands(body: BodyMeasures, up_axis: UpAxis) -> bool:
-    """Test whether the lower hand is mostly near the ground.
+    """Test whether, in most frames, the lower hand is less than a quarter of a leg above the lower foot.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ CODES = {
     "non-unit-quaternions": "Some quaternions did not have length 1; they were normalised.",
     "sign-flips-unrolled": "Rotations jumped between a quaternion and its negative; the signs were made continuous.",
     # Inferred properties.
-    "unit-inferred": "The unit of length is unusual; it was inferred from the size of the body.",
+    "unit-inferred": "The file states no unit of length, or an impossible one; the unit was inferred from the body.",
     "unit-doubtful": "With the unit of length that the file states, or that was given, the legs are shorter or longer "
     "than those of an adult.",
     "up-axis-assumed": "The file does not show which axis points up; y was assumed.",
@@ -63,7 +63,7 @@ CODES = {
     # Defects of the motion.
     "rest-pose-frame": "A rest pose at the beginning or end of the motion falsifies averages; it can be trimmed.",
     "floor-offset": "The floor under the feet is above or below height zero.",
-    "floor-penetration": "Feet go below the height of the ground in the rest of the motion.",
+    "floor-penetration": "In some frames, feet are more than 5 cm below the ground on which the body stands.",
     "foot-skate": "Feet slide while they are on the ground.",
     "in-place-gait": "The body walks in place, as on a treadmill; leave the clip out of the coverage of speeds.",
     "teleport": "The root jumps between two frames.",
@@ -147,7 +147,7 @@ def without_rest_pose(clip: Clip) -> tuple[Clip, tuple[int, int]]:
 
     Returns
     -------
-    clip : Clip    the frames that remain
+    clip : Clip    the frames that remain; the same clip if it has no rest pose, or if all its frames are a rest pose
     dropped : (int, int)    numbers of frames removed at the start and at the end
     """
     start, end = _rest_pose_frames(clip, track(clip))
@@ -206,7 +206,7 @@ def _rest_poses(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
 
 
 def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
-    """Count the frames of a rest pose at the start of a clip and at the end of the clip.
+    """Count the frames of a rest pose at the start and at the end of a clip; (F, 0) if all F frames are a rest pose.
 
     In a rest pose, nearly every joint has the rotation of the skeleton's rest pose, or the arms are held out in a T.
     """
@@ -236,7 +236,7 @@ def rest_pose_jumps(clip: Clip) -> tuple[int, int]:
 
     Returns
     -------
-    (int, int)    frames at the start and at the end; 0 where there is no such pose, and if the whole clip is one
+    (int, int)    frames at the start and at the end; 0 at an end without a jump; (0, 0) if all frames are a rest pose
     """
     tracks = track(clip)
     start, end = _rest_pose_frames(clip, tracks)

@@ -74,6 +74,8 @@ class ImportedItem:
     """An item to store: its name, collection, tags and documents.
 
     `name` identifies the item within the import: other items refer to it as `{"output": name}` until it is stored.
+    If `reuse` is "by_name", the item becomes a new revision of the project's item with this name; if "by_content", an
+    item of the project with equal required documents is used instead. Without such an item, a new one is stored.
     If `same_skeleton` is true, the item is not stored when the project's item with this name has another skeleton.
     """
 

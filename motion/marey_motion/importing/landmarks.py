@@ -75,7 +75,7 @@ def path_length(skeleton: Skeleton, top: int, end: int) -> float:
     Parameters
     ----------
     skeleton : Skeleton    the joints
-    top, end : int    indices of the upper and the lower joint
+    top, end : int    indices of the upper and the lower joint; `end` must descend from `top`
 
     Returns
     -------

@@ -187,9 +187,9 @@ def model_parts(
 
 
 def _time(time: PredecessorTime, model: Tree) -> Tree:
-    """Convert a time function of the predecessor to plain values, with the digest of the document `model`.
+    """Convert a time function of the predecessor to plain values.
 
-    The time function of this document was converted from the time function of the predecessor.
+    The value `content` is the digest of the time function in the document `model`, which was converted from `time`.
     """
     return {
         "form": time.form,

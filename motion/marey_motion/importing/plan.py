@@ -30,7 +30,7 @@ class PlannedFile:
     companion : name of the companion file that this file needs; None if it needs none
     notes : name of the file with the annotation or the alignment of this file's motion; None if there is none
     folder, item_name : path below the collection that receives the import, and name of the clip
-    reason : reason why the file is refused; empty for other roles
+    code, reason : machine-readable code, and reason why the file is refused; empty for other roles
     """
 
     name: str

@@ -87,8 +87,9 @@ class SourceDocument:
     """A decoded file of the predecessor that holds no motion.
 
     `subject` names the content: a model, a tree over the samples of a model, a graph of models, an annotation or an
-    alignment of a motion, a skeleton model, a zipped graph, or a record of work. `document` is the decoded content; for
-    a zipped graph (an archive of a graph with its models), the models in it are not decoded yet.
+    alignment of a motion, a skeleton model, a zipped graph, or a record of work. `document` is the decoded content. For
+    a record of work, it has the members `form` and `content`. For a zipped graph (an archive of a graph with its
+    models), it is empty, because the archive is decoded later.
     """
 
     subject: Subject

@@ -51,7 +51,7 @@ class Tracks:
 
         Parameters
         ----------
-        joints : int    indices of landmarks or of joints of the feet
+        joints : int    indices of joints that are points of the body (keys of `body.column`)
 
         Returns
         -------

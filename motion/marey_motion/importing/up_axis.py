@@ -26,7 +26,7 @@ from marey_schemas.options.imports import ImportOptions, UpAxis
 _CLEAR_COSINE = 0.8
 # Below this cosine between legs and trunk, the pose is not one of a body: all bones are on one line.
 _FOLDED_COSINE = -0.9
-_FOLDED = "rest pose that is none of a body, with legs and trunk pointing the same way"
+_FOLDED = "rest pose that no body can have, with head and feet on the same side of the hips"
 _FLAT_GROUND = 0.1
 _CLEARLY_FLATTER = 3.0
 # Sum of the cosines of motion and rest pose, along the same axis, that is as clear as one upright body.
@@ -55,7 +55,7 @@ def choose_up_axis(
 
     Returns
     -------
-    str    axis, with a sign if it points down; "y", with a warning, if no feet were found in the file
+    str    axis, with a minus sign if it points down; "y", with a warning, if no feet were found in the file
 
     Raises
     ------
