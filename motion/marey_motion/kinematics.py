@@ -297,8 +297,8 @@ def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequenc
     known = length >= SHORTEST_LATERAL_M
     if not known.any():
         raise MotionError(
-            "the forward direction of the body cannot be computed, because each left joint is exactly above "
-            "or below the right joint in every frame",
+            "the forward direction of the body cannot be computed, because in every frame the left joints are above, "
+            "below or at the right joints; check the joint mapping, or choose frames in which the body is upright",
             code="heading-undefined",
         )
     last_known = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))

@@ -66,7 +66,7 @@ def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopS
 
     Raises
     ------
-    ClipError    if the rate is not a positive number
+    ClipError    if `to_hz` is not a positive number
     """
     if not (np.isfinite(to_hz) and to_hz > 0):
         raise ClipError(f"the frame rate must be a positive number, not {to_hz}", where="frame_rate_hz")

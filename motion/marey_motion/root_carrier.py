@@ -99,7 +99,7 @@ def body_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: 
 
     Returns
     -------
-    Motion    the motion with the root and the carrier swapped
+    Motion    the motion with the root and the carrier swapped; unchanged if the root is the carrier
     """
     if not carrier:
         return motion

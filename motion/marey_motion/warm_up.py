@@ -70,6 +70,8 @@ def kernel_sources() -> list[Path]:
 def discard_outdated_kernels() -> None:
     """Remove all compiled code if the installed sources or the installed compiler have changed since the compilation.
 
+    Then `STAMP` records that the compilation is not complete. Nothing is done if the folder of `STAMP` is not writable.
+
     The compiler's cache detects only changes in the file that defines a kernel. A compiled kernel also contains copies
     of the kernels that it calls and the names of the types of its arguments, which other files may define. Modification
     times cannot be used: files of an installed package have the times of the archive, which are the same for every

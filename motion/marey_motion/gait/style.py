@@ -21,7 +21,8 @@ BANK_LIMIT_RAD = 0.35
 class GaitStyle:
     """Factors that scale features of the neutral gait: 1 keeps a feature unchanged, and 0 removes it.
 
-    With `bounce`, `lean`, `sway` and `arm_swing` at 0, the upper body moves rigidly with the root.
+    `stride` must be above 0. With `bounce`, `lean`, `sway` and `arm_swing` at 0, the upper body moves rigidly with the
+    root.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ def depths_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, 
 
 
 def warn_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, floor: Floor) -> CheckWarning | None:
-    """Warn if hands or feet are below the floor.
+    """Warn if hands or feet are deeper below the floor than in the source (see `depths_below_floor`).
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def warn_below_floor(before: AnyFloats, after: AnyFloats, plan: RetargetPlan, fl
 
     Returns
     -------
-    CheckWarning or None    None if no hand or foot is more than `BELOW_M` below the floor
+    CheckWarning or None    None if no hand or foot is deeper than in the source by more than `BELOW_M`
     """
     places, joints, values, deep = [], [], {}, np.zeros(len(after), dtype=np.bool_)
     for end, (part, option) in _KINDS.items():

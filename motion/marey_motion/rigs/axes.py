@@ -172,7 +172,7 @@ def doubtful_joints(skeleton: Skeleton, mapping: JointMapping) -> frozenset[str]
 
 
 def _conventional(rest: _PosedBody, mapping: JointMapping) -> dict[str, tuple[Floats, Floats]]:
-    """Find the axes that a known rig gives the joints of those parts that its rest pose does not show."""
+    """Find the twist and swing axes (3,) that a known rig gives the doubtful joints of `rest`, by standard name."""
     if not rest.doubtful:
         return {}
     ends = {name: end for name in rest.doubtful if (end := bone_end(name, rest.joints)) is not None}

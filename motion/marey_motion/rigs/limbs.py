@@ -20,7 +20,7 @@ MOST_LIMBS = 12
 
 @dataclass(frozen=True)
 class Limb:
-    """A chain from a branching joint to the farthest tip, three joints or more."""
+    """A chain of three joints or more: from a child of a branching joint towards the farthest tip."""
 
     chain: tuple[int, ...]
     bones: tuple[float, ...]  # length from each joint of the chain to the next

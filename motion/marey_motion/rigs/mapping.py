@@ -234,7 +234,7 @@ def _drop_clavicles_without_length(skeleton: Skeleton, joints: dict[str, int]) -
 
 
 def _animal_signs(skeleton: Skeleton, joints: Mapping[str, int]) -> str:
-    """Describe in words the evidence that the skeleton has four legs; empty for a human."""
+    """Describe in words the evidence that the skeleton is that of an animal; empty if there is no evidence."""
     for index, name in enumerate(skeleton.display_names):
         base = parse_name(name).base
         is_animal = any(word in base for word in _ANIMAL_WORDS)

@@ -15,7 +15,7 @@ class JointName(NamedTuple):
     Parameters
     ----------
     side : str    "left", "right", or "" for the centre
-    base : str    the rest in lower case without separators
+    base : str    the name without side, namespace and separators, in lower case
     """
 
     side: str

@@ -71,7 +71,7 @@ def test_a_body_that_faces_nowhere_cannot_be_faced() -> None:
     rotations = skeleton.rest_rotations.copy()
     rotations[0] = quaternions.from_axis_angle([0.0, 0.0, 1.0], 0.5 * pi)  # on its side: the hips above one another
     pose = np.concatenate(([0.0, 0.2, 0.0], rotations.ravel())).astype(np.float32)
-    with pytest.raises(MotionError, match="exactly above or below") as refused:
+    with pytest.raises(MotionError, match="above, below or at the right joints") as refused:
         apply_edit(Clip(skeleton, 60.0, pose[None]), [Face()])
     assert (refused.value.code, refused.value.where) == ("heading-undefined", "commands[0] (face)")
 
