@@ -40,8 +40,8 @@ class MatchingBody:
     Parameters
     ----------
     hips : the joint whose velocity is matched
-    carrier : the lowest joint from which all standard joints descend, usually the hips. Joints above it, such as a
-        static reference, only move the body as a whole.
+    carrier : the lowest joint from which all standard joints except `root` descend, usually the hips. Joints above the
+        carrier, such as a static reference, only move the body as a whole.
     torso : the joint whose position on the ground is smoothed to make the simulation root: the upper spine, or else the
         hips
     feet, toes : (left, right) ankles, and (left, right) toes; without toe joints, the ankles again

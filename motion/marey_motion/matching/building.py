@@ -55,8 +55,13 @@ def build_database(
 
     Raises
     ------
-    MotionError    if a clip has another skeleton, no facing direction or too few frames (the error names the clip);
-        if two clips have the same uid; if options are invalid; or if the normaliser has other feature dimensions
+    MotionError    if no clip is given; if a clip has another skeleton, has no facing direction or lacks the selected
+        frames (the error names the clip); if two clips have the same uid; if the body lacks a joint that the options
+        select; or if the normaliser has other feature dimensions
+
+    Notes
+    -----
+    A clip that is too short to look ahead is no error: none of its rows can be chosen, and a note says so.
     """
     layout = feature_layout(options, body)
     if normaliser is not None:
@@ -120,7 +125,7 @@ def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
 
     Raises
     ------
-    MotionError    if the databases have different joints, horizons or weights
+    MotionError    if no database is given, or if the databases have different joints, horizons or weights
     """
     if not databases:
         raise MotionError("a normaliser needs at least one database, but none was given", code="no-features")

@@ -155,7 +155,8 @@ def run_trial(
 
     Raises
     ------
-    MotionError    if an option is invalid, or if the index or the trajectory does not fit the database
+    MotionError    if an option is invalid, if the index or the trajectory does not fit the database, or if the last row
+        of a clip that does not wrap is selectable
     """
     from marey_motion.matching import controller_kernels as kernels
 

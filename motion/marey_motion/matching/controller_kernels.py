@@ -246,8 +246,8 @@ def _jumped(desired, before, when):
 def _advance(playback, rules, row, offsets, root):
     """Move `root` (x, z, heading) by one tick: by the step that follows `row`, and by an offset of the root's velocity.
 
-    The offset is caused by switches to other rows, and decays. `offsets` (2, 3) contains the offset (left, forward,
-    turn per second) and its change per second; both are advanced by one tick.
+    The offset is caused by switches to other rows, and decays. `offsets` (2, 3) contains the offset (metres per second
+    to the left and forward, radians per second) and its change per second; both are advanced by one tick.
     """
     left = playback.steps[row, 0] + offsets[0, 0] * rules.tick_s
     forward = playback.steps[row, 1] + offsets[0, 1] * rules.tick_s

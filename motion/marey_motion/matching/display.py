@@ -71,7 +71,7 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
 
     Both poses are in the frame of the root. The displayed pose includes the remaining offsets of earlier switches; the
     next pose has no offsets. The next pose is the pose of the row chosen for the next tick or, at the last tick, of the
-    row that would follow.
+    row that would follow (at the end of a clip, of the displayed row itself).
 
     Parameters
     ----------

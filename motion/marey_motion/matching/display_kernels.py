@@ -54,7 +54,8 @@ def _turn_to(pose, column, w, x, y, z):
 def _add_velocity(poses, places, successors, joints, moved, row, rate, velocities):
     """Add `rate` times the difference between a row and the next row of its clip to `velocities` (1 + M + K, 3).
 
-    `velocities` contains the velocity of the root's position, then of M translations, then of K rotations.
+    At the end of a clip, the difference between the last two rows is used instead. `velocities` contains the velocity
+    of the root's position, then of M translations, then of K rotations.
     """
     if successors[row] < 0:  # a clip's end goes on as it came
         if row == 0 or successors[row - 1] != row:

@@ -66,7 +66,7 @@ def prepare_clip(
     ----------
     source : SourceClip    the clip
     body : MatchingBody    the joints to match
-    options : DatabaseOptions    rate and horizons
+    options : DatabaseOptions    rate, end policy, root mode and whether rest poses are kept
     landmarks : Landmarks    joints of the body, by which rest poses and walks in place are detected
 
     Returns
@@ -75,7 +75,8 @@ def prepare_clip(
 
     Raises
     ------
-    MotionError    if the clip has another skeleton or does not contain the range of frames
+    MotionError    if the clip has another skeleton or does not contain the range of frames, or if a loop has no facing
+        direction
     """
     notes: list[DatabaseNote] = []
 
@@ -115,7 +116,7 @@ def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool)
 def _wanted_frames(
     source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks, warn: _Warn
 ) -> tuple[Clip, int, bool]:
-    """Cut a clip to the requested range, without rest poses at the ends.
+    """Cut a clip to the requested range, and drop rest poses at both ends unless the options keep them.
 
     Returns the cut clip, the index of its first frame in the source, and whether the body walks in place.
     """
@@ -173,7 +174,7 @@ def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], warn: _W
 
 
 def _closed(motion: Motion, warn: _Warn) -> Motion:
-    """Drop the last frame of a loop if it repeats the first frame."""
+    """Drop the last frame of a loop if it repeats the first frame; warn of this, and of a loop that does not close."""
     if motion.frame_count < 3 or motion.rotations.shape[1] < 2:
         return motion
     inner = motion.rotations[:, 1:]

@@ -36,8 +36,8 @@ class TrialRecord:
     status : (T,) int8    `Status`
     match_cost : (T,) float64    cost of the chosen row; if poses are compared by features, the squared distance between
         normalised features. NaN at ticks without a search
-    continuing_cost : (T,) float64    cost of continuing the displayed clip, comparable to `match_cost`; NaN at ticks
-        without a search and at the end of the clip
+    continuing_cost : (T,) float64    cost of continuing the displayed clip, comparable to `match_cost`; NaN at the
+        first tick, at ticks without a search and at the end of the clip
     pose_cost : (T,) float64    distance in metres, summed over the pose joints, from the displayed pose to the pose of
         the row that follows at the next tick. The displayed pose includes the remaining offsets of earlier switches;
         the pose of the following row has no offsets

@@ -24,7 +24,10 @@ from marey_motion.motion import Motion
 from marey_schemas.options.matching import DatabaseOptions
 
 CLAMPED_S = 1 / 3
-"""Duration, in seconds, of the end of a clip where searches may not choose rows, because the look-ahead is cut off."""
+"""Duration, in seconds, of the end of a clip where searches may not choose rows, because the look-ahead is cut off.
+
+With the end policy "trim", this duration is the longest horizon instead. A loop that wraps has no such end.
+"""
 
 
 class ClipRows(NamedTuple):
@@ -52,7 +55,7 @@ def clip_rows(
     seam : LoopSeam or None    seam of a loop that looks ahead to its own beginning
     body : MatchingBody    the joints
     layout : FeatureLayout    D dimensions
-    options : DatabaseOptions    rate, horizons and end of clips
+    options : DatabaseOptions    rate, root mode and end policy
 
     Returns
     -------

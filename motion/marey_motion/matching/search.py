@@ -82,7 +82,8 @@ def build_index(
 
     Raises
     ------
-    MotionError    if no row is selectable, or if a value is not finite or exceeds `LARGEST`
+    MotionError    if no row is selectable, if a value is not finite or exceeds `LARGEST`, or if the shapes of the
+        arrays do not match
     """
     rows = np.ascontiguousarray(normalised, dtype=np.float64)
     mask = np.ascontiguousarray(selectable, dtype=np.bool_)
@@ -214,8 +215,8 @@ def find_nearest(
 
     Returns
     -------
-    rows : (Q,) int64    numbers of the rows; -1 where all rows are skipped
-    costs : (Q,) float64    squared distances; infinite where all rows are skipped
+    rows : (Q,) int64    numbers of the rows; -1 where all selectable rows are skipped
+    costs : (Q,) float64    squared distances; infinite where all selectable rows are skipped
 
     Raises
     ------
@@ -246,7 +247,7 @@ def find_best(
     ----------
     index : SearchIndex    N rows of D dimensions
     query : (D,) float64    normalised like the rows
-    count : int    number of rows to find; fewer are returned if fewer are selectable
+    count : int    number of rows to find; fewer are returned if fewer are selectable and not skipped
     weights : (D,) float64, optional    factors by which the squared differences are multiplied, one per dimension and
         not negative; 1 if None
     skip : (int, int)    rows [start, stop) that may not be chosen
