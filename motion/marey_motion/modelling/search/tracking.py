@@ -124,8 +124,8 @@ def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
     missing = [name for name in (*LEFTS, *RIGHTS) if name not in standard_joints]
     if missing:
         raise MappingError(
-            f"a constraint on the heading needs {', '.join(missing)}, which the joint mapping of "
-            "the skeleton does not contain; add them to the mapping"
+            f"a constraint on the heading, or a sequence of steps, needs {', '.join(missing)}, which the joint "
+            "mapping of the skeleton does not contain; add them to the mapping"
         )
     lefts, rights = (tuple(standard_joints[name] for name in side) for side in (LEFTS, RIGHTS))
     return Tracked(frame, lefts, rights)
