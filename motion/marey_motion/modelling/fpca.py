@@ -89,6 +89,10 @@ def find_components(
     -------
     PrincipalExamples    components and scores
 
+    Raises
+    ------
+    MotionError    if the shapes do not match
+
     Notes
     -----
     There are fewer examples than coefficients. Therefore, the eigenvectors u of the (m, m) matrix of the examples'

@@ -41,7 +41,10 @@ class LatentMixture:
 
     @cached_property
     def cholesky(self) -> Floats:
-        """Lower triangular factors of the covariances, (K, L, L)."""
+        """Lower triangular factors of the covariances, (K, L, L).
+
+        Raises `MotionError` if a covariance is not positive definite.
+        """
         try:
             return np.asarray(np.linalg.cholesky(self.covariances), dtype=np.float64)
         except np.linalg.LinAlgError:

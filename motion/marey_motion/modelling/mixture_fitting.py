@@ -93,8 +93,8 @@ class FittedMixture:
         `held_out_subjects`, not to the candidates. If the options do not set the factor, it is the least of `WIDENINGS`
         with which at most 5 % of the left-out examples (rounded up) are below their thresholds (see `HeldOut`). It is
         the greatest of `WIDENINGS` if no factor is sufficient, and 1 if `held_out` is None
-    candidates : tuple of MixtureCandidate    by kind of covariance and number of components; empty for examples that do
-        not vary
+    candidates : tuple of MixtureCandidate    sorted by kind of covariance, then by number of components; empty for
+        examples that do not vary
     held_out, held_out_subjects : HeldOut, optional    likelihoods of examples whose take, or whose performer, was left
         out; None if there are too few of them
     """
@@ -130,9 +130,12 @@ def fit_mixture(
 
     Mixtures with the kinds of covariance and the numbers of components that `options` allow are compared by
     `options.criterion`. If the criterion is "held_out", the mixture with the fewest parameters is chosen among the
-    mixtures whose held-out likelihood is at most one standard error lower than that of the best mixture. Unless the
-    options set the number of components, a mixture of several components is excluded if the weight of a component
-    corresponds to fewer than 5 examples.
+    mixtures whose held-out likelihood is at most one standard error lower than that of the best mixture. Without
+    cross-validation, "bic" replaces "held_out".
+
+    Unless the options set the number of components, a mixture of several components is excluded if the weight of a
+    component corresponds to fewer than 5 examples. With "bic" and "aic", it is also excluded if it makes left-out
+    examples no more likely than one component does.
 
     Parameters
     ----------
@@ -184,7 +187,7 @@ class _Tried(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Unseen:
-    """Latent vectors (n, d), the number of the fold (n,) of each, and the mixtures fitted without each fold."""
+    """Latent vectors (n, d), the number (n,) of each vector's fold, and for each fold, a mixture fitted without it."""
 
     latents: Floats
     folds: Ints
@@ -254,7 +257,10 @@ class _Fitting:
         )
 
     def _of_kind(self, kind: CovarianceKind, criterion: Criterion, folds: Ints | None) -> Iterator[_Tried]:
-        """Yield mixtures with one kind of covariance and 1, 2, ... components, until more components do not help."""
+        """Yield mixtures with one kind of covariance and 1, 2, ... components, until more components do not help.
+
+        If the options set the number of components, only the mixture with this number is yielded.
+        """
         fixed = self.options.mixture_components
         most = max(1, min(self.options.most_mixture_components, len(self.latents) // LEAST_EXAMPLES_PER_COMPONENT))
         best, worse = -np.inf, 0

@@ -58,7 +58,7 @@ def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -
 
 
 def trained_to_tree(trained: TrainedPrimitive, skeleton: Mapping[str, Any], provenance: Mapping[str, Any]) -> Tree:
-    """Convert a trained primitive, its training and its report to the document that is stored as the part `model`.
+    """Convert a trained primitive with its options and its report to the document that is stored as the part `model`.
 
     Parameters
     ----------
@@ -98,7 +98,8 @@ def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPr
 
     Raises
     ------
-    ModelError    if the joints differ, or if the numbers describe no model
+    ModelError    if the schema or the joints differ
+    MotionError    if the numbers describe no model
     """
     if tree.get("schema") != PRIMITIVE_SCHEMA:
         raise ModelError(

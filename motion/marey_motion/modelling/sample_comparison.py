@@ -47,6 +47,9 @@ def compare_samples(
 ) -> SampleComparison:
     """Compare samples with examples.
 
+    The durations of all samples are compared, but only the poses of the first `MOTIONS_COMPARED` samples. The distances
+    between examples are computed for at most as many examples, evenly spread over the set.
+
     Parameters
     ----------
     primitive : MotionPrimitive    the model

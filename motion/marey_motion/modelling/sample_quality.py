@@ -22,8 +22,8 @@ class FootQuality:
     below_floor_share : share of frames in which at least one foot is under height 0
     below_floor_mean_cm : mean depth of the lowest foot in those frames; 0 if there are none
     lowest_cm : lowest height of a foot in a motion, mean over the motions
-    slide_m_s : mean horizontal speed of each foot, over the frames in which this foot is on the ground in most training
-        examples
+    slide_m_s : mean horizontal speed over all feet and, for each foot, the steps of canonical time in which the foot is
+        on the ground in most training examples; 0 if there are no such steps
     """
 
     below_floor_share: float

@@ -68,6 +68,10 @@ class SplineBasis:
         Returns
         -------
         SplineBasis    over canonical time 0 to frames - 1
+
+        Raises
+        ------
+        MotionError    if there are at most `degree` coefficients, or fewer than 2 frames
         """
         if coefficients <= degree:
             raise MotionError(f"a spline of degree {degree} needs more than {degree} coefficients, not {coefficients}")
@@ -97,6 +101,10 @@ class SplineBasis:
         Returns
         -------
         (m, n) float64    values of the basis functions, or their derivatives per frame to the power of `derivative`
+
+        Raises
+        ------
+        MotionError    if a time is outside the span
         """
         from scipy.interpolate import BSpline
 
@@ -119,6 +127,10 @@ class SplineBasis:
         Returns
         -------
         (..., n, D) float64    coefficients
+
+        Raises
+        ------
+        MotionError    if there is not one sample for each canonical frame that the knots span
         """
         frames = values.shape[-2]
         if frames != self.frame_count:

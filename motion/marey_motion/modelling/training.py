@@ -121,7 +121,7 @@ def check_examples(aligned: AlignedSet) -> None:
 
     Raises
     ------
-    ModelError    naming the invalid example
+    ModelError    if a condition is not met; for a condition on each example, the error names the first invalid example
     """
     if not 1 <= len(aligned.clips) <= MOST_EXAMPLES:
         raise ModelError(

@@ -80,7 +80,7 @@ class TrainingReport:
     log_likelihood : mean log-likelihood of the examples
     held_out_log_likelihood : mean of the examples' `held_out_log_likelihood`; None if it was not computed
     held_out_low_share : share of the examples that are less likely, under a mixture fitted without their takes, than
-        95 % of the samples of this mixture
+        95 % of the samples of this mixture; None if it was not computed
     held_out_subject_log_likelihood, held_out_subject_low_share : mean log-likelihood and share as above, but under
         mixtures fitted without the performer of the example; None if fewer than three performers are known
     examples : reports of the examples, in the order of the aligned set

@@ -54,6 +54,8 @@ def check_search(
 ) -> SearchCheck | None:
     """Train a model without every fifth take, and search for the positions of hands and feet in these takes.
 
+    The take of the reference example is never one of these takes.
+
     If at least three performers are known, the same is done for each performer: a model is trained without the examples
     of this performer, and the positions of hands and feet in these examples are searched for.
 

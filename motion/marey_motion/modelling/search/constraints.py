@@ -1,7 +1,7 @@
-"""Conversion of the constraints of a search to joints, frames in canonical time, and tolerances of a model.
+"""Conversion of the constraints of a search to joints and canonical frames of a model, and to tolerances.
 
-A `Placement` is the position and heading, in the world of the constraints, at which the model's motions begin; by
-default, they begin at the origin of the world.
+In the modules of this folder, a `Placement` is the position and heading, in the world of the constraints, at which the
+model's motions begin; by default, they begin at the origin of the world.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from marey_schemas.search_constraints import (
 )
 
 FAR_AWAY_M = 1000.0
-"""Distance, in metres, of the point to look at that replaces a direction to look in."""
+"""Distance in metres from a joint to the point that replaces the direction of a look direction constraint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +44,10 @@ class Finished:
 
 
 def finish_motion(steps: Sequence[Step], found: FoundMotion, mapping: JointMapping) -> Finished:
-    """Bring joints exactly to their targets at the frames nearest to the times of the constraints.
+    """Bring joints to their targets by inverse kinematics, at the frames nearest to the times of the constraints.
 
-    Only the limb, or the chain up to the pelvis, moves; the position of the body and the timing stay the same.
+    Only the limb, or the chain up to the pelvis, moves; the position of the body and the timing stay the same. Only
+    constraints on the position, orientation or look direction of a joint are met; constraints on the pelvis are not.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ class FoundMotion:
         return self.starts[step] + length
 
     def _length(self, step: int) -> int:
-        """Count the frames of a step, from its first to its last frame."""
+        """Count the frames of a step, without its first frame."""
         ends = (*self.starts[1:], self.motion.frame_count - 1)
         return ends[step] - self.starts[step]
 
@@ -76,6 +76,7 @@ def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
     Raises
     ------
     InvalidConstraint    if steps have different skeletons or frame rates
+    MotionError    if the motion of a step would have too many frames
     """
     first = steps[0].primitive
     for number, step in enumerate(steps):

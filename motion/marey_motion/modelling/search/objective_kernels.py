@@ -130,7 +130,8 @@ def _aims(kind, row, rows, points, turns, pointing, wanted):
     """Compute where a joint's axis points, and where the constraint with index `row` wants it to point.
 
     Fills `pointing` and `wanted` with unit directions (3,). Returns the distance from the joint to the point to look
-    at, or 1 if the constraint is a direction.
+    at, or 1 if the constraint is a direction. If the joint is at the point, any direction is right: `wanted` is set to
+    `pointing`, and the result is 1.
     """
     item = rows.items[row]
     axis, target = rows.axes[row], rows.targets[row]

@@ -39,8 +39,8 @@ class Refined:
     cost : the minimised cost at `latents`
     start_cost : the cost at the start
     iterations : number of steps that were tried
-    evaluations : number of motions that were evaluated, including those for derivatives. Both numbers include a first
-        minimisation whose result was discarded, if there was one
+    evaluations : number of times that residuals and derivatives were computed. `iterations` and `evaluations` include a
+        first minimisation whose result was discarded, if there was one
     """
 
     latents: Floats
@@ -74,7 +74,8 @@ class LeastSquares(Protocol):
 def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:
     """Improve latent vectors; the cost of the result is never above the cost of the start.
 
-    If `options.likelihood_weight` is None, the sum of the squared errors does not increase, either.
+    If `options.likelihood_weight` is None, the sum of the squared errors does not increase, either: `LIKELIHOOD_WEIGHT`
+    is the weight of the likelihood and, if the sum increased with this weight, the likelihood is ignored instead.
 
     Parameters
     ----------

@@ -54,6 +54,11 @@ def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CAN
     Returns
     -------
     FoundSamples    the best samples, the best first
+
+    Raises
+    ------
+    MotionError    if the samples have another number of dimensions than the model, or if `candidates` or `top` is below
+        1
     """
     _check(objective, tree, candidates, top)
     return _descend(objective, tree, candidates, top, lambda latents: latents)
@@ -78,6 +83,10 @@ def search_closely(
     Returns
     -------
     FoundSamples    the best latent vector
+
+    Raises
+    ------
+    MotionError    if the samples have another number of dimensions than the model, or if `candidates` is below 1
     """
     best = search_tree(objective, tree, candidates=candidates)
     middle = tree.means[0]
@@ -134,9 +143,9 @@ def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluatio
 
 
 def _smallest(costs: Floats, places: Indices, count: int) -> Indices:
-    """Return the `count` indices with the smallest costs among `places`, which are indices into `costs`, by cost.
+    """Return the indices of the `count` smallest numbers in `costs` (n,), in ascending order of cost.
 
-    Of indices with equal costs, the first are returned.
+    Equal costs are sorted by `places` (n,), the number of the node or sample of each cost.
     """
     order: Indices = np.lexsort((places, costs))[:count]
     return order

@@ -203,7 +203,8 @@ class SeveralSteps:
 
         Returns
         -------
-        StepStart    position and heading at the end of the last given step, and its transition joints
+        StepStart    placement at the end of the last given step, and the positions of the transition joints there, in
+            metres; the start of the sequence, without joints, if no step is given
         """
         if not latents:
             return StepStart(self.start, {})
@@ -255,7 +256,9 @@ class SeveralSteps:
 
 
 def _ends(step: Step, joints: Sequence[str]) -> tuple[Tracked, ...]:
-    """List the points of a step that are compared with the same points of adjacent steps. Raises `MappingError`.
+    """List the points of a step that are compared with the same points of adjacent steps.
+
+    Raises `MappingError` if hips or shoulders are not mapped.
 
     The points at the start of the step come first: the pelvis, the axis of the body from right to left, and the
     transition joints `joints`. The same points at the end of the step follow.

@@ -131,6 +131,10 @@ def build_tree(
     Returns
     -------
     SampleTree    samples in the order of the tree
+
+    Raises
+    ------
+    MotionError    if samples are clustered by the positions of end effectors, but no end effector is given
     """
     count = options.samples if primitive.dimensions else 1
     samples = primitive.sample(count, seed).astype(np.float32)

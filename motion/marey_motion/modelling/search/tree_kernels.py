@@ -127,8 +127,8 @@ def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, c
     `order` (n,) is permuted so that each node's members are contiguous; `starts`, `sizes` and `children` (nodes,) are
     filled per node: first member, number of members, number of child nodes. The children of a node have consecutive
     numbers, and the nodes of a level are in the order of their parents. A node has up to `branching` children; a node
-    with at most `leaf_size` samples, or at level `depth`, has none. `randoms` (nodes, branching) are uniform random
-    numbers.
+    with at most `leaf_size` samples, at level `depth`, or whose samples have equal features, has none. `randoms`
+    (nodes, branching) are uniform random numbers.
     """
     count = features.shape[0]
     room = (np.empty(count), np.empty(count, np.int64), np.empty(count, np.int64))
