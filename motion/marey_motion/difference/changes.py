@@ -53,7 +53,7 @@ def spans_where(exceeds: Flags, matched: MatchedFrames) -> tuple[Range, ...]:
     Returns
     -------
     tuple of ranges    frames of the new clip, half open and in order; ranges less than `JOINED_S` seconds apart are
-        joined, and wider gaps too if there would be more than `MOST_SPANS` ranges
+        joined. If there would be more than `MOST_SPANS` ranges, ranges that are farther apart are joined, too
     """
     frames = matched.frames[exceeds]
     if not len(frames):
@@ -109,7 +109,7 @@ def path_change(
 
     Returns
     -------
-    PathChange or None    None if all positions are equal, apart from rounding
+    PathChange or None    None if no frames match, or if all positions are equal, apart from rounding
     """
     distances = CM_PER_M * np.linalg.norm(after - before, axis=1)
     if not len(distances) or distances.max() <= NOISE_CM:
@@ -174,8 +174,8 @@ def whole_move(before: Floats, after: Floats) -> Move | None:
 
     Returns
     -------
-    Move or None    None if the paths are equal, or if the mean distance between them after the movement is more than
-        `UNEXPLAINED` times the mean distance before it
+    Move or None    None if the paths are empty or equal, or if the mean distance between them after the movement is
+        more than `UNEXPLAINED` times the mean distance before it
     """
     change = np.linalg.norm(after - before, axis=1)
     if not len(change) or CM_PER_M * change.max() <= NOISE_CM:

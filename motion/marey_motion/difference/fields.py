@@ -13,7 +13,10 @@ from marey_schemas.documents.differences import Change, ModelDifference
 from marey_schemas.documents.models import log_likelihoods
 
 MOST_TEXT = 2000
-"""Maximum length of a value as JSON text; longer values are replaced by a description."""
+"""Maximum length, in characters, of a value as JSON text.
+
+Longer strings are cut off; longer lists and objects are replaced by a description.
+"""
 
 
 class ChangedValue(NamedTuple):
@@ -109,7 +112,10 @@ def _key(value: Any) -> str:
 
 
 def _shown(value: Any) -> Any:
-    """Return a value as it appears in a difference: arrays and long values become short descriptions in words."""
+    """Return a value as it appears in a difference: arrays, long lists and long objects become short descriptions.
+
+    A long string is cut off.
+    """
     if isinstance(value, np.ndarray):
         return f"array of {' x '.join(str(size) for size in value.shape)} numbers"
     text = json.dumps(value, default=_shown)

@@ -21,7 +21,7 @@ SHIFTED = 0.05
 MOST_PAIRS = 16_000_000
 """Greatest number of pairs of segments whose costs are computed.
 
-Each of the segments that differ in the old annotation is paired with each of those in the new annotation.
+Each differing segment of the old annotation is paired with each differing segment of the new annotation.
 """
 
 

@@ -46,7 +46,8 @@ def find_period(clip: MeasuredClip, metric: PerceptualMetric) -> Period:
 
     A minimum is significant if it is in the lowest quarter of the range of distances. This excludes half a cycle, which
     gives a shallow minimum because left and right are exchanged. The loop starts at a frame that differs enough from
-    the frame half a period later. This excludes loops in which the body stands still.
+    the frame half a period later. This excludes loops in which the body stands still. Of the possible starts, the frame
+    that differs least from the frame one period later is chosen.
 
     Parameters
     ----------

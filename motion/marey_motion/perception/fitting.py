@@ -248,7 +248,11 @@ def bootstrap_weights(
 
     Returns
     -------
-    (B, 1 + K) float64    constant, then the weight of each class multiplied by N
+    (B, 1 + K) float64    constant, then the weight of each class multiplied by the norm
+
+    Raises
+    ------
+    MotionError    if, in some draw, too few pairs have a perceived difference
     """
     people = len(shown)
     means = differences.means(shaping)

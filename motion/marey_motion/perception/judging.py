@@ -128,7 +128,8 @@ def draw_trials(
     """Draw the motions of a study's trials so that all motions, and all pairs, are shown about equally often.
 
     The numbers of times that a participant sees each motion differ by at most one. For each participant, several draws
-    are made; the kept draw is the one with which the counts of all pairs differ least over the participants so far.
+    are made, and the draw is kept after which the counts of all pairs, summed over the participants so far, differ
+    least.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
 """Measurement of clips for a perceptual metric: rotations, positions and velocities of joints.
 
-Positions and velocities are relative to the place and heading of the body, so that these do not affect distances.
+Positions and velocities are relative to the place and heading of the body, so that place and heading do not affect
+distances.
 """
 
 from __future__ import annotations
@@ -80,8 +81,8 @@ class MeasuredClip:
 
         Parameters
         ----------
-        times : (n,) float64    fractional frame numbers from 0 to F - 1; for a cyclic clip also others, as frame F is
-            frame 0 of the next cycle
+        times : (n,) float64    fractional frame numbers from 0 to F - 1; for a cyclic clip, any numbers, because
+            frame F is frame 0 of the next cycle
 
         Returns
         -------
@@ -156,7 +157,7 @@ def measure_motion(motion: Motion, body: MatchingBody, rate_hz: float, *, seam: 
 
 
 def require_comparable(a: MeasuredClip, b: MeasuredClip) -> None:
-    """Check that two clips can be compared: that they have the same joints and the same frame rate.
+    """Check that two clips have the same joints, rest rotations, joint classes and frame rate.
 
     Parameters
     ----------

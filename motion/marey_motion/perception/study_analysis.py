@@ -36,7 +36,7 @@ from marey_motion.perception.registration import differences_along_curve
 from marey_schemas.documents.metrics import SHAPINGS, MetricDocument, Shaping
 
 INTERVAL = (0.025, 0.975)
-"""Quantiles of the resampled weights at the ends of their intervals."""
+"""Quantiles of the resampled weights that are the lower and the upper end of each interval."""
 FEWEST_FOR_INTERVALS = 5
 """Least number of participants for intervals: the quantiles need 40 different draws, and four people have only 35."""
 
@@ -55,7 +55,7 @@ class ComponentFit:
     left_out : (R,) float64, optional    differences predicted by `leave_one_motion_out`; None for the shaping `power`,
         and if there are too few motions
     intervals : dict    95 % interval of each weight, as a share of the sum of all weights, over resampled participants;
-        empty for the shaping `power`, and if there are too few participants
+        empty for the shaping `power`, without draws of participants, and if there are too few participants or answers
     """
 
     component: Component
@@ -74,8 +74,8 @@ class FittedMetric:
     metric : PerceptualMetric    components and shares
     parts : tuple of ComponentFit    the components, in the same order
     quality : FitQuality    agreement with the table
-    left_out_rmse : float, optional    root mean square error for motions that were left out of the fit; None if
-        unknown
+    left_out_rmse : float, optional    root mean square error for motions that were left out of the fit; None for the
+        shaping `power`, and if there are too few motions
     """
 
     metric: PerceptualMetric
@@ -255,7 +255,10 @@ def _left_out(parts: Sequence[PairDifferences], perceived: Floats, shaping: Shap
 def _intervals(
     judgements: Judgements, differences: PairDifferences, shaping: Shaping, draws: int, seed: int
 ) -> dict[str, tuple[float, float]]:
-    """Return the 95 % interval of each weight, as a share of the sum of all weights, over draws of participants."""
+    """Return the 95 % interval of each weight, as a share of the sum of all weights, over draws of participants.
+
+    Returns an empty dictionary without draws, and if there are too few participants or answers.
+    """
     if not draws or len(np.unique(judgements.participants)) < FEWEST_FOR_INTERVALS:
         return {}
     shown, chosen = pair_counts_by_participant(judgements)

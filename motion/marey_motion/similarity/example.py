@@ -40,7 +40,7 @@ class Example:
         return np.argsort([int(f"{place:05b}"[::-1], 2) for place in range(count)], kind="stable")
 
     def rows_around(self, frame: float, rate_hz: float) -> tuple[int, int]:
-        """Find the rows of the example's own clip at which the windows that overlap the example start.
+        """Find the rows of the example's own clip at which windows start that overlap the example.
 
         Parameters
         ----------
@@ -68,7 +68,7 @@ class GroupedExample:
     ----------
     example : Example    T samples
     groups : (T,) int64    number of the ball that encloses each sample
-    turns : (T,) int64    order in which samples are compared with rows: those in wide balls come first, because their
+    turns : (T,) int64    order in which samples are compared with rows: samples in wide balls come first, because their
         distances exceed the bound of the ball most
     centres : (G, WIDTH) float32    centres of the balls
     reaches : (G, 41) float32    radii of the balls: of each vector, then of each rotation

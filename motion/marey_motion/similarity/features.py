@@ -44,7 +44,7 @@ class PoseFeatures:
 
     Parameters
     ----------
-    rows : (n, WIDTH) float32    features; those of joints that the skeleton lacks are 0
+    rows : (n, WIDTH) float32    features; joints that the skeleton lacks have zero vectors and identity rotations
     present : (15,) bool    which of `JOINTS` the skeleton has
     """
 
@@ -67,7 +67,7 @@ def clip_features(motion: Motion, body: MatchingBody, rate_hz: float) -> PoseFea
 
     Raises
     ------
-    MotionError    if no frame has a facing direction, or the skeleton has no joint class
+    MotionError    if no frame has a facing direction, the skeleton has no joint class, or a feature is not finite
     """
     count = int((motion.frame_count - 1) * INDEX_RATE_HZ / rate_hz + _ROUNDED_FRAMES) + 1
     return features_at(motion, body, rate_hz, np.arange(count) * (rate_hz / INDEX_RATE_HZ))
@@ -90,7 +90,7 @@ def features_at(motion: Motion, body: MatchingBody, rate_hz: float, times: AnyFl
 
     Raises
     ------
-    MotionError    if no frame has a facing direction, or the skeleton has no joint class
+    MotionError    if no frame has a facing direction, the skeleton has no joint class, or a feature is not finite
     """
     measured = measure_motion(motion, body, rate_hz).at(np.asarray(times, np.float64))
     columns = _columns(measured, body)

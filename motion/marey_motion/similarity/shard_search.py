@@ -98,7 +98,7 @@ class Weighing:
 
         Returns
         -------
-        list of ComparedRuns    one for each set of joints
+        list of ComparedRuns    one for each set of joints that has the joints that the metric needs
         """
         short = np.diff(shard.runs.starts) <= length
         joints, balls = np.where(searched.closed | short, -1, shard.joints), shard.runs.balls

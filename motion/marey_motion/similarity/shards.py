@@ -28,7 +28,7 @@ STEP_ROWS = 3
 STEPS_PER_BALL = 2
 """Number of steps of a ball. Larger balls are fewer and take less time to compare, but exclude fewer windows."""
 FULL_SHARD_ROWS = 65_536
-"""Number of rows of a full shard: 36 minutes of motion, about 41 MB."""
+"""Number of rows of a full shard: 36 minutes of motion, about 43 MB."""
 _MARK = b"mareyix1"
 _HEAD = struct.Struct("<8sQQ")
 _RADII = VECTORS + len(ROTATED_JOINTS)

@@ -71,7 +71,8 @@ def metric_tables(metric: PerceptualMetric, present: Flags) -> MetricTables | No
     Parameters
     ----------
     metric : PerceptualMetric    metric that `require_searchable` accepts
-    present : (15,) bool    which of `JOINTS` both skeletons have; weights of missing classes are spread over the others
+    present : (15,) bool    which of `JOINTS` both skeletons have; the weights of missing classes are spread over the
+        other classes
 
     Returns
     -------
