@@ -299,7 +299,7 @@ class _Fitting:
         )
 
     def _simplest(self, tried: list[_Tried], best: _Tried) -> _Tried:
-        """Find the mixture with the fewest parameters among those as good for left-out examples as the best one."""
+        """Find the mixture with the fewest parameters among all that are as good for left-out examples as the best."""
 
         def size(one: _Tried) -> tuple[int, float]:
             candidate = one.candidate

@@ -84,7 +84,7 @@ def compare_samples(
 
 
 def _distances(motions: Floats, others: Floats) -> Floats:
-    """Compute the distances (n, m) between motions (n, T, J, 3) and others (m, T, J, 3), in centimetres."""
+    """Compute the distances (n, m) between `motions` (n, T, J, 3) and `others` (m, T, J, 3), in centimetres."""
     return CM_PER_M * np.stack([np.linalg.norm(others - one, axis=-1).mean(axis=(1, 2)) for one in motions])
 
 

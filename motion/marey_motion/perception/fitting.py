@@ -263,7 +263,7 @@ def bootstrap_weights(
 
 
 def leave_one_motion_out(parts: Sequence[PairDifferences], perceived: Floats, shaping: Shaping) -> Floats:
-    """Predict the differences of each motion from the others, by a fit to the pairs without this motion.
+    """Predict the differences of each motion from all other motions, by a fit to the pairs without this motion.
 
     For each left-out motion, all components and their shares are fitted. All pairs of the motion are left out, because
     a fit to some of them would already contain information about the remaining pairs.

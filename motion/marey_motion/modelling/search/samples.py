@@ -39,10 +39,10 @@ class FoundSamples:
 def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, top: int = 1) -> FoundSamples:
     """Descend a tree with the best nodes of each level, and keep the best samples.
 
-    All children of all candidates of a level are evaluated at once: a node by the mean of its samples, a leaf by each
-    of its samples. The result consists of samples and never of means, because a mean need not be a likely motion. Of
-    samples with equal costs, the first in the tree is preferred. If `candidates` is at least the number of nodes, the
-    search is exhaustive.
+    All children of the candidates of a level are evaluated by the means of their samples; for a candidate without
+    children (a leaf), each of its samples is evaluated. The result consists of samples and never of means, because a
+    mean need not be a likely motion. Of samples with equal costs, the first in the tree is preferred. If `candidates`
+    is at least the number of nodes, the search is exhaustive.
 
     Parameters
     ----------
