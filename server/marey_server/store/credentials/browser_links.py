@@ -104,12 +104,12 @@ def redeem_link(tx: Transaction, code: str, attempt: SignInTry) -> IssuedSession
 
 
 def is_session(tx: Transaction, secret: str) -> bool:
-    """Return whether a text is the token of a valid session."""
+    """Return whether `secret` is a valid token of a user, such as the token of a session."""
     return _session_of(tx, secret) is not None
 
 
 def end_session(tx: Transaction, secret: str) -> None:
-    """Revoke the token of a session; an unknown token changes nothing."""
+    """Revoke the token of a session, or another token of a user; a token that is not valid changes nothing."""
     found = _session_of(tx, secret)
     if found is not None and found.token_id is not None:
         tx.principal = found
@@ -117,7 +117,7 @@ def end_session(tx: Transaction, secret: str) -> None:
 
 
 def _session_of(tx: Transaction, secret: str) -> Principal | None:
-    """Return the principal of a session; None if `secret` is not a valid token, or not the token of a user."""
+    """Return the principal of the token `secret`; None if the token is not valid or does not belong to a user."""
     try:
         found = tokens.resolve_token(tx, secret)
     except UnauthenticatedProblem:

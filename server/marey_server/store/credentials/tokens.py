@@ -122,9 +122,10 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
 def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     """Return the principal of an attempt's token.
 
-    Raises `LeaseLostProblem` if the attempt has lost the job, or if the author of the job has lost the right to run it.
-    The token is valid while the attempt holds its job. For `REPLAY_GRACE_US` after the end of the attempt, the token
-    only allows a repeated `complete` or `fail`, which gets the stored answer.
+    Raises `LeaseLostProblem` if the attempt has lost the job, or if the author of the job has lost the right to run it,
+    and `UnauthenticatedProblem` if the token is unknown or no longer valid. The token is valid while the attempt holds
+    its job. For `REPLAY_GRACE_US` after the end of the attempt, the token only allows a repeated `complete` or `fail`,
+    which gets the stored answer.
     """
     row = tx.first(_ATTEMPT_TOKEN, {"hash": hash_secret(secret)})
     if row is None:
@@ -148,7 +149,8 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
 
     The new token may not have more rights than the caller's own token: no other scopes, no other labels of workers,
     and no later expiry. Otherwise, raises `ForbiddenProblem`. Raises `InvalidProblem` for labels without the scope
-    `work`, and `NotFoundProblem` for a scope of a project that the caller cannot see.
+    `work`, `NotFoundProblem` for a scope of a project that the caller cannot see, and `QuotaExceededProblem` if the
+    caller has too many tokens.
     """
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
