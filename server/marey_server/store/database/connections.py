@@ -54,9 +54,9 @@ MOVING_THREADS = 16
 RESERVED_THREADS = 3
 """Number of threads, and of connections, for short transactions that must not wait for other transactions."""
 SHARED_BY_ALL = 2
-"""Greatest number of ordinary threads of which one client may use all at the same time.
+"""Number of ordinary threads up to which one client may use all of them at the same time.
 
-If there are more threads, one client may use all but one of them.
+If there are more ordinary threads, one client may use all but one.
 """
 
 
@@ -258,9 +258,9 @@ class Database:
     def queue_read(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
-        """Run `self.read(principal, function)` for a client, in a thread for ordinary reads.
+        """Run `self.read(principal, function)` for a client in an ordinary thread; return the future of the result.
 
-        With `reserved`, use a thread for reserved reads. If the client closes the connection, the read is stopped
+        With `reserved`, use a reserved thread instead. If the client closes the connection, the read is stopped
         before its next statement. Raises `UnavailableProblem` if too many calls wait.
         """
 
@@ -274,10 +274,11 @@ class Database:
     def queue_write(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
-        """Run `self.write(principal, function)` for a client in a thread.
+        """Run `self.write(principal, function)` for a client in a thread; return the future of the result.
 
-        On SQLite, a reserved write runs before the other waiting writes. The write runs even if the client has closed
-        the connection. Raises `UnavailableProblem` if too many writes wait.
+        With `reserved`, the write uses a reserved thread on Postgres, and runs before the other waiting writes on
+        SQLite. The write runs even if the client has closed the connection. Raises `UnavailableProblem` if too many
+        writes wait.
         """
         client = Client(client.key, client.known)
         write_lane, lane = self._write_lane, self._reserved if reserved else self._ordinary

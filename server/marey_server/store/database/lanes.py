@@ -168,7 +168,7 @@ class Lane:
         return len(self._line)
 
     def submit(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Queue a call for a client.
+        """Queue a call for a client, and return the future of its result.
 
         Raises `UnavailableProblem` if the queue is full, and `StoppingProblem` if the lane is closed.
         """

@@ -89,7 +89,11 @@ class WriteLane:
         return taken
 
     def _write_together(self, group: Sequence[_Write]) -> bool:
-        """Run writes in one transaction; return whether it was committed. An unexpected error rolls back all writes."""
+        """Run writes in one transaction, and set their futures after the commit.
+
+        Returns False if an unexpected error of a write has rolled back all writes; the futures are then not set. If the
+        commit fails, all futures get its error.
+        """
         completions: list[Callable[[], Any]] = []
 
         def run_all(tx: Transaction) -> None:
