@@ -50,7 +50,7 @@ RENEW_US = GRACE_US // 2
 def put_blob(
     tx: Transaction, content: bytes | Spool, *, expected: str | None = None, project_id: str | None = None
 ) -> str:
-    """Store bytes that the caller uploaded, and allow the caller to refer to them by their digest.
+    """Store bytes that the caller uploaded, and allow the caller to refer to them by their digest; return the digest.
 
     The bytes can be used in the project `project_id`, or if this is None, in all projects that the caller's token
     allows. Raises `InvalidProblem` if the digest of the bytes is not `expected`, and `QuotaExceededProblem` if the

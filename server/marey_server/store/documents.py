@@ -30,10 +30,11 @@ EDIT_SCHEMA = PARTS[Kind.EDIT]["edit"].schema
 def store_document(tx: Transaction, content: Any, *, schema: str | None = None) -> str:
     """Store a document and return its digest. `content` is a tree, or the result of `prepare_document` for a tree.
 
-    Storing the same document again adds no rows.
+    The document is checked against `schema`, by default the schema that the document names. Storing the same document
+    again adds no rows.
 
-    Raises `ConflictProblem` (`missing-blobs`) if the document names blobs that the caller has not sent and may not
-    read.
+    Raises `InvalidProblem` if the document is not valid, and `ConflictProblem` (`missing-blobs`) if the document names
+    blobs that the caller has not sent and may not read.
     """
     ready = prepared(content, schema=schema)
     store_documents(tx, [ready])

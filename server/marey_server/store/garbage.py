@@ -54,7 +54,11 @@ MOST_UPLOADS = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """Numbers of deleted rows and files."""
+    """Numbers of deleted rows and files.
+
+    `keys` are idempotency keys. `ended_holdings` are records of blobs that were uploaded by attempts of jobs which have
+    ended since.
+    """
 
     documents: int
     blobs: int
@@ -69,9 +73,10 @@ class Collected:
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
-    """Delete documents and blobs that have had no references for `grace_us`, and expired rows of other tables.
+    """Delete unreferenced documents and blobs, and expired rows of other tables.
 
-    May run at any time, and in several processes at once.
+    A document or blob is deleted only if it was neither stored nor renewed in the last `grace_us` microseconds. May run
+    at any time, and in several processes at once.
     """
     return Collected(
         documents=_collect(database, document, delete_documents, grace_us),
@@ -98,7 +103,7 @@ def _collect(
 
 
 def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> list[str]:
-    """Return the next digests of documents or blobs, after the digest `behind`, without references for `grace_us`.
+    """Return the next digests of documents or blobs, after the digest `behind`, that may be deleted (see `_garbage`).
 
     There are at most `BATCH` of them, with at most `BATCH_BYTES` together. A larger document or blob is returned alone.
     """
@@ -114,7 +119,7 @@ def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> li
 
 
 def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElement[bool], ...]:
-    """Return the SQL conditions for documents or blobs that are old enough and not referenced.
+    """Return the SQL conditions for unreferenced documents or blobs, stored or renewed more than `grace_us` ago.
 
     Staged documents meet the conditions, too; the caller must exclude them.
     """
@@ -133,7 +138,7 @@ def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_
 
 
 def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
-    """Delete those of the given documents that have had no reference for `grace_us`; return their number."""
+    """Delete those of the given documents that are garbage (see `_garbage`) and not staged; return their number."""
     going = set(_still_garbage(tx, document, digests, grace_us)) - _staged_documents(tx)
     for references in (document_blob, document_item):
         tx.execute(delete(references).where(references.c.document_digest.in_(going)))
@@ -155,7 +160,7 @@ def _staged_documents(tx: Transaction) -> set[str]:
 
 
 def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
-    """Delete those of the given blobs that have had no reference for `grace_us`; return their number."""
+    """Delete those of the given blobs that are garbage (see `_garbage`); return their number."""
     going = _still_garbage(tx, blob, digests, grace_us)
     for digest in going:
         tx.blobs.release(tx.connection, digest)

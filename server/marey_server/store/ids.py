@@ -15,7 +15,7 @@ def new_id(prefix: str) -> str:
 
 
 def first_id_at(prefix: str, time_us: int) -> str:
-    """Return an id that sorts before all ids created at this time or later, and after all ids created earlier."""
+    """Return an id that sorts before all ids of the millisecond of `time_us` or later, and after all earlier ids."""
     return _id_of(prefix, max(time_us, 0) // 1000 << 80)
 
 
