@@ -2,6 +2,8 @@
 
 Entries are deleted only when they are older than the settings allow. Entries are changed only when an item is purged:
 in the entries of this item, its id then replaces its name.
+
+On Postgres, call `events.number_events` before the functions that list entries: entries without a number are left out.
 """
 
 from __future__ import annotations
@@ -68,7 +70,7 @@ def list_project_audit(tx: Transaction, name: str, wanted: AuditFilter, *, curso
 def _list(
     tx: Transaction, wanted: AuditFilter, of: list[ColumnElement[bool]], project_id: str, cursor: str | None, limit: int
 ) -> Page:
-    """Return a page of audit entries. On Postgres, `number_events` must be called first."""
+    """Return a page of audit entries, newest first; entries without a number (see `number_events`) are left out."""
     number = events.number_of(tx)
     statement = (
         select(*_COLUMNS, number.label("number"), project.c.name.label("project"))

@@ -61,7 +61,7 @@ def read_clock(connection: Connection) -> StoredClock:
 
 
 def set_clock(connection: Connection) -> int:
-    """Set the stored clock to the time of this machine, and move later times back; return how many times were moved.
+    """Set the stored clock to the time of this machine, and move later times back; return the number of changed values.
 
     Later times of past events are set to the new time. Leases end at the new time, so running jobs continue if their
     workers report, and are queued again otherwise. Tokens and time limits that were created with the wrong clock keep

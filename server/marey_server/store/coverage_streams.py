@@ -47,7 +47,11 @@ class NewStream:
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """Row of a coverage stream in the database."""
+    """Row of a coverage stream in the database.
+
+    `offset` is the number of frames that were received. `said` is the digest of the last request, and `answer` is the
+    answer to this request; both are None before the first request.
+    """
 
     id: str
     settings: Tree

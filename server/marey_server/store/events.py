@@ -119,7 +119,7 @@ def _placed(tx: Transaction, conditions: Sequence[ColumnElement[bool]], most: in
 
 
 def require_kept(tx: Transaction, after: int) -> None:
-    """Raise `GoneProblem` if an event after the one numbered `after` was deleted, so that a client has missed it."""
+    """Raise `GoneProblem` if an event after the one numbered `after` was deleted; 0 always passes."""
     last = _last_deleted(tx)
     if 0 < after < last:
         raise GoneProblem(
@@ -304,7 +304,7 @@ def _waiting_for_place(tx: Transaction, projects: Collection[str]) -> set[str]:
 
 
 def kinds_due(tx: Transaction, since_us: int) -> tuple[set[str], int]:
-    """Return the kinds of the queued jobs whose wait for a retry ended after `since_us`, and the present time."""
+    """Return the kinds of the queued jobs whose wait ended after `since_us`, and the present time in microseconds."""
     due = (job.c.state == QUEUED, job.c.run_at_us > since_us, job.c.run_at_us <= tx.now_us)
     return set(tx.execute(select(job.c.kind).where(*due).distinct()).scalars()), tx.now_us
 
@@ -329,7 +329,7 @@ def forget_names(tx: Transaction, ids: Sequence[str], *members: str) -> None:
 def forget_clips(tx: Transaction, project_id: str, items: frozenset[str]) -> None:
     """Remove the paths of items from the project's records of exports without consent.
 
-    The audit log shows the id of the first clip in place of its name.
+    The audit log names a record after its first clip. If this clip is among `items`, its id replaces the name.
     """
     recorded = event.c.about.is_not(None), event.c.project_id == project_id, event.c.kind == "consent.overridden"
     for row in tx.execute(select(event.c.seq, event.c.body).where(*recorded)).all():
