@@ -365,11 +365,15 @@ def _contents_in(row: Row[Any], digest: str, leaf: Leaf, findings: list[StoreDef
 
 
 def _check_proposals(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault for each proposal that lacks a field or, while it is open, a branch."""
+    """Return a fault for each proposal whose fields do not fit its state, or that is open and lacks a branch."""
     of_dataset = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.kind == RefKind.BRANCH.value)
     branches = set(tx.execute(select(dataset_ref.c.name).where(*of_dataset)).scalars())
     return [
-        StoreDefect("proposal-corrupt", row.id, f"the proposal {one.number} lacks what its state {one.state} needs")
+        StoreDefect(
+            "proposal-corrupt",
+            row.id,
+            f"fields or branches of the proposal {one.number} do not fit its state {one.state}",
+        )
         for one in tx.execute(select(proposal).where(proposal.c.dataset_id == row.id))
         if not _is_consistent(one, branches)
     ]

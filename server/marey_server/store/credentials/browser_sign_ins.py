@@ -139,8 +139,9 @@ def _name_of(claim: str | None) -> str:
     name = (claim or "").partition("@")[0].lower()
     if not _USER_NAME.fullmatch(name):
         raise ForbiddenProblem(
-            "The identity provider sent no valid user name for you: a user name has at most 64 letters, digits, `.`, "
-            "`_` and `-`. Ask an administrator to create a user and to link you with this user.",
+            "The identity provider sent no valid user name for you: a user name has at most 64 letters (a to z), "
+            "digits, `.`, `_` and `-`, and begins and ends with a letter or digit. Ask an administrator to create a "
+            "user and to link you with this user.",
             code="no-user-name",
         )
     return name

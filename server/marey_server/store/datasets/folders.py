@@ -47,7 +47,9 @@ def read_folder(tx: Transaction, project_row: ProjectRow, found: Row[Any]) -> Fo
     """
     if found.path is None:
         raise InvalidProblem(
-            f"The dataset {found.name!r} has no folder to commit; list the changes in the request.", code="no-folder"
+            f"The dataset {found.name!r} has no folder: nothing can be checked out, and a commit must list its changes "
+            "in the request.",
+            code="no-folder",
         )
     if found.folder_deleted_us is not None:
         raise InvalidProblem(

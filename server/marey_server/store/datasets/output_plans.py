@@ -92,7 +92,7 @@ def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most:
     """Compute the commit of the outputs of a job to a branch whose newest commit is `head`.
 
     The commit is refused in three cases: it would add, change and remove more than `most` entries in total; a path is
-    too long; or both the job and others have changed more than `MOST_COMBINED` entries.
+    too long; or more than `MOST_COMBINED` entries combine a change of the job with a change of others.
     """
     store = StoredChunks(tx)
     reader = ChunkReader(store)
@@ -105,7 +105,7 @@ def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most:
     annotations = AnnotationMerger(tx, wanted.project_id, MOST_MERGED_BY_JOB)
     merged = _merged(reader, base, head_tree, entries, annotations)
     if len(merged.combined) > MOST_COMBINED:
-        return PlannedCommit(head, too_many_changes(MOST_COMBINED, " if others have changed the dataset meanwhile"))
+        return PlannedCommit(head, too_many_changes(MOST_COMBINED, " that others have changed meanwhile"))
     tree = change(store, base, _values(entries)) if merged.conflicts else change(store, head_tree, merged.changes)
     in_folder = not merged.conflicts and _is_in_folder(tx, wanted, head, merged.changes)
     return PlannedCommit(
@@ -118,8 +118,9 @@ def follow(tx: Transaction, wanted: OutputEntries, planned: PlannedCommit, head:
     """Return a plan for the commit `head`, to which others have moved the branch since the plan was computed.
 
     The new plan keeps all chunks of `planned`, even those that are stored already: a purge of a deleted dataset may
-    have deleted them again. Returns None if the plan must be computed again, because others have changed the same
-    entries as the job, or too many entries.
+    have deleted them again. A plan with conflicts is returned unchanged. Returns None if the plan must be computed
+    again, because it was refused, or because others have changed the same entries as the job or more than
+    `MOST_FOLLOWED` entries.
     """
     if planned.head == head or planned.merged.conflicts:  # the commit to a branch of its own stays as it is
         return planned
@@ -176,7 +177,7 @@ def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConfl
 def too_many_changes(most: int, condition: str = "") -> CommitConflict:
     """Return the conflict for a job that would commit more than `most` changes.
 
-    The text `condition`, such as " if others have committed", follows the limit in the message.
+    The text `condition`, such as " that others have changed", says in the message which entries the limit counts.
     """
     return CommitConflict(
         code="too-many-changes",

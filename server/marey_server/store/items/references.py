@@ -78,7 +78,10 @@ def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def resolved(tree: Any, done: Mapping[str, Published]) -> Any:
-    """Return the document `tree` with each reference to a draft replaced by the revision published from the draft."""
+    """Return the document `tree` with each reference to a draft replaced by the revision published from the draft.
+
+    `done` contains the published revisions by the name of the draft. References to other drafts are not replaced.
+    """
     if isinstance(tree, Mapping):
         if tree.keys() == {"output"} and tree["output"] in done:
             published = done[tree["output"]]
@@ -146,7 +149,7 @@ class ReferenceCheck:
         ends = [segment["end"] for segment in annotation.get("segments", ())]
         ends += [keyframe["frame"] + 1 for keyframe in annotation.get("keyframes", ())]
         if max(ends, default=0) > frames:
-            detail = f"The clip has only {counted(frames, 'frame')}, but the annotation ends after {max(ends)}."
+            detail = f"The clip has only {counted(frames, 'frame')}, but the annotation ends after {max(ends)} frames."
             raise _invalid("/annotation", "beyond-end", detail)
 
     def _require_models(self, graph: Tree) -> None:

@@ -129,7 +129,7 @@ def merge_skeletons(tx: Transaction, project: str, request: SkeletonMergeRequest
 
 
 def _find_skeletons(tx: Transaction, project: ProjectRow, request: SkeletonMergeRequest) -> list[_Skeleton]:
-    """Return the skeletons to compare; lock their rows, so that nobody revises them before they are merged.
+    """Return the skeletons to compare; without `dry_run`, lock their rows, so that nobody revises them meanwhile.
 
     A deleted skeleton is compared if existing items use it. There are such items if a checkout has restored them.
     """
@@ -262,10 +262,11 @@ def _moved(tx: Transaction, project: ProjectRow, skeleton: _Skeleton) -> frozens
 def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonMergeRequest) -> None:
     if merged.is_edited and merged.mapping != kept.mapping and request.kept is None:
         raise ConflictProblem(
-            f"Somebody made or confirmed the joint maps of {kept.named['path']} and {merged.named['path']}, and they "
-            "differ; choose the skeleton that remains with --keep (in requests: kept).",
+            f"The joint map of {kept.named['path']} differs from the joint map of {merged.named['path']}, which "
+            "somebody made or confirmed; choose the skeleton that remains with --keep (in requests: kept).",
             code="mappings-differ",
-            unnamed="Joint maps that were made or confirmed by hand differ; choose the skeleton that remains (kept).",
+            unnamed="A joint map that somebody made or confirmed differs from the joint map of another skeleton; "
+            "choose the skeleton that remains (kept).",
         )
 
 

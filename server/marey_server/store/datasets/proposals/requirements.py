@@ -88,8 +88,8 @@ def find_missing(tx: Transaction, project_id: str, row: Row[Any], rule: Protecti
     if len(approvals) < rule.approvals:
         yield Missing(
             code="approvals",
-            detail=f"{counted(rule.approvals, 'approval')} of the newest commit by others than the author are "
-            f"required; there are {len(approvals)}.",
+            detail=f"The newest commit needs {counted(rule.approvals, 'approval')} by users other than the author of "
+            f"the proposal; it has {len(approvals)}.",
         )
     yield from _missing_checks(rule, checks_of(tx, row))
 
