@@ -57,7 +57,7 @@ class FolderCommit:
     was: str | None
     """Version that was checked out in the folder when it was read, as stored in `dataset.folder_commit`."""
     partial: FolderManifest | None
-    """Record of the folder's entries after the commit, still with the commit before it.
+    """Manifest of the folder after the commit, except that its field `commit` still names the previous commit.
 
     None if a whole version is checked out in the folder.
     """
@@ -89,7 +89,7 @@ class PreparedCommit:
     recorded: str | None = None
     """Commit that an earlier request with the same `write_id` has recorded, so that nothing is left to do."""
     last_purge: int = 0
-    """Time of the last purge of the project before the commit was prepared."""
+    """Time in microseconds of the last purge of the project before the commit was prepared, 0 if there was none."""
 
 
 def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCreate) -> PreparedCommit:
@@ -280,7 +280,7 @@ def _require_checked_out(found: Row[Any], manifest: FolderManifest | None, paren
 def _from_folder(
     tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, head: str | None
 ) -> tuple[str, Contents, FolderCommit]:
-    """Store the tree of a new version, made from the items in the dataset's folder.
+    """Compute the tree of a new version from the items in the dataset's folder; its new chunks are added to `store`.
 
     If the branch has a newest commit `head`, the new tree is the tree of `head` with the changes of the folder since
     the checkout. Returns the digest of the root of the new tree, the content digests of the items, and the state of the

@@ -127,7 +127,7 @@ _PARTS = (
 
 
 def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
-    """Return SQL conditions that the parts of all wanted revisions meet, and perhaps parts of some others.
+    """Return SQL conditions that the parts of all wanted revisions meet, and perhaps parts of other revisions.
 
     Ids and numbers are compared separately, because SQLite would scan the whole table to compare pairs. So parts of
     other revisions can meet the conditions, too, if their id and their number each occur in `wanted`. Callers skip such

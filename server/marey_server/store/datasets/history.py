@@ -304,7 +304,8 @@ def shown_entry(entry: DatasetEntry, held: Mapping[str, tuple[str, int]]) -> Ent
 def revisions_with(tx: Transaction, project_id: str, contents: Iterable[str]) -> dict[str, tuple[str, int]]:
     """Find, for each content digest, a revision of the project that has this content.
 
-    A revision of a deleted item is used only if all items with the content are deleted.
+    The result maps content digests to item ids and revision numbers. Content digests without a revision are left out. A
+    revision of a deleted item is used only if all items with the content are deleted.
     """
     wanted = sorted(set(contents))
     found: dict[str, tuple[str, int]] = {}

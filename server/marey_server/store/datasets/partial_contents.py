@@ -51,7 +51,7 @@ Bases = Mapping[BasePlace, Base]
 
 
 def bases_named_in(received: Sequence[ReceivedRevision], take_bytes: Callable[[int], None]) -> set[BasePlace]:
-    """Return where the bases are that the partial arrays and array differences in received documents need.
+    """Return the places of the bases that the partial arrays and array differences in received documents need.
 
     `take_bytes` is called with the total size of the restored arrays, before they take memory. Raises `InvalidProblem`
     if a partial array or a difference is malformed, or if the restored arrays together are too large.

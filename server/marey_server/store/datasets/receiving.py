@@ -66,7 +66,7 @@ class LocalRevisions:
     documents: Mapping[str, Mapping[str, str]]
     """Digests of the revisions' documents: by the content digest of the revision, then by the name of the part."""
     last_purge: int
-    """Time of the last purge of the project before the revisions were found."""
+    """Time in microseconds of the last purge of the project before the revisions were found, 0 if there was none."""
     facets: Mapping[str, Mapping[str, float]]
     """Facets of the received revisions, by content digest."""
     bases: Bases
@@ -187,7 +187,7 @@ class PreparedReceipt:
     entries: int
     chunks: Mapping[str, bytes]
     last_purge: int
-    """Time of the last purge of the project before the receipt was prepared."""
+    """Time in microseconds of the last purge of the project before the receipt was prepared, 0 if there was none."""
 
 
 def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedCommit) -> PreparedReceipt:

@@ -56,15 +56,15 @@ class SelectedEntries:
     chunks: Mapping[str, bytes]
     """Chunks of the tree, by digest."""
     last_purge: int
-    """Time of the last purge of the project before the entries were selected."""
+    """Time in microseconds of the last purge of the project before the entries were selected, 0 if there was none."""
 
 
 def select_entries(tx: Transaction, project: str, name: str, request: CheckoutRequest) -> SelectedEntries | None:
     """Select the entries of a version that a checkout asks for; return None if it asks for the whole version.
 
     Raises `NotFoundProblem` if the version has no entry at one of the paths, and `BadRequestProblem` for a query that
-    cannot be read. Raises `InvalidProblem` if no entry is selected, or if too many entries must be compared with the
-    query.
+    is malformed or has a condition `like(...)`. Raises `InvalidProblem` if no entry is selected, or if too many entries
+    must be compared with the query.
     """
     if not request.partial:
         return None

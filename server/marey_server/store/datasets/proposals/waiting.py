@@ -75,7 +75,8 @@ class WaitingMerges:
         """Examine the next `EXAMINED_AT_ONCE` waiting proposals, and merge those that are ready.
 
         Returns the number of merged proposals. A proposal that another request changes meanwhile is examined again in
-        the next round. After an error with one proposal, the other proposals are still examined.
+        the next round. After an error with one proposal, the other proposals are still examined. Only
+        `UnavailableProblem` ends the call.
         """
         found = self._database.read(SYSTEM, _next_waiting, self._last)
         merged = sum(map(self._attempt_one, found))
