@@ -185,10 +185,10 @@ def revert_item(
 def change_item(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: ExpectedRev
 ) -> Item:
-    """Rename, move or tag an item.
+    """Rename or move an item, or replace its tags.
 
     Raises `ConflictProblem` if another item of the kind has the name in the collection, `ForbiddenProblem` if the
-    caller may not write to one of the two folders, and `PreconditionFailedProblem` if the item has changed.
+    caller may not write to the old or the new folder, and `PreconditionFailedProblem` if the item has changed.
     """
     project_row = projects.require(tx, project)
     rights = rights_of_caller(tx, project_row)

@@ -130,7 +130,7 @@ def permit_export(tx: Transaction, project: str, kind: Kind, item_id: str, overr
 def record_override(
     tx: Transaction, project_id: str, subject: str, override: ConsentOverride, ended: Collection[EndedConsent]
 ) -> None:
-    """Record in the audit log that the caller allows the export of clips whose consent has `ended`.
+    """Record in the audit log that the caller allows the export of the clips in `ended`.
 
     `subject` is the id of the job that exports the clips, or of the dataset or item that is exported.
     """

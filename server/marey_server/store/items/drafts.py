@@ -33,7 +33,7 @@ class Draft:
     * `by_name` adds a revision to the item that has the name; without such an item, it creates one.
     * `by_content` uses an item of the project whose required parts are equal; without such an item, it creates one.
 
-    With `same_skeleton`, nothing is published if the existing item of this name has another skeleton.
+    With `same_skeleton`, the draft is not published if the existing item of this name has another skeleton.
     """
 
     name_in_batch: str

@@ -1,4 +1,4 @@
-"""Publication of drafts: the only code that creates revisions."""
+"""Publication of drafts: creates items and new revisions of items, many of them with few SQL statements."""
 
 from __future__ import annotations
 
@@ -347,7 +347,10 @@ class _Publication:
         }  # fmt: skip
 
     def _reuse(self, one: _Ready, head: _Head) -> None:
-        """Use the existing item if it has the content of the draft; otherwise add a revision to it."""
+        """Use the existing item if it has the content of the draft; otherwise add a revision to it.
+
+        Does nothing if another write has changed the item since `head` was read; `add` then tries again.
+        """
         if one.draft.kind is Kind.CLIP and one.draft.reuse == "by_name":
             one = self._with_earlier_facts(one, head)
         if one.draft.reuse == "by_content" or one.digests.items() <= head.parts.items():

@@ -191,7 +191,10 @@ def _facets(rows: Iterable[Any]) -> dict[str, dict[str, float]]:
 def read_parts(
     tx: Transaction, revisions: Collection[tuple[str, int]]
 ) -> dict[tuple[str, int], dict[str, PartSummary]]:
-    """Return the parts of the given revisions, by item id and revision number."""
+    """Return the parts of the given revisions, by item id and revision number, then by name of the part.
+
+    The result may contain further revisions of the same items. Revisions that do not exist are left out.
+    """
     return _parts(tx.run(_PARTS, _keys_of(revisions)))
 
 

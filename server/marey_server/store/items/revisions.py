@@ -19,7 +19,10 @@ from marey_versions.records import RevisionKey
 
 
 def read_part_digests(tx: Transaction, revisions: Collection[tuple[str, int]]) -> dict[tuple[str, int], dict[str, str]]:
-    """Return the digest of each part of the given revisions (pairs of item id and number)."""
+    """Return, for each of the given revisions (item id and number), the digests of its documents by name of the part.
+
+    A revision that does not exist has an empty mapping.
+    """
     found: dict[tuple[str, int], dict[str, str]] = {one: {} for one in revisions}
     for some in in_lists(sorted(found)):
         ids, numbers = {item_id for item_id, _ in some}, {number for _, number in some}

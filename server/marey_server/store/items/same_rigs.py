@@ -25,7 +25,7 @@ from marey_server.store.transaction import Transaction
 Tree = dict[str, Any]
 
 SAME_NUMBER = 1e-5
-"""Greatest difference, caused by rounding in files, of equal offsets in metres and of equal quaternion components."""
+"""Difference, caused by rounding in files, up to which offsets (in metres) or quaternion components count as equal."""
 
 _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 

@@ -23,7 +23,7 @@ Tree = dict[str, Any]
 
 
 def without_skeleton_changes(tx: Transaction, project: ProjectRow, loaded: list[LoadedDraft]) -> list[LoadedDraft]:
-    """Prevent drafts with `same_skeleton` from changing the skeletons of existing items; return the changed drafts.
+    """Prevent drafts with `same_skeleton` from changing the skeletons of existing items; return the remaining drafts.
 
     If the skeletons of a draft and of the existing item are the same rig (`is_same_rig`), the draft refers to the
     skeleton of the item instead. It does not if the skeleton of the item is deleted. If the rigs are different, the

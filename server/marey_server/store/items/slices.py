@@ -20,12 +20,14 @@ Tree = dict[str, Any]
 def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | None, *, encoded: bool = False) -> Tree:
     """Cut a motion to a range of frames and a list of joints; the translation of the root is always kept.
 
+    Raises `InvalidProblem` if the range contains no frame, or if `joints` is empty or has an unknown or repeated name.
+
     Parameters
     ----------
     motion : document of schema marey/motion@1 with `EncodedArray` leaves
     frames : half-open range, clipped to the motion
     joints : names in the order of the result
-    encoded : whether the arrays of the result are `EncodedArray`, too
+    encoded : whether the arrays of the result are `EncodedArray`, too; otherwise they are numpy arrays
     """
     cut = dict(motion)
     poses: EncodedArray = motion["poses"]
