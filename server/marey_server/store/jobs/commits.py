@@ -67,8 +67,9 @@ def check_target(
 ) -> Target:
     """Check the commit of outputs that a submission requests, and return it in the form in which the job stores it.
 
-    Raises `InvalidProblem` with a JSON Pointer below `at` for an unknown dataset or branch, and for a job without
-    outputs to commit. Raises `ForbiddenProblem` or `ConflictProblem` if the caller may not commit to the branch.
+    `into` is the collection of the job's results. Raises `InvalidProblem` with a JSON Pointer below `at` for an unknown
+    dataset or branch, for a tag, for a kind of job that creates no items, and if the commit would replace the whole
+    dataset. Raises `ForbiddenProblem` or `ConflictProblem` if the caller may not commit to the branch.
     """
     if not scopes.allows(tx.principal.scopes, "write", project.name):
         raise ForbiddenProblem(
@@ -380,7 +381,7 @@ def _message(row: Any) -> str:
 
 
 def _mover(tx: Transaction, row: Any) -> Mover:
-    """Return the author of a job with the role that the author has now.
+    """Return the author of a job with the role that the author has now; the server itself counts as an owner.
 
     Raises `ForbiddenProblem` if the author is disabled, or may not write to the project any more.
     """

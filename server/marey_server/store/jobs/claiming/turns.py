@@ -235,7 +235,7 @@ _NOW = Prepared(
 
 
 def take_within_limit(tx: Transaction, turn: Turn, most: int, take: Take, *, may_wait: bool) -> list[Any]:
-    """Claim up to `most` jobs of a project, but not more than its limit allows.
+    """Claim up to `most` jobs of a project, but not more than its limit allows; return the rows of the claimed jobs.
 
     On Postgres, claims of a project with a limit run one after another: each claim locks the project, and then counts
     the running jobs again. With `may_wait`, the claim waits for the lock. Without it, nothing is claimed if another
