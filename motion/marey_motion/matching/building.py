@@ -203,7 +203,7 @@ def _built(
         try:
             for clip in _variants(prepare_clip(source, body, options, landmarks), body, options):
                 rows = clip_rows(clip.motion, clip.seam, body, layout, options)
-                yield _entry(clip), rows, (*clip.notes, *_row_notes(clip, rows))
+                yield _entry(clip), rows, (*clip.notes, *_row_notes(clip, rows, options))
         except MotionError as error:
             where = f"{source.name}, {error.where}" if error.where else source.name
             raise MotionError(error.message, code=error.code, where=where) from error
@@ -234,8 +234,9 @@ def _entry(clip: PreparedClip) -> DatabaseClip:
     )
 
 
-def _row_notes(clip: PreparedClip, rows: ClipRows) -> tuple[DatabaseNote, ...]:
-    if rows.selectable.any() or (clip.mirrored and not clip.notes):
+def _row_notes(clip: PreparedClip, rows: ClipRows, options: DatabaseOptions) -> tuple[DatabaseNote, ...]:
+    is_said_of_original = clip.mirrored and options.mirroring != "only"
+    if rows.selectable.any() or is_said_of_original:
         return ()
     length = counted(len(rows.selectable), "frame")
     message = f"{clip.source.name}: the clip has {length}, too few to look ahead, so none of its rows can be chosen"

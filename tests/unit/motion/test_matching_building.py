@@ -229,6 +229,11 @@ class TestFrames:
         assert [note.code for note in database.notes if note.clip] == ["too-short"]
         assert np.all(np.isfinite(database.features))
 
+    @pytest.mark.parametrize("mirroring", ["none", "add", "only"])
+    def test_a_clip_too_short_to_look_ahead_is_named_once(self, mirroring: str) -> None:
+        database = built(WALK.sliced(0, 5), DatabaseOptions.model_validate({"mirroring": mirroring}))
+        assert [note.code for note in database.notes if note.clip] == ["too-short"]
+
     def test_a_range_of_frames_is_that_part_of_the_clip(self) -> None:
         part, whole = built(WALK, frames=(30, 100)), built(WALK.sliced(30, 100))
         assert part.features.tobytes() == whole.features.tobytes()
