@@ -30,8 +30,9 @@ def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:
     MotionError    naming the example whose time function is not strictly increasing
     """
     slopes = np.diff(time_functions, axis=1)
-    if not (np.isfinite(slopes).all() and (slopes > 0.0).all()):
-        worst = int(np.argwhere(~(slopes > 0.0))[0, 0])
+    increasing = np.isfinite(slopes) & (slopes > 0.0)
+    if not increasing.all():
+        worst = int(np.argwhere(~increasing)[0, 0])
         raise MotionError(
             "a time function must be strictly increasing", code="time-function-invalid", where=f"example {worst}"
         )

@@ -137,8 +137,9 @@ def check_examples(aligned: AlignedSet) -> None:
         motion = clip.motion
         if motion.rotations.shape != shape or clip.time_function.shape != (frames,):
             raise ModelError(
-                f"the example has {motion.rotations.shape[0]} frames, but the others have {frames}; "
-                "align all examples together",
+                f"the example has {motion.frame_count} frames, {motion.rotations.shape[1]} joints and a time function "
+                f"of {len(clip.time_function)} frames, but the set has {frames} frames and {shape[1]} joints; align "
+                "all examples together",
                 where=clip.name,
             )
         if motion.translated_joints:

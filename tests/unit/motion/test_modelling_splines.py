@@ -76,9 +76,10 @@ def test_a_time_function_lasts_as_long_after_it_was_fitted(slopes: list[float]) 
     assert made == pytest.approx(times[-1], rel=1e-12)
 
 
-def test_a_time_function_that_stands_still_is_refused() -> None:
+@pytest.mark.parametrize("wrong", [7.0, 6.0, np.inf, np.nan])
+def test_a_time_function_that_stands_still_goes_back_or_is_not_finite_is_refused(wrong: float) -> None:
     times = np.arange(20.0)
-    times[8] = times[7]
+    times[8] = wrong
     with pytest.raises(MotionError, match="example 1"):
         fit_log_slopes(SplineBasis.clamped(19, 8), np.stack([np.arange(20.0), times]))
 

@@ -423,6 +423,7 @@ def test_examples_that_make_no_model_are_refused_by_name() -> None:
     back = odd.time_function.copy()
     back[5] = back[6]
     for members, told in (
+        ({"time_function": odd.time_function[:20]}, "a time function of 20 frames, but the set has 30 frames"),
         ({"motion": holes}, "not finite"),
         ({"motion": loose}, "bone_1 moves relative to its parent"),
         ({"motion": odd.motion.at_frames(np.arange(20))}, "20 frames"),
