@@ -227,9 +227,9 @@ def compare_pairs(
     found = np.empty((len(pairs), 1 + len(metric.components)))
     with ThreadPoolExecutor(threads) as pool:
         for done, distance in enumerate(pool.map(partial(_distance, clips, metric), pairs.tolist())):
-            if progress is not None:
-                progress(done, len(pairs), f"comparing {len(clips)} clips")
             found[done] = distance.total, *distance.by_component
+            if progress is not None:
+                progress(done + 1, len(pairs), f"comparing {len(clips)} clips")
     return found
 
 

@@ -106,6 +106,12 @@ def test_a_table_has_the_distances_of_the_pairs_and_nearer_speeds_are_nearer() -
     np.testing.assert_allclose(found.by_component[0], found.totals)
 
 
+def test_progress_counts_the_pairs_that_are_done() -> None:
+    clips, seen = [comparable(gait).compared for gait in gaits()], []
+    compare_clips(clips, METRIC, progress=lambda done, total, _note: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
 def test_loops_are_cut_once_and_whole_clips_are_kept() -> None:
     (gait, *_) = gaits()
     cut = comparable(gait)
