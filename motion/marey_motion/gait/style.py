@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from marey_motion.arrays import AnyFloats
+from marey_motion.errors import MotionError
 
 GRAVITY_M_S2 = 9.81
 STEERING_RADIUS_M = 0.3  # turning on the spot needs steps like walking at this radius
@@ -47,6 +48,12 @@ class GaitStyle:
     arm_swing: float = 1.0
     wander: float = 0.0
     wander_phases_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not self.stride > 0.0:
+            raise MotionError(
+                f"the factor of strides must be above 0, not {self.stride}", code="gait-invalid", where="stride"
+            )
 
     @classmethod
     def varied(cls, seed: int) -> GaitStyle:

@@ -234,6 +234,12 @@ def test_a_smaller_body_walks_the_same_path() -> None:
     assert kinematics.global_positions(small, end_sites=True)[..., 1].min() > 0.0134
 
 
+@pytest.mark.parametrize("stride", [0.0, -1.0, float("nan")])
+def test_strides_need_a_length(stride: float) -> None:
+    with pytest.raises(MotionError, match="strides must be above 0"):
+        GaitStyle(stride=stride)
+
+
 def test_the_same_arguments_give_the_same_bytes_and_other_styles_others() -> None:
     def bytes_of(seed: int) -> bytes:
         return generate_gait(1.4, 0.3, 3.0, style=GaitStyle.varied(seed)).poses.tobytes()
