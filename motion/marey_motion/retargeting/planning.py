@@ -234,8 +234,9 @@ def _check_enough(pairs: tuple[JointPair, ...], source_mapping: JointMapping, ta
         missing = [name for name in ESSENTIAL_JOINTS if name not in mapping.joints]
         if missing:
             lacks.append(f"the {which} skeleton's mapping has no {', '.join(missing)}")
+    told = "; ".join(lacks) or "the target skeleton's mapping names one joint for several standard joints"
     raise MappingError(
-        f"too few joints are mapped to retarget: {'; '.join(lacks)}. Add them to the joint mappings; both "
+        f"too few joints are mapped to retarget: {told}. Correct the joint mappings; both "
         f"skeletons must map the pelvis and at least {FEWEST_ESSENTIAL - 1} of the other essential joints",
         code="mapping-too-small",
         where="mapping",

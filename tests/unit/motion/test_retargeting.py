@@ -522,7 +522,15 @@ def test_too_small_a_mapping_is_refused_with_what_is_missing(studio: Actor, game
         )
     assert "target skeleton's mapping has no left_knee" in str(error.value)
     assert "source" not in str(error.value)
-    assert "Add them to the joint mappings" in str(error.value)
+    assert "Correct the joint mappings" in str(error.value)
+
+
+def test_a_mapping_with_one_joint_for_most_standard_joints_is_refused(studio: Actor, game: Actor) -> None:
+    pelvis = game.mapping.joints["pelvis"]
+    same = {name: joint if name == "head" else pelvis for name, joint in game.mapping.joints.items()}
+    mapped = SimpleNamespace(skeleton=game.skeleton, mapping=replace(game.mapping, joints=same), axes=game.axes)
+    with pytest.raises(MappingError, match="names one joint for several standard joints"):
+        plan_between(studio, mapped, scale=1.0)
 
 
 @pytest.mark.parametrize(("kept", "without"), [("keep_feet", "left_knee"), ("keep_hands", "right_elbow")])
