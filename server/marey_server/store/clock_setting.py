@@ -52,7 +52,8 @@ class StoredClock:
 
     def __str__(self) -> str:
         stored, wall = (f"{datetime_of(us):%Y-%m-%d %H:%M:%SZ}" for us in (self.stored_us, self.wall_us))
-        return f"the database was last used at {stored if self.stored_us else 'no time'}; this machine says {wall}"
+        used = f"last used at {stored}" if self.stored_us else "never used"
+        return f"the database was {used}; this machine says {wall}"
 
 
 def read_clock(connection: Connection) -> StoredClock:
