@@ -17,7 +17,10 @@ PER_RIG = 10_000_000
 """Work, in nanoseconds, to find the limbs of a skeleton and the axes about which the limbs bend."""
 PER_PLANTED_NUMBER = 600
 PER_TAP, MOST_OF_TAPS = 0.35, 200.0
-"""Work of a moving mean for each value of the motion, in nanoseconds: per frame of the window, and its upper limit."""
+"""Work of a moving mean for each value of the motion, in nanoseconds.
+
+The first number is the work per frame of the window; the second is the upper limit for the whole window.
+"""
 PER_COMPARED_POSES = 4_000
 """Work, in nanoseconds, to compute the perceptual distance of two poses."""
 PER_CONSTRAINT_GROUP, PER_CONSTRAINED_NUMBER = 1_000_000, 10

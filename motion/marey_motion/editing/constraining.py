@@ -37,7 +37,7 @@ from marey_schemas.editing.constraints import Solver
 MOST_ROUNDS = 12
 """Maximum number of rounds in which constraints on different ranges of frames are solved one after another."""
 SMALL_ERROR = 1e-3
-"""Error, in metres or radians, below which all constraints must be for the rounds to end early."""
+"""The rounds end early if the error of every constraint is below this value, in metres or radians."""
 _PER_FRAME = 40_000
 """Work per frame, in nanoseconds, to prepare the arrays, measure the errors and evaluate closed forms."""
 _LIMIT_PASSES = 4
@@ -300,7 +300,7 @@ class _Cluster:
         neighbours: Neighbours,
         solved: Callable[[Motion, Sequence[Target], Neighbours], Motion],
     ) -> Motion:
-        """Replace the solution in runs of frames in which the limb jumps by the solution for smoother targets.
+        """Smooth the limb's path in runs of frames in which the limb jumps, and solve these runs for the smoother path.
 
         `given` is the motion before it is solved, and `made` is the solution for `targets`. Returns `made` if the
         position target has a pole or an offset.

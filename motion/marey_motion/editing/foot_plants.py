@@ -43,7 +43,7 @@ SHORTEST_LOWERING_M = 1e-9
 
 @dataclass(frozen=True)
 class Foot:
-    """One foot: its leg and its toe joint, or the ankle if the skeleton has no toe joint."""
+    """One foot: its leg, and its toe joint or, if no toe joint is mapped, its ankle."""
 
     leg: TwoBoneLimb
     toe: int

@@ -167,8 +167,8 @@ def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_
 def _with_kept_feet(take: Take, first: Motion, second: Motion, joined: Motion, overlap: int, count: int) -> Motion:
     """Join the paths of the feet like the path of the root, and keep the soles above the lower floor of the two clips.
 
-    A foot that is planted just before and just after the seam stays in place. With its next step, it moves to its
-    place in the second clip.
+    Without an overlap, a foot that is planted just before and just after the seam stays in place; with its next step,
+    the foot moves to its place in the second clip (see `_with_held_stances`).
     """
     feet = feet_of(take)
     if not feet:
@@ -191,7 +191,9 @@ def _with_kept_feet(take: Take, first: Motion, second: Motion, joined: Motion, o
 def _with_held_stances(
     take: Take, tracks: Sequence[Motion], wanted: Motion, feet: Sequence[Foot], count: int
 ) -> tuple[Motion, int]:
-    """Hold each foot that is planted just before and just after the seam in place until its stance ends.
+    """Keep each foot in place until its stance ends, if the foot is planted just before and just after the seam.
+
+    A foot is not kept in place if it exceeds one of the limits `FARTHEST_HELD_M` and `LONGEST_HELD_S`.
 
     `tracks` are the paths of the feet in the first and in the second clip. Returns the new paths of the feet, and the
     number of frames after the seam in which the new paths may differ from those of the second clip.

@@ -134,8 +134,8 @@ class LimbSmoother:
         """Slow down the turns of the path of the limb's end, and lead the path round the limb's first joint.
 
         `vectors` (n, 3) are the positions of the path relative to the first joint; `jumps` (n,) are the frames next to
-        a jump. From `width` frames before to `width` frames after each such frame, and each frame in which the limb
-        would have to fold too far, the direction changes evenly, and the distance is at least that of the folded limb.
+        a jump. Up to `width` frames away from these frames, and from frames in which the limb would have to fold too
+        far, the direction changes evenly, and the distance is at least that of the folded limb.
         """
         from scipy.ndimage import maximum_filter1d
 
@@ -167,7 +167,7 @@ class LimbSmoother:
 
 
 def _directions(vectors: Floats, otherwise: Floats) -> Floats:
-    """Compute the unit directions (..., 3) of vectors; a vector of length zero is replaced by that of `otherwise`."""
+    """Compute the unit directions (..., 3) of vectors; a vector of `otherwise` replaces each vector of length zero."""
     vectors = np.where(np.linalg.norm(vectors, axis=-1, keepdims=True) > 1e-6, vectors, otherwise)
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))
 

@@ -111,7 +111,8 @@ def scale(take: Take, command: Scale) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    command : Scale    the factor, and whether it scales the translations of other joints, too
+    command : Scale    the factor, and whether to scale also the translations of joints other than the
+        pelvis and its ancestors
 
     Returns
     -------

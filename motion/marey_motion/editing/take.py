@@ -61,7 +61,7 @@ class EditedBody:
 
     @cached_property
     def carrier(self) -> int:
-        """Index of the joint that carries the whole body (`MatchingBody.carrier`); the root if no joints are mapped."""
+        """Index of the joint that carries the body (`MatchingBody.carrier`); the root if `matching` raises an error."""
         try:
             return self.matching.carrier
         except MappingError:

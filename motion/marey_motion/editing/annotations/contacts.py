@@ -108,7 +108,10 @@ def contact_labels(points: Floats, rate_hz: float) -> NDArray[np.bool_]:
 
 
 def _with_hysteresis(values: Floats, low: float, high: float) -> NDArray[np.bool_]:
-    """Compute a mask (F,) that is true from where the values fall below `low` until they rise above `high`."""
+    """Compute a mask (F,) that is true from where the values fall below `low` until they rise above `high`.
+
+    The mask is also true before the first value outside these limits.
+    """
     decided = (values < low) | (values > high)
     latest = np.maximum.accumulate(np.where(decided, np.arange(len(values)), -1))
     return np.asarray(np.where(latest >= 0, values[latest] < low, values < high))

@@ -45,7 +45,7 @@ class Layer:
 
     Raises
     ------
-    AnnotationError    if a segment or keyframe is invalid; the error names it
+    AnnotationError    if the clip has no frames, or if a segment or keyframe is invalid (the error names it)
     """
 
     frame_count: int
@@ -174,7 +174,7 @@ def _moment(keyframe: Keyframe) -> tuple[int, str]:
 
 
 def require_segments(segments: Sequence[Segment], frame_count: int) -> None:
-    """Check that segments are inside the clip and not empty, and that neighbours do not overlap.
+    """Check that segments have valid labels, are inside the clip and not empty, and do not overlap their neighbours.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def require_segments(segments: Sequence[Segment], frame_count: int) -> None:
 
 
 def _require_keyframes(keyframes: Sequence[Keyframe], frame_count: int) -> None:
-    """Raise `AnnotationError` if a keyframe is outside the clip or repeated."""
+    """Raise `AnnotationError` if a keyframe has an invalid label, is outside the clip or is repeated."""
     for keyframe in keyframes:
         _require_label(keyframe.label, str(keyframe))
         if not 0 <= keyframe.frame < frame_count:

@@ -78,7 +78,7 @@ def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposa
 
     Returns
     -------
-    Layer    the proposal; an empty layer if the wrist never moves `options.least_reach_m` away from rest
+    Layer    the proposal; movements that stay closer to rest than `options.least_reach_m` have no segment
 
     Raises
     ------
