@@ -290,10 +290,10 @@ def _descend_frame(body, targets, frame, offsets, ends, carried, local, root, be
 def descend(body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found):
     """Solve the frames `order` (n,) in this order; change `rotations` (F, K, 4) and fill the `SolverResult` `found`.
 
-    `given_rotations` and `given_roots` are the poses of all frames before they were solved. If `carried[i]` is at least
-    0, frame `order[i]` is solved from its given pose, changed as frame `carried[i]` was changed; otherwise, it is
-    solved from its given pose. `ends` holds the three stopping criteria: the maximum number of sweeps, and the
-    tolerances in metres and in radians.
+    `given_rotations` and `given_roots` are the poses of all frames before they were solved. The solver starts from the
+    given pose of frame `order[i]`. If `carried[i]` is at least 0, the change from the given to the solved pose of frame
+    `carried[i]` is first applied to this pose. `ends` holds the three stopping criteria: the maximum number of sweeps,
+    and the tolerances in metres and in radians.
     """
     best = np.empty(rotations.shape[1:])
     for n in range(order.shape[0]):

@@ -307,10 +307,10 @@ def _solve_frame(body, targets, frame, offsets, ends, carried, local, root, work
 def solve_frames(body, targets, ends, given_rotations, given_roots, order, carried, roots, rotations, work, found):
     """Solve the frames `order` (n,) in this order; change `roots` (F, 3) and `rotations` (F, K, 4) in place.
 
-    `given_rotations` and `given_roots` are the poses of all frames before they were solved. If `carried[i]` is at least
-    0, frame `order[i]` is solved from its given pose, changed as frame `carried[i]` was changed; otherwise, it is
-    solved from its given pose. Also fills the `SolverResult` `found`. `ends` holds the three stopping criteria: the
-    maximum number of steps, and the tolerances in metres and in radians.
+    `given_rotations` and `given_roots` are the poses of all frames before they were solved. The solver starts from the
+    given pose of frame `order[i]`. If `carried[i]` is at least 0, the change from the given to the solved pose of frame
+    `carried[i]` is first applied to this pose. Also fills the `SolverResult` `found`. `ends` holds the three stopping
+    criteria: the maximum number of steps, and the tolerances in metres and in radians.
     """
     for n in range(order.shape[0]):
         f, other = order[n], carried[n]

@@ -88,7 +88,7 @@ def straight_hinge(
 
     Returns
     -------
-    axes : JointAxes    axes whose swing axis bends a limb
+    axes : JointAxes    the given axes; for an elbow, the swing axis is reversed, so that positive angles bend the limb
     reference : (4,) float64    local rotation at angle 0
     """
     rest = skeleton.rest_rotations[joint].astype(np.float64)

@@ -2,9 +2,12 @@
 
 There are three solvers. Without `Neighbours`, a solver solves frames independently: the result for a frame does not
 depend on other frames. With `Neighbours`, joints move smoothly from frame to frame, as far as the targets leave a
-choice. No solver returns a pose with a larger error than the given pose. The error is the weighted sum of the squared
-errors of all targets; an angle counts as `ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, the
-pose is brought within the limits before the comparison.
+choice.
+
+Without `Neighbours`, no solver returns a pose with a larger error than the given pose; with `Neighbours`, only the
+two-bone solver guarantees this. The error is the weighted sum of the squared errors of all targets; an angle counts as
+`ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, the pose is brought within the limits before the
+comparison.
 """
 
 from __future__ import annotations
@@ -286,7 +289,7 @@ def solve_two_bone(
 
     Raises
     ------
-    EditError    if the joints form no limb, or the targets do not belong to the limb's end
+    EditError    if the joints form no limb, if a target is not for the limb's end, or if `position` leaves an axis free
     """
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 

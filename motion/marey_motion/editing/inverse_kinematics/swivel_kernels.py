@@ -75,8 +75,8 @@ def fill_upper_bones(limb, body, roots, rotations, work, bones):
 def pole_swivels(limb, body, roots, after, pole, work, angles, weights):
     """Fill `angles` (F,): the swivels, in radians, that direct the middle joint of a limb to the point `pole`.
 
-    `pole` (3,) is in the world, in metres. Also fills `weights` (F,), from 0 (no direction across the limb
-    leads to the point, or the limb is straight) to 1. The other parameters are those of `measure_swivels`.
+    `pole` (3,) is in the world, in metres. Also fills `weights` (F,), from 0 to 1; a weight is 0 if the point is on the
+    line through the limb's ends, or if the limb is straight. The other parameters are those of `measure_swivels`.
     """
     for f in range(after.shape[0]):
         offsets = body.offsets[min(f, body.offsets.shape[0] - 1)]

@@ -28,7 +28,8 @@ def swivel_coherently(
 ) -> None:
     """Swivel a solved limb so that its middle joint moves smoothly; changes the rotations of `problem`.
 
-    A run of frames stays as it is if the swivels would not slow down the fastest movement of the limb in this run.
+    Without a pole, a run of frames stays as it is if the limb swivels by at most `COHERENT_RAD` between two frames, or
+    if the correction would not slow down the fastest movement of the limb in this run.
 
     Parameters
     ----------
@@ -68,10 +69,10 @@ def swivel_coherently(
 
 
 def _limb_speeds(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floats, Floats]:
-    """Compute two speeds (F - 1,), in radians per frame: of the upper bone in the world, and of its joint in the limb.
+    """Compute the speed (F - 1,) of the upper bone's direction in the world, and of the first joint's local rotation.
 
-    The speed of the bone does not include a twist of a straight limb. The speed of the joint, computed from its local
-    rotation, does not include a rotation of the body.
+    Both are in radians per frame. The speed of the bone does not include a twist of a straight limb, and the speed of
+    the joint does not include a rotation of the body.
     """
     from marey_motion.editing.inverse_kinematics import swivel_kernels
 
