@@ -25,7 +25,10 @@ from marey_schemas.options.evaluation import EvaluationOptions, Grid, settling_s
 
 REGIMES = ("approach", "base", "switched")
 RESPONSE_SHARE = 0.1
-"""A desired speed counts as reached if the error stays below this share of that speed for `RESPONSE_HOLD_S` seconds."""
+"""A desired speed counts as reached if the error stays below this share of that speed for `RESPONSE_HOLD_S` seconds.
+
+At a stop, the limit is this share of the greatest desired speed in the trial.
+"""
 RESPONSE_HOLD_S = 0.5
 """Seconds for which the error must stay below `RESPONSE_SHARE` for the speed to count as reached."""
 
@@ -295,7 +298,10 @@ def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | N
 
 
 def _censored_median(answered: Sequence[float], count: int) -> float | None:
-    """Compute the median of `count` times, of which only the `answered` ones are known and all others are longer."""
+    """Compute the median of `count` times, of which only the `answered` ones are known and all others are longer.
+
+    Returns None if there are no times, or if the median depends on an unknown time.
+    """
     middle = sorted(answered)[(count - 1) // 2 : count // 2 + 1] if count else []
     return float(np.mean(middle)) if len(middle) == 1 + (count + 1) % 2 else None
 

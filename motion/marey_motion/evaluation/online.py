@@ -81,6 +81,10 @@ class OnlineCoverage:
     ----------
     frame_count : frames received, over all takes
     counts : (V, O) int64    windows of this performance in each cell
+
+    Raises
+    ------
+    MotionError    if the frame rate is out of range, the grid has too many cells, or `seconds` has another shape
     """
 
     def __init__(
@@ -218,7 +222,7 @@ class OnlineCoverage:
     def targets(self, count: int, *, path_s: float = TARGET_PATH_S) -> tuple[Target, ...]:
         """List cells that lack data, the cell nearest to the performer's current speed and turn rate first.
 
-        Distances are counted in cells. Outside a take, distances are measured from standing still.
+        Distances are counted in cells. Before the first window of a take, they are measured from standing still.
 
         Parameters
         ----------

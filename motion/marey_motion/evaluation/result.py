@@ -170,13 +170,13 @@ class EvaluationResult:
     Parameters
     ----------
     trials : metrics of each trial; if there are replicates, the means over the replicates
-    suite : pooled metrics over all trials, and by family under "circle.…" and "switching.…"; if there are replicates,
-        the means of the values of the replicates
+    suite : pooled metrics over all trials, and over each family under names such as "circle.offset_mean"; if there are
+        replicates, the means of the values of the replicates
     usage : use of each clip, in the order of `clips`
     switches : (S, 3) int64    for each pair of rows between which the suite jumped: the row before the jump, the
         row after it, and the number of these jumps; ordered by the first two
-    records : simulated ticks of each trial, in the order of `trials`; if there are replicates, of the first one.
-        `switches` are counted over these ticks, and `usage` over those of all replicates
+    records : simulated ticks of each trial, in the order of `trials`; if there are replicates, of the first one; empty
+        if they were not read. `switches` are counted over these ticks, and `usage` over those of all replicates
     replicates : metrics of each replicate; None if there is only one
     perceived : perceptual distances of the jumps; None if no perceptual metric was chosen
     notes : remarks on data that were left out or look doubtful

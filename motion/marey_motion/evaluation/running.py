@@ -27,7 +27,7 @@ def run_each(
     threads: int,
     cancelled: CancelCallback,
 ) -> None:
-    """Call a function for many items on several threads, and pass on each result at once, so that few are in memory.
+    """Call a function for many items on several threads, and pass each result to `keep` as soon as it is ready.
 
     Parameters
     ----------

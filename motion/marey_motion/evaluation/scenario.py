@@ -203,7 +203,7 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
 
     Raises
     ------
-    MotionError    if the trial has no ticks, or if the interval between its speed switches is not positive
+    MotionError    if the trial has no ticks, or if the time between its changes of speed or direction is not positive
     """
     tick_count = round((trial.approach_s + trial.duration_s) * rate_hz)
     if tick_count < 1 or trial.approach_s < 0.0 or trial.duration_s < 0.0:
@@ -213,7 +213,7 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
             where=trial.name,
         )
     if (every_s := trial.changes_every_s) is not None and not every_s > 0.0:
-        raise MotionError("the interval between speed switches must be longer than 0 s", where=trial.name)
+        raise MotionError("the time between changes of speed or direction must be above 0 s", where=trial.name)
     times = np.arange(tick_count + int(np.ceil(look_ahead_s * rate_hz))) / rate_hz
     if trial.path:
         return _along_keys(trial, times, rate_hz, tick_count)

@@ -191,7 +191,8 @@ def evaluate(
     Raises
     ------
     EvaluationCancelled    if cancelled
-    MotionError    if two trials have the same name, or if no clip is suitable for the requested trials along takes
+    MotionError    if two trials have the same name, if no clip is suitable for the requested trials along takes, or if
+        no clip of the baseline can be generated
     """
     trials = (*suite_trials(options), *take_trials(database, options))
     index = index_of(database)
@@ -254,6 +255,7 @@ def evaluate_baseline(
     Raises
     ------
     EvaluationCancelled    if cancelled
+    MotionError    if no clip can be generated for any speed and turn rate of the grid
     """
     families = tuple(family for family in options.families if family != "takes")
     options = options.replace(replicates=baseline_replicates(options), families=families)

@@ -175,8 +175,8 @@ class ClipGraph:
     ----------
     counts : number of jumps for each pair (clip left, clip entered), in ascending order of the pairs; both may be the
         same clip
-    components : strongly connected components of the displayed clips; the largest comes first, then the one with the
-        lowest index
+    components : strongly connected components of the displayed clips, from the largest to the smallest; of equally
+        large components, the one with the lowest clip index comes first
     dead_ends : components that were entered and never left
     """
 

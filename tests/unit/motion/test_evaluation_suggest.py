@@ -219,8 +219,8 @@ def test_the_reason_for_a_filling_says_where_most_of_it_is_missing(turn_rate_deg
     cells = (FilledCell(1.5, turn_rate_deg_s, 0.9, 1.0), FilledCell(1.0, 0.0, 0.1, 0.5))
     filling = Filling("runs", "a@1", "a", 4.0, cells, 1.0, 0.25, 40, False, 0.25, 0.5)
     assert why_filling(filling) == (
-        f"“a” from runs contains 1.0 s of the missing data, most of it at 1.5 m/s {where}; 25 % of it can be blended "
-        "with the set."
+        f"“a” from runs contains 1.0 s of the missing data, the largest part at 1.5 m/s {where}; 25 % of it can be "
+        "blended with the set."
     )
 
 

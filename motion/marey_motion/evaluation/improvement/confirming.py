@@ -38,7 +38,7 @@ class Confirmed:
     ----------
     chance : standard deviation of each headline metric over these replicates, for the unchanged set
     unused : effect of removing all unused clips; None if there are none
-    ranges : effect of removing all unused clips and ranges, compared with the unchanged set; None if there are none
+    ranges : effect of removing all unused clips and ranges, compared with the unchanged set; None without ranges
     plan : planned removals with their confirmed effects
     additions : clips to add; the first ones with their confirmed effects
     """
@@ -195,5 +195,5 @@ def _plan_effects(
 
 
 def _with_effects(steps: Sequence[Step], effects: Iterator[Effect]) -> tuple[Step, ...]:
-    """Return copies of the steps with their confirmed effects, of which each step takes the next one of `effects`."""
+    """Return copies of the steps; the confirmed effect of each step is the next one of the iterator `effects`."""
     return tuple(replace(step, confirmed=next(effects)) for step in steps)

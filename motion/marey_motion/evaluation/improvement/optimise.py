@@ -228,7 +228,7 @@ class _Search:
     def best_step(self, last: OptimisationStep, progress: ProgressCallback | None) -> OptimisationStep | None:
         """Choose the step, after the step `last`, that lowers the objective most.
 
-        Returns None if no step lowers the objective enough, or if the budget is spent.
+        Returns None if no step lowers the objective enough, if no gain is confirmed, or if the budget is spent.
         """
         self.refused = []
         found: list[_Candidate] = []

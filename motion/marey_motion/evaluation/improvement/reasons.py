@@ -161,7 +161,7 @@ def why_filling(filling: Filling, defects: Defects | None = None) -> str:
 
 def _gain_in_words(filling: Filling) -> str:
     gain = f"“{filling.name}” from {filling.collection} contains {filling.filled_s:.1f} s of the missing data"
-    where = f"most of it at {_cell_in_words(filling.cells[0])}"
+    where = f"the largest part at {_cell_in_words(filling.cells[0])}"
     if filling.needs_retarget:
         return f"{gain}, {where}; it has another skeleton and must be retargeted first."
     return f"{gain}, {where}; {100 * (filling.blendable_share or 0.0):.0f} % of it can be blended with the set."

@@ -16,7 +16,7 @@ ProgressCallback = Callable[[int, int, str], None]
 TRIED_AGAIN = 12
 """Number of clips that each step of a plan tries, except the first step.
 
-The order of harm changes little from step to step, and trying all clips in each step took most of the time.
+The order of harm changes little from step to step, and trying all clips in each step would take most of the time.
 """
 
 
@@ -103,7 +103,7 @@ def leave_one_out(
 
     Returns
     -------
-    tuple of Removal    one per source
+    tuple of Removal    one per source tried; a source without which no row can be chosen is not tried
     """
     gone = frozenset(removed)
     counts = simulation.trials_needing(gone)

@@ -28,7 +28,7 @@ from marey_schemas.documents.replicates import LEAST_REPLICATES, student_quantil
 PERCENT, PERCENT_OF_FEW = 95, 75
 """Least percentage of repetitions whose change lies in the interval: in general, and if few runs changed.
 
-In simulations with any size of jumps, these were at least 97 and 76 % (docs/decisions/0094).
+In simulations with any size of jumps, the percentages were at least 97 and 76 % (docs/decisions/0094).
 """
 FEW_RUNS = 8
 """Number of changed runs below which the lower percentage applies."""

@@ -46,7 +46,7 @@ from marey_schemas.options.improvement import SuggestionOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 USUAL_BLENDABLE_M = 0.5
-"""Distance up to which poses count as blendable if the suite made no transition that shows this distance.
+"""Distance up to which poses count as blendable if the options set none and the suite made no transition.
 
 The distance is a pose cost, in metres, summed over seven joints.
 """

@@ -114,7 +114,7 @@ def sweep_weights(
     settings : sequence of FeatureWeights    weights to try
     how : SweepOptions    objective that rates each setting, and replicates
     trials : sequence of Trial, optional    trials to run; all trials of the suite if None
-    threads : int, optional    number of trials to run at once
+    threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
 
