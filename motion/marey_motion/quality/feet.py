@@ -158,7 +158,7 @@ def skate_by_contact(feet: Feet) -> float | None:
 
 
 def skate_ratio(feet: Feet, options: QualityOptions) -> float | None:
-    """Compute the share of the steps with a toe near the floor in which this toe skates.
+    """Compute the skate ratio: of the steps in which a toe is near the floor, the share in which this toe skates.
 
     Parameters
     ----------

@@ -117,7 +117,8 @@ def measure_quality(
 
     Returns
     -------
-    ClipQuality    the measures, after resampling to the rate of the options
+    ClipQuality    the measures, after resampling to the rate of the options; penetration and excess of joint limits are
+        measured in all frames, without resampling
 
     Raises
     ------

@@ -14,7 +14,7 @@ from marey_schemas.documents.evaluations import CONFIDENCE
 from marey_schemas.documents.quality import LEAST_TAKES
 
 DRAWN_AT_ONCE = 4_000_000
-"""Maximum number of cells of the table of draws by takes that is in memory at a time."""
+"""Maximum number of cells in memory at a time, of the table with a row for each draw and a column for each take."""
 
 
 class MeanOverClips(NamedTuple):
