@@ -52,7 +52,7 @@ class Blobs:
     def put_file(self, path: str | Path, *, digest: str | None = None) -> str:
         """Stream a file to the server and return its digest; a large file is sent as a resumable upload.
 
-        Raises `FileChanged` if the length of the file changes while it is sent.
+        Raises `FileChanged` if a large file becomes shorter while it is sent, or if the length of another file changes.
         """
         path = Path(path)
         name = digest or digest_of_file(path)
@@ -96,7 +96,10 @@ class Blobs:
         return target
 
     def fetch_into(self, digest: str, file: BufferedRandom) -> None:
-        """Download a blob into an empty file that is open for reading and writing; its position is then at the end."""
+        """Download a blob into an empty file that is open for reading and writing; its position is then at the end.
+
+        Raises `DigestMismatch` if the received bytes have another digest.
+        """
 
         def once() -> None:
             start = file.tell()

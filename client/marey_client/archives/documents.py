@@ -109,7 +109,7 @@ class DocumentWriter:
             self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
 
     def _files(self, digest: str, body: Any) -> set[str]:
-        """Return the digests of the files that a document names and the document that it replaced did not name."""
+        """Return the digests of the files that a document names, without files that the replaced document names."""
         named = _files_in(body)
         if named and digest in self.earlier:
             place = self.earlier[digest].place

@@ -198,12 +198,12 @@ class _Import:
                 self._send(together)
 
     def _references(self, content: str) -> set[str]:
-        """Return the revisions to which those documents of a revision refer that the project does not have yet."""
+        """Return the digests of the revisions to which a revision refers in documents that the project lacks."""
         documents = [digest for digest in self._revision(content).parts.values() if not self._is_stored(digest)]
         return {one for digest in documents for one in contents_in(self._document(digest))}
 
     def _missing(self, contents: list[str]) -> list[str]:
-        """Ask the server which revisions the project lacks, and return these; record all others in `present`."""
+        """Ask the server which revisions the project lacks; return these, and record the other ones in `present`."""
         missing = []
         for some in batched(contents, MOST_CONTENTS):
             request = ContentsRequest(revisions=tuple(some))

@@ -109,11 +109,11 @@ def write_archive(
 def write_transfer(
     dataset: DatasetReader, commits: Sequence[Commit], path: Path, on_progress: OnProgress, *, differences: bool
 ) -> None:
-    """Write and check an archive of `commits`, newest first, for a server that has all their other ancestors.
+    """Write and check an archive of `commits`, newest first, for a server that has all commits before them.
 
-    With `differences`, arrays may be replaced by their differences from arrays of these ancestors; then only this
-    server can read the archive. Continues after an interruption as `write_archive` does. Raises `LargeCommit`, before
-    documents are read, if a commit has more changes than servers accept. Consents are not checked.
+    With `differences`, arrays may be replaced by their differences from arrays of the commits before them; then only
+    this server can read the archive. Continues after an interruption as `write_archive` does. Raises `LargeCommit`,
+    before documents are read, if a commit has more changes than servers accept. Consents are not checked.
     """
 
     def fill(writer: ArchiveWriter) -> None:
@@ -203,7 +203,7 @@ def _is_at(path: Path, file: BinaryIO) -> bool:
 
 
 def _history(dataset: DatasetReader, head: Commit, known: Mapping[str, Commit]) -> dict[str, Commit]:
-    """Read the commit `head` and its ancestors, back to the commits `known`; return all of them by digest."""
+    """Read the commit `head` and its ancestors, back to the commits `known`; return the read commits and `known`."""
     found = dict(known)
     waiting = [head.digest]
     while waiting:

@@ -30,7 +30,7 @@ class AsyncBlobs(Counterpart):
     async def put_file(self, path: str | Path, *, digest: str | None = None) -> str:
         """Stream a file to the server and return its digest; a large file is sent as a resumable upload.
 
-        Raises `FileChanged` if the length of the file changes while it is sent.
+        Raises `FileChanged` if a large file becomes shorter while it is sent, or if the length of another file changes.
         """
         return await self._run(self._sync.put_file, path, digest=digest)
 
@@ -46,5 +46,8 @@ class AsyncBlobs(Counterpart):
         return await self._run(self._sync.fetch_to, digest, target)
 
     async def fetch_into(self, digest: str, file: BufferedRandom) -> None:
-        """Download a blob into an empty file that is open for reading and writing; its position is then at the end."""
+        """Download a blob into an empty file that is open for reading and writing; its position is then at the end.
+
+        Raises `DigestMismatch` if the received bytes have another digest.
+        """
         await self._run(self._sync.fetch_into, digest, file)

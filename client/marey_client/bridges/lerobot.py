@@ -112,7 +112,7 @@ def prepare_lerobot(
 def write_lerobot(version: VersionToExport, target: Path, on_progress: OnProgress) -> ExportedVersion:
     """Write a version to a new folder as a LeRobotDataset.
 
-    Raises `CannotExport` if the clips do not have the same skeleton and frame rate.
+    Raises `CannotExport` if the clips differ in skeleton, joints with positions or frame rate.
     """
     identity = version.identity.model_dump(mode="json", exclude_none=True)
     with new_folder(target) as folder:
@@ -171,9 +171,9 @@ class _Writing:
     def _refusal(self, differing: Sequence[str]) -> str:
         assert self.rig is not None
         return (
-            "all clips of a LeRobotDataset need the same skeleton and frame rate, but these differ from "
-            f"{self.first} ({self.rig.rate_hz:g} Hz): {listed(differing)}; retarget clips with another skeleton (marey "
-            "retarget), resample clips with another frame rate (marey edit), commit the results, and export them"
+            "all clips of a LeRobotDataset need the same skeleton, joints with positions and frame rate, but these "
+            f"differ from {self.first} ({self.rig.rate_hz:g} Hz): {listed(differing)}; retarget clips with another "
+            "skeleton or other joints with positions (marey retarget), resample clips with another frame rate (marey edit), commit the results, and export them"
         )
 
     def _rig_of(self, motion: Mapping[str, Any]) -> CommonRig:

@@ -303,8 +303,8 @@ class DatasetHandle:
     ) -> ExportedVersion:
         """Write the clips of a version to a new folder as a LeRobotDataset v3.0, with one episode for each clip.
 
-        Raises the errors of `export_files`. Also raises `CannotExport` if the clips do not have the same skeleton and
-        frame rate, and `MissingPackage` if pyarrow is not installed.
+        Raises the errors of `export_files`. Also raises `CannotExport` if the clips differ in skeleton, joints with
+        positions or frame rate, and `MissingPackage` if pyarrow is not installed.
         """
         from marey_client.bridges.lerobot import prepare_lerobot, write_lerobot
 
