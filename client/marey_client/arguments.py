@@ -114,7 +114,7 @@ class Parameters:
 
 
 class _AnnotationNames(dict[str, Any]):
-    """Names of a module; other names, except those of Python, are `Any`."""
+    """Names of a module; names that neither the module nor Python itself defines are `Any`."""
 
     def __missing__(self, name: str) -> Any:
         if hasattr(builtins, name):
@@ -169,7 +169,7 @@ def _fits_anything(_value: Any) -> bool:
 
 
 _NUMBERS: dict[Any, tuple[type, ...]] = {int: (int, Integral), float: (float, int, Real)}
-"""Classes of the numbers that fit; the last one of each includes those of numpy."""
+"""Classes of the numbers that fit `int` and `float`; `Integral` and `Real` include the numbers of numpy."""
 _LISTS: tuple[Any, ...] = (Sequence, Iterable, Collection)
 """Types for which any iterable fits, because functions copy it; a text is one value, not several characters."""
 _WORDS = {"Callable": "a function", "ndarray": "a numpy array", "slice": "a range such as slice(0, 120)"}
@@ -201,7 +201,7 @@ def _type_of_entries(wanted: Any) -> Any:
 
 
 def _entries(value: Any) -> Iterable[tuple[Any, Any]]:
-    """Return place and value of each entry of a list or dict; nothing for iterators, to consume none of them."""
+    """Return place and value of each entry of a list, set or dict; nothing for iterators, which this would consume."""
     if isinstance(value, Mapping):
         return value.items()
     return enumerate(value) if isinstance(value, (list, tuple, set, frozenset)) else ()

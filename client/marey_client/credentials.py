@@ -37,7 +37,7 @@ _PLAIN_ADDRESS = re.compile(
     r"https?://(127\.0\.0\.1|(?![0-9.]+[:/]|[0-9.]+$)[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?)(:[1-9][0-9]{0,3})?"
     r"(/[A-Za-z0-9._/-]*)?"
 )
-"""Pattern of addresses that are certainly valid, with a host name or with 127.0.0.1; others are parsed and checked."""
+"""Pattern of addresses that are certainly valid, with a host name or 127.0.0.1; other addresses are parsed."""
 
 
 class TokenFile:
@@ -109,7 +109,7 @@ class Credential:
     file: Path | None = None
     """File that contains only the token; None if the token does not come from such a file."""
     logins: Path | None = None
-    """File of stored logins in which the token was found, or was searched for last; otherwise None."""
+    """File of stored logins in which the token was found, or in which `resolve_other` found none; otherwise None."""
 
     @property
     def bearer(self) -> str | TokenFile | None:
@@ -120,7 +120,10 @@ class Credential:
 def resolve(
     url: str | None = None, token_file: Path | None = None, environment: Mapping[str, str] | None = None
 ) -> Credential:
-    """Return the server and the token, from arguments, environment variables, a stored login or a local server."""
+    """Return the server and the token, from arguments, environment variables, a stored login or a local server.
+
+    The token is None if there is none. Raises `BadAddress`, and `BadCredentialFile` if a file with tokens is not valid.
+    """
     environment = os.environ if environment is None else environment
     stored = read_logins(logins_path(environment))
     by_variable = next(filter(None, map(environment.get, SERVER_VARIABLES)), None)

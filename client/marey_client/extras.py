@@ -26,5 +26,5 @@ def needing(extra: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise MissingPackage(
-            f"this needs the package {error.name}, which is not installed; run: pip install 'marey[{extra}]'"
+            f"this function needs the package {error.name}, which is not installed; run: pip install 'marey[{extra}]'"
         ) from error

@@ -33,7 +33,7 @@ class TracedRequest:
         return trace_headers(self.scope)
 
     def note_try(self) -> None:
-        """Record in the span that the request is sent; from the second time on, record the number of repetitions."""
+        """Count a try of the request; from the second try on, record the number of repetitions in the span."""
         if self.tries:
             self._note("http.request.resend_count", self.tries)
         self.tries += 1

@@ -148,7 +148,7 @@ class Transport:
         return read_model(answer, self.send("GET", path, params=params, headers=headers))
 
     def post(self, answer: type[Model], path: str, body: BaseModel | None = None, **options: Any) -> Model:
-        """Send a JSON document by POST, with an idempotency key; return the document in the answer."""
+        """Send a JSON document by POST; return the document in the answer. `options` are those of `send`."""
         return read_model(answer, self.send("POST", path, content=as_json(body), **options))
 
     def send(
@@ -165,9 +165,10 @@ class Transport:
     ) -> httpx.Response:
         """Send a request, if necessary several times, and return the complete answer.
 
-        If `repeatable` is False, the request is not sent again after its connection broke. By default, it is False for
-        PUT, PATCH and DELETE requests that have the header `If-Match`, and True for all others; then, POST requests get
-        an idempotency key. To stream `content`, give a function that returns a new iterable of bytes for each try.
+        If `repeatable` is False, the request is not sent again after its connection broke. The default is False for
+        PUT, PATCH and DELETE requests that have the header `If-Match`, and True for all other requests. If `repeatable`
+        is not given, POST requests get an idempotency key. To stream `content`, give a function that returns a new
+        iterable of bytes for each try.
 
         Raises `RequestFailed` if the server answers with an error, `Unreachable` if there is no answer.
         """

@@ -69,8 +69,8 @@ class Calls:
 
     Parameters
     ----------
-    concurrency : number of calls that run at a time; others begin in their order. Calls that wait, for example for the
-        end of a job, are not counted
+    concurrency : number of calls that run at a time; further calls begin in the order in which they were made. Calls
+        that wait, for example for the end of a job, are not counted
     """
 
     def __init__(self, concurrency: int) -> None:
@@ -89,7 +89,7 @@ class Calls:
         self._live: set[_ThreadCall] = set()
 
     def _begin_again_if_forked(self) -> None:
-        """Forget the threads and the calls of the parent, which a forked process does not have."""
+        """In a forked process, forget the threads and the calls of the parent process, which do not exist there."""
         if self._process != os.getpid():
             self._begin()
 

@@ -23,11 +23,11 @@ T = TypeVar("T")
 CounterpartClass = TypeVar("CounterpartClass", bound="type[Counterpart]")
 
 COUNTERPARTS: dict[type[Any], type[Counterpart]] = {}
-"""Class of the async client for each class of the SDK, as far as its module is loaded."""
+"""Class of the async client for each class of the SDK; only classes of loaded modules are in it."""
 
 
 class Counterpart:
-    """Counterpart of an object of the SDK: its methods run those of this object in threads."""
+    """Counterpart of an object of the SDK; its methods run the methods of this object in threads."""
 
     _sync: Any
     _calls: Calls
@@ -51,21 +51,21 @@ class Counterpart:
         return _named_async(str(self._sync))
 
     async def _run(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run a method whose arguments and result are those of the SDK."""
+        """Run a method of the SDK in a thread; its arguments and its result are not converted."""
         return await self._calls.run(function, *args, **kwargs)
 
     async def _exchange(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
-        """Run a method with counterparts or functions among its arguments, or counterparts in its result."""
+        """Run a method of the SDK in a thread; convert its arguments by `_as_sync`, and its result by `_as_async`."""
         given, named = self._given(args, kwargs)
         return self._as_async(await self._calls.run(function, *given, **named))
 
     def _now(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
-        """Call a method that sends no request, with counterparts among its arguments or in its result."""
+        """Call a method of the SDK that sends no request, without a thread; convert its arguments and its result."""
         given, named = self._given(args, kwargs)
         return self._as_async(function(*given, **named))
 
     async def _each(self, function: Callable[..., Iterator[Any]], /, *args: Any, **kwargs: Any) -> AsyncIterator[Any]:
-        """Yield what a method of the SDK yields."""
+        """Yield what a method of the SDK yields, with counterparts in place of objects of the SDK."""
         given, named = self._given(args, kwargs)
         async for one in self._calls.each(function, *given, **named):
             yield self._as_async(one)

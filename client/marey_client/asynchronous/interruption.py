@@ -47,7 +47,10 @@ class RunningCall:
 
     @contextmanager
     def ending_by(self, end: Callable[[], object]) -> Iterator[None]:
-        """Call `end` if the call is interrupted during the `with` block; then raise `Interrupted` at its end."""
+        """Call `end` if the call is interrupted during the `with` block; raise `Interrupted` after the block.
+
+        Raises `Interrupted` before the block if the call was interrupted earlier.
+        """
         with self._lock:
             self.stop_if_interrupted()
             self._endings.append(end)
@@ -70,7 +73,7 @@ class RunningCall:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Mark the call as waiting during the `with` block; its threads may mark it several times at once."""
+        """Mark the call as waiting during the `with` block; several of its threads may do this together."""
         with self._lock:
             self._waits += 1
             begins = self._waits == 1
@@ -110,15 +113,15 @@ def run_as(call: RunningCall, function: Callable[[], T]) -> T:
 
 
 def leave_call() -> None:
-    """Let what runs in this context from now on be no part of a call, so that nothing interrupts it."""
+    """Separate this context from its call, so that nothing interrupts the code that runs in it from now on."""
     _current.set(None)
 
 
 class CallPool(ThreadPoolExecutor):
-    """Threads of one call: what they run belongs to the call, and to the trace, of the thread that submits it."""
+    """Threads for one call: each function belongs to the call, and to the trace, of the thread that submits it."""
 
     def submit(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run a function in a thread, unless the call is interrupted before."""
+        """Run a function in a thread; if the call is interrupted before, the future raises `Interrupted`."""
         context = copy_context()
 
         def run() -> T:
@@ -136,7 +139,7 @@ def stop_if_interrupted() -> None:
 
 
 def pause(seconds: float) -> None:
-    """Wait, at most until the call that runs in this thread is interrupted."""
+    """Wait. Raises `Interrupted` as soon as the call that runs in this thread is interrupted."""
     call = current_call()
     if call is None:
         time.sleep(seconds)

@@ -46,7 +46,7 @@ class InterruptibleConnections(httpx.BaseTransport):
 
 
 class _Pools:
-    """Connections of one process without TLS, and with TLS; the first request that uses TLS reads its certificates."""
+    """Connections of one process without TLS, and with TLS; the first request with TLS loads trusted certificates."""
 
     def __init__(self, limits: httpx.Limits) -> None:
         self._limits = limits

@@ -22,7 +22,7 @@ OVER = frozenset({401, 404, 409})
 class HostileAttempt:
     """Attempt to run one job of the test, which also sends faulty requests.
 
-    Each method raises `MareyError` if the server answers wrongly.
+    `claim`, `stage`, `complete` and `refused` raise `MareyError` if the server answers wrongly.
     """
 
     def __init__(self, scratch: Scratch, caller: LoadConnection, job: str, draw: random.Random) -> None:

@@ -57,7 +57,7 @@ class OfferedLoad:
         self._follow(lambda: not any(thread.is_alive() for thread in submitting), begun, tick)
 
     def submit_backlog(self, count: int) -> None:
-        """Submit jobs in batches, at once, before workers start. Raises `MareyError` if the server refuses them."""
+        """Submit `count` jobs in batches, before workers start. Raises `MareyError` if the server refuses them."""
         left = count
         with connection(self._scratch.url, self._scratch.token) as caller:
             while left:
