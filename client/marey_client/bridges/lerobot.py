@@ -173,7 +173,8 @@ class _Writing:
         return (
             "all clips of a LeRobotDataset need the same skeleton, joints with positions and frame rate, but these "
             f"differ from {self.first} ({self.rig.rate_hz:g} Hz): {listed(differing)}; retarget clips with another "
-            "skeleton or other joints with positions (marey retarget), resample clips with another frame rate (marey edit), commit the results, and export them"
+            "skeleton or other joints with positions (marey retarget), resample clips with another frame rate (marey "
+            "edit), commit the results, and export them"
         )
 
     def _rig_of(self, motion: Mapping[str, Any]) -> CommonRig:

@@ -56,7 +56,7 @@ def _command_name(arguments: list[str]) -> str | None:
 
 
 def _take_any_text() -> None:
-    """Make output streams escape characters that their encoding lacks, and ignore output after they are closed."""
+    """Make output streams escape characters that their encoding lacks; discard output if the process has no stream."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - open to the end

@@ -95,7 +95,9 @@ def _missing(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -
 
     if not address.path:
         marey.project(address.project).read()  # raises the error that names the nearest project
-        return WrongUsage(f"{address} is a project, but this needs the path of an item; `marey ls {address}` lists it")
+        return WrongUsage(
+            f"{address} is a project, but the command needs the path of an item; `marey ls {address}` lists it"
+        )
     if marey.project(address.project).collections.at(address.path) is not None:
         return WrongUsage(f"{address} is a folder; `marey ls {address}` lists it")
     if address.is_folder:

@@ -71,7 +71,7 @@ OTHER_NAMES = {
     "version": "--version",
     "whoami": "user show",
 }
-"""Command of `marey` to suggest if a user types the name of a command of another program, by this name."""
+"""Suggested command of `marey`, by the name of the similar command of another program that a user may type."""
 
 
 class CommandGroup(TyperGroup):

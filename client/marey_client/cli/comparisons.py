@@ -42,7 +42,7 @@ def compare(
         list[str],
         typer.Argument(
             help="Evaluation to compare with BEFORE; or several, each of another set of clips. All must have the "
-            "same trials as BEFORE, and its scaling of features: create them with `marey evaluate "
+            "same trials and the same scaling of features as BEFORE: create them with `marey evaluate "
             "--normaliser BEFORE`."
         ),
     ],

@@ -180,7 +180,8 @@ def _last_at_each_path(targets: Sequence[FolderOrItem]) -> list[FolderOrItem]:
         chosen.setdefault(one.place, one)
     if others := len(targets) - len(chosen):
         print_message(
-            f"left out {counted(others, 'item')} with the path of one that was removed later; restore them by their ids"
+            f"left out {counted(others, 'item')} with the path of an item that was removed later; restore them by "
+            "their ids"
         )
     return list(chosen.values())
 
@@ -228,7 +229,7 @@ def tag(
     preview: Preview = False,
     as_json: AsJson = False,
 ) -> None:
-    """Add tags to items, and remove others; `marey ls --tag` lists items by tag.
+    """Add tags to items, and remove tags from items; `marey ls --tag` lists items by tag.
 
     Each item is changed by a request of its own. If the server refuses a request, for example because somebody has
     changed the item since it was selected, the other requests are still sent, and the exit status is 1.

@@ -140,7 +140,7 @@ def _named(project: str, items: Sequence[PurgedItem]) -> str:
 def _request(
     project: ProjectHandle, place: str, kind: str | None, query: str | None, older_than: int | None
 ) -> PurgeRequest:
-    """Return the request to purge the removed items at an address: an item's id, a folder, or their former path."""
+    """Return the request to purge removed items; `place` is a folder, or the id or the former path of an item."""
     from marey_schemas.purges import PurgeRequest
 
     address = Address.parse(place)

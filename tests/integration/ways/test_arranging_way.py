@@ -377,7 +377,7 @@ def test_of_several_removed_items_of_one_path_a_query_restores_the_last(
     run("rm", "lab/raw/a")
     done = run("restore", "lab", "--query", "name = a")
     assert done.stderr.splitlines()[-1] == "1 item restored"
-    assert "left out 1 item with the path of one that was removed later" in done.stderr
+    assert "left out 1 item with the path of an item that was removed later" in done.stderr
     assert next(lab.clips.list(path="raw/a")).id == last
     refused = run("restore", "lab", "--query", "name = a", status=1)
     assert "first move or rename the item that has this address now" in refused.stderr

@@ -26,7 +26,7 @@ token = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage yo
 SOON_DAYS = 14
 """For tokens that expire in fewer days than this, lists show the number of days left."""
 RESERVED_BYTES = 1000
-"""Size of a file before a token is written to it; no token is longer."""
+"""Number of bytes that are written to a file to reserve space for a token; no token is longer."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -216,7 +216,7 @@ def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedel
 
 
 def _rotation_id(begun: Path, token: str) -> str:
-    """Return the id for the replacement of this token from the file `begun`; store a new id there if it has none."""
+    """Return the id for the replacement of this token from the file `begun`; if the file has none, store a new id."""
     from marey_client.credentials import write_private
 
     prefix = token.split("_")[1] if token.count("_") > 1 else ""

@@ -113,7 +113,7 @@ class _ShellRequest:
         return expanded(command.function, command.groups)
 
     def _completed(self, function: Callable[..., Any], command: tuple[str, ...]) -> Callable[..., Any]:
-        """Return a function with the parameters of `function`, which typer completes by `SUBJECTS`; it does nothing."""
+        """Return a function without effect, with the parameters of `function`, which typer completes by `SUBJECTS`."""
 
         def run(**_: Any) -> None: ...
 

@@ -170,8 +170,8 @@ def _interruptible(evaluations: VersionEvaluations) -> Iterator[None]:
 def _plan(among: VersionRange) -> str:
     count, tests = len(among.commits), among.expected_tests
     return (
-        f"{counted(count, 'version')} can be the first bad one; about {counted(2 + tests, 'evaluation')}: 2 for the "
-        f"ends and {tests} between them"
+        f"{counted(count, 'version')} can be the first bad one; about {counted(2 + tests, 'evaluation')}: 2 of the "
+        f"good and the bad version, and {tests} between them"
     )
 
 
@@ -180,7 +180,7 @@ def _print_plan(among: VersionRange, as_json: bool) -> None:
         document = {"good": among.good, "bad": among.bad, "versions": len(among.commits), "first": among.first}
         return print_json({**document, "expected": 2 + among.expected_tests})
     if among.first is not None:
-        print_pairs([("first after the ends", f"{short(among.first.digest)} {among.first.message}")])
+        print_pairs([("first between good and bad", f"{short(among.first.digest)} {among.first.message}")])
     return print_message(_plan(among))
 
 

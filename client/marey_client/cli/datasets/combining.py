@@ -167,16 +167,18 @@ def _pick_options(
 
 
 class Decisions(NamedTuple):
-    """Decisions about conflicts: those of the options --ours, --theirs and --base, and the side for all others."""
+    """Decisions about conflicts: by the options --ours, --theirs and --base, and the side for all other conflicts."""
 
     given: Sequence[Resolution]
     others: str | None
 
     def complete(self, preview: Callable[[Sequence[Resolution]], MergeAnswer]) -> list[Resolution]:
-        """Return the decisions, with one for each conflict that `preview` of these decisions finds.
+        """Return the given decisions and, if `others` is a side, one for each conflict that `preview` still finds.
 
         Previews are repeated, because an answer lists a limited number of conflicts, and a decision can move an entry
         to a path that is taken. A conflict that is found again although it was decided gets no further decision.
+
+        Raises `WrongUsage` if `others` is not a side.
         """
         from marey_schemas.datasets.merges import MOST_RESOLUTIONS, Resolution, Side
 

@@ -305,7 +305,7 @@ def merge(
 
 
 def _decided(on: DatasetHandle, handle: ProposalHandle, choices: Decisions) -> tuple[Sequence[Resolution], str | None]:
-    """Return a decision for each conflict, and the proposed commit whose conflicts were looked at, if they were."""
+    """Return the decisions about conflicts, and the proposed commit, or None if its conflicts were not read."""
     if choices.others is None:
         return choices.given, None
     found = handle.read()

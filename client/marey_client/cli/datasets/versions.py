@@ -246,7 +246,7 @@ def blame(
 
 
 def _origin_row(name: str, one: Origin, path: str) -> tuple[object, ...]:
-    notes = [] if one.path == path else [f"then {one.path}"]
+    notes = [] if one.path == path else [f"was {one.path}"]
     notes += [] if one.certain else ["or an earlier commit"]
     made = one.commit
     return name, short(made.digest), made.at, made.author, made.job, made.message, ", ".join(notes)

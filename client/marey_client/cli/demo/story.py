@@ -129,7 +129,7 @@ class Story:
         return found or self.project.skeletons.create(SKELETON, _game_skeleton_parts(), collection=TAKES)
 
     def _retarget(self, sources: Sequence[ClipHandle], target: SkeletonHandle) -> Job | None:
-        """Retarget the takes to the second skeleton; return None if there is no take."""
+        """Retarget the takes to the second skeleton; return the job when it has ended, or None if there is no take."""
         if not sources:
             return None
         job = self.project.retarget(sources, target.id, into=RESULTS)

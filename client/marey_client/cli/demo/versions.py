@@ -126,7 +126,7 @@ def _merge_branch(dataset: DatasetHandle) -> None:
 
 
 def _draw_difference(project: ProjectHandle, path: str, clip: ClipHandle, folder: Path) -> Path | None:
-    """Draw what smoothing changed; return the path of the picture."""
+    """Draw what smoothing changed; return the path of the picture, or None if there is no smoothed clip."""
     smoothed = next(project.clips.list(path=f"{EDITED}/{path}"), None)
     if smoothed is None:
         return None

@@ -23,7 +23,7 @@ from marey_schemas.wording import counted
 
 NO_DIFFERENCE = "no difference"
 MOST_LINES = 20
-"""Greatest number of joints, segments or fields that are listed; only the number of the others is printed."""
+"""Greatest number of joints, segments or fields that are listed; of all further ones, only the number is printed."""
 MOST_SPANS = 3
 """Greatest number of time ranges that are listed for a joint."""
 LEAST_TURN_DEG = 0.05

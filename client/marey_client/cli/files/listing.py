@@ -235,7 +235,10 @@ def _show_deleted(
 
 
 def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:
-    """Return the items at an address that is not a folder. Raises `WrongUsage` if there are none."""
+    """Return the item at an address that is not a folder, as a list; empty for a project.
+
+    Raises `WrongUsage` if there is no such item.
+    """
     from marey_schemas.kinds import Kind
 
     item = find_item(marey, address, list(Kind))
@@ -378,7 +381,7 @@ def _show_history(item: ItemHandle, as_json: bool) -> None:
 
 
 def _stale_reasons(staleness: Staleness, item: ItemHandle) -> Iterator[str]:
-    """Yield a text for each of the first outdated inputs, and one for all others: an evaluation can have thousands."""
+    """Yield a text for each of the first outdated inputs, and one text with the number of all further inputs."""
     for edge in staleness.because[:REASONS_SHOWN]:
         yield f"{edge.kind} {edge.name} has newer revisions than {edge.revision}"
     if (others := len(staleness.because) - REASONS_SHOWN) > 0:

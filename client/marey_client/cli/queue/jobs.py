@@ -243,8 +243,8 @@ def retry_job(
 ) -> None:
     """Submit a failed or cancelled job again.
 
-    Unsuccessful jobs that the job needs are submitted again, too, and by default so are jobs that did not run only
-    because one of all these jobs did not succeed.
+    Unsuccessful jobs on which the job depends are submitted again, too. By default, so are later jobs that failed or
+    were cancelled only because one of these jobs did not succeed.
     """
     with connect(context) as marey:
         ended = follow(marey, marey.jobs.retry(job_id, dependants=dependants), wait=wait, as_json=as_json)

@@ -51,7 +51,7 @@ def export(
     ] = ExportForm.CSV,
     revision: Annotated[int | None, typer.Option(min=1, help="Revision of the study; default: the newest.")] = None,
 ) -> None:
-    """Write what participants answered to a file, under pseudonyms and without dates.
+    """Write the answers of participants to a file, under pseudonyms and without dates.
 
     For maintainers and owners of the project.
     """

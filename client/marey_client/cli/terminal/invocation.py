@@ -97,7 +97,7 @@ def connect_other(url: str | None, token_file: Path | None, first: Marey) -> Ite
         try:
             yield marey
         except Unauthenticated as error:
-            error.add_note(f"if {found.url} refused the token: `marey login --server {found.url}` stores one for it")
+            error.add_note(f"if {found.url} refused the token: `marey login --server {found.url}` stores a new token")
             raise
 
 

@@ -24,7 +24,7 @@ MOST_VALUES = 200
 """Greatest number of values in a range if the schema sets no limit."""
 EVEN = 1e-9
 GREATEST_SHOWN_BOUND = 1e15
-"""Bound from which the range of a number is not shown, because it is a limit of integers and not of the parameter."""
+"""Absolute value from which a bound is not shown, because such bounds are limits of integers, not of a parameter."""
 
 
 # -- schemas --
@@ -60,7 +60,7 @@ def _takes(schema: Schema, kind: str) -> bool:
 
 
 def without_null(schema: Schema) -> Schema:
-    """Return the schema of a value without the alternative null."""
+    """Return the schema of a value without the alternative null, if exactly one other alternative remains."""
     others = [one for one in _choices(schema) if one.get("type") != "null"]
     return schema if len(others) == len(_choices(schema)) or len(others) > 1 else others[0]
 
@@ -96,7 +96,7 @@ def range_text(schema: Schema) -> str:
 
 
 def default_text(schema: Schema) -> str:
-    """Return a default in the syntax of the command line; empty if there is none."""
+    """Return a default in the syntax of the command line; empty if it is missing, null, false or an object."""
     default = schema.get("default")
     if isinstance(default, bool):
         return "on" if default else ""
