@@ -138,7 +138,7 @@ class ItemHandle:
         return self.transport.get(LineageGraph, f"{self.url}/lineage-graph", params)
 
     def staleness(self) -> Staleness:
-        """Return whether an input from which the item was made has a newer revision now, and which inputs have."""
+        """Return whether inputs from which the item was made have newer revisions now, and list these inputs."""
         return self.transport.get(Staleness, f"{self.url}/stale")
 
     def difference(

@@ -115,7 +115,7 @@ class AsyncItemHandle(Counterpart):
         return await self._run(self._sync.lineage_graph, revision, **options)
 
     async def staleness(self) -> Staleness:
-        """Return whether an input from which the item was made has a newer revision now, and which inputs have."""
+        """Return whether inputs from which the item was made have newer revisions now, and list these inputs."""
         return await self._run(self._sync.staleness)
 
     async def difference(

@@ -136,9 +136,9 @@ class Datasets:
 
 
 def _known_commits(dataset: DatasetHandle, ref: Ref | None) -> Callable[[str], bool]:
-    """Return a function that asks the server only once whether the dataset has a commit.
+    """Return a function that returns whether the dataset has a commit, and asks the server once for each commit.
 
-    `ref` is a branch of the dataset, whose newest commit is known.
+    For the newest commit of the branch `ref`, no request is sent.
     """
     ask = cache(dataset.has)
     return lambda digest: (ref is not None and ref.commit == digest) or ask(digest)

@@ -90,7 +90,7 @@ class EvaluationHandle(ReportedHandle):
     def compare(
         self, *others: EvaluationHandle, on_progress: OnProgress | None = None, **options: Unpack[CompareKeywords]
     ) -> Findings:
-        """Compare this evaluation with others, at least one, with the same trials and the same scaling of features.
+        """Compare this evaluation with one or more others that have the same trials and the same scaling of features.
 
         `options` are those of `CompareParams`.
         """

@@ -75,7 +75,10 @@ class PipelineRun:
         return self._jobs.outputs(self._steps[step].id)
 
     def cancel(self) -> Mapping[str, Job]:
-        """Cancel every job that has not ended, the last jobs first, so that no job fails because of a missing input."""
+        """Cancel every job that has not ended, and return all jobs by step.
+
+        The last jobs are cancelled first, so that no job fails because of a missing input.
+        """
         for job in reversed(self.refresh().values()):
             if not job.state.terminal:
                 with suppress(Conflict):  # it has ended since

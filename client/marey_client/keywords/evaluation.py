@@ -114,8 +114,8 @@ class VerdictLimitsKeywords(TypedDict, total=False):
     """Greatest standard deviation of the turn rate, in degrees per second. The heading sways with each step: the
     baseline of generated clips reaches 21."""
     response_s: float
-    """Greatest median time in which the character responds to a switch of the speed, in seconds. Switches without a
-    response count as longer than all others."""
+    """Greatest median time in which the character responds to a switch of the speed, in seconds. A switch without a
+    response counts as slower than every response."""
     skate_m_s: float
     """Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more. The default is
     the greatest speed of a foot that counts as standing."""

@@ -134,7 +134,8 @@ class WristContactProposal(_Proposal):
         gt=OUT_OF_REST,
         le=1,
         allow_inf_nan=False,
-        description="Share of the farthest distance from the rest position in a reach at which the hand has arrived.",
+        description="In each reach, share of the farthest distance from the rest position at which the hand has "
+        "arrived.",
     )
     release: bool = Field(
         False,

@@ -53,7 +53,7 @@ class VerdictLimits(Options):
     response_s: _Limit = Field(
         2.0,
         description="Greatest median time in which the character responds to a switch of the speed, in seconds. "
-        "Switches without a response count as longer than all others.",
+        "A switch without a response counts as slower than every response.",
     )
     skate_m_s: _Limit = Field(
         TOE_SPEED_M_S,

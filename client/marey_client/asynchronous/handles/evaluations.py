@@ -77,7 +77,7 @@ class AsyncEvaluationHandle(AsyncReportedHandle):
         on_progress: AsyncOnProgress | None = None,
         **options: Unpack[CompareKeywords],
     ) -> AsyncFindings:
-        """Compare this evaluation with others, at least one, with the same trials and the same scaling of features.
+        """Compare this evaluation with one or more others that have the same trials and the same scaling of features.
 
         `options` are those of `CompareParams`.
         """

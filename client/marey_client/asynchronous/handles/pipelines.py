@@ -52,5 +52,8 @@ class AsyncPipelineRun(Counterpart):
         return self._each(self._sync.outputs, step)
 
     async def cancel(self) -> Mapping[str, Job]:
-        """Cancel every job that has not ended, the last jobs first, so that no job fails because of a missing input."""
+        """Cancel every job that has not ended, and return all jobs by step.
+
+        The last jobs are cancelled first, so that no job fails because of a missing input.
+        """
         return await self._run(self._sync.cancel)

@@ -305,7 +305,7 @@ class AsyncJobSubmission(AsyncProjectItems):
     ) -> AsyncJobHandle:
         """Submit a job that measures foot skate, contacts, penetration, jitter, joint limits, speed and turn rate.
 
-        `reference` are recorded clips, which are measured in the same way and shown beside the others; `contacts` are
+        `reference` are recorded clips, which are measured in the same way and shown beside `clips`; `contacts` are
         annotations of all clips with segments `contact_left`, `contact_right` or `contact_both`; `options` are those of
         `QualityParams`, for example `rate_hz=60`. `handles.findings.Quality` reads the result. The numbers are also
         facets of the clips.
