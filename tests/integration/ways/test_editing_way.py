@@ -254,7 +254,7 @@ def test_an_animator_edits_from_the_command_line(lab: ProjectHandle, run: Comman
 
 WRONG: tuple[tuple[tuple[str, ...], int, str], ...] = (
     (("edit", "apply", "lab/walks", "--do", "mirror"), 2, "choose where the results go"),
-    (("edit", "apply", "lab/walks", "--into", "x"), 2, "give commands either with --do or with --file"),
+    (("edit", "apply", "lab/walks", "--into", "x"), 2, "give commands with --do or --file"),
     (("edit", "apply", "lab/walks", "--do", "wobble", "--into", "x"), 2, "there is no command 'wobble'"),
     (("edit", "apply", "lab/walks", "--do", "trim start=9 stop=3", "--into", "x"), 2, "must be after"),
     (("edit", "preview", "lab/walks/walk 0", "--do", "trim start=9999"), 1, "commands[0] (trim)"),

@@ -203,8 +203,10 @@ def _commands(
 def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -> EditDocument:
     from marey_client.handles.edits import as_edit
 
-    if (file is None) == (not do):
+    if do and file is not None:
         raise WrongUsage("give commands either with --do or with --file, not both")
+    if not do and file is None:
+        raise WrongUsage("no commands are given; give commands with --do or --file")
     tree: Any = [parse_command(text) for text in do or ()] if file is None else read_json(file)
     given = tree if isinstance(tree, dict) else {"commands": tree}
     commands, title = given.get("commands"), given.get("title", "")
