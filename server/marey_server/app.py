@@ -330,10 +330,10 @@ def stop_event() -> asyncio.Event:
 
 
 def finish_start(running: Running, *, greet: bool = True) -> None:
-    """Print the greeting of a server that has started, and exclude all objects so far from garbage collection.
+    """Print the greeting of a server that has started, unless `greet` is false.
 
-    Nearly all of these objects belong to modules. If a full garbage collection examined them, it would stop the server
-    for 0.1 s each time.
+    Also exclude all existing objects from the garbage collection of Python. Nearly all of them belong to modules. If a
+    full garbage collection examined them, it would stop the server for 0.1 s each time.
     """
     gc.freeze()
     if greet:
@@ -397,7 +397,7 @@ def greeting(settings: Settings, address: str, database: Database) -> Iterator[s
 
 
 def next_command(settings: Settings, address: str) -> str:
-    """Return the first command that a user should run, with the options for server and token if they are needed."""
+    """Return the end of the sentence "next, in another terminal": the first command to run, with needed options."""
     reachable = address.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
     defaults = Settings.model_fields
     usual_address = f"http://{defaults['host'].default}:{defaults['port'].default}"

@@ -161,7 +161,7 @@ class GoneProblem(ApiProblem):
 
 
 AUTHOR_LOST = "author-lost-access"
-"""Code of the reason why an attempt is stopped if its author may not run jobs any more; also of the job's failure."""
+"""Reason why an attempt must stop, and code of its job's failure, if the job's author may not run jobs any more."""
 
 
 class PreconditionFailedProblem(ApiProblem):

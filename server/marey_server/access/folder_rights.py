@@ -80,7 +80,7 @@ class FolderRights:
 
         `deleted_us` is the time at which the folder was deleted, or None. If the folder was deleted, the item is
         restored into an existing or a new folder with the same path. The overrides of the deleted folder do not apply
-        there, so the role must suffice in both folders.
+        there, so the role must be at least maintainer in both folders.
         """
         for state in (deleted_us, None):
             self.require(path, Role.MAINTAINER, state)
@@ -104,7 +104,7 @@ class FolderRights:
 
 
 def _nearest(path: str, overrides: Sequence[Mapping[str, Role]]) -> Role | None:
-    """Return the role that overrides give in the folder `path`, or None if there are no overrides.
+    """Return the role that overrides give in the folder `path`, or None if no override applies to this folder.
 
     If the folder itself has no override, the nearest folder above it with an override counts. If several mappings in
     `overrides` contain this folder, the lowest of their roles is returned.

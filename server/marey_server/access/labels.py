@@ -18,7 +18,7 @@ LONGEST_KEY = 512
 def labels_key(labels: Mapping[str, str]) -> str:
     """Return labels as one text in a fixed order, such as `gpu=a100,site=lyon`.
 
-    Raises `InvalidProblem` if there are too many labels.
+    Raises `InvalidProblem` if there are too many labels, or if the text has more than `LONGEST_KEY` characters.
     """
     pairs = _checked_pairs(labels)
     key = ",".join(pairs)

@@ -47,7 +47,8 @@ def labels_of_job(request: JobCreate, image: str | None, rules: PodRules | None,
     image : image that the script of the job names, if any
     rules : None if the server starts no pods for single jobs
 
-    Raises `InvalidProblem` if the number of processors is not valid, or if the job needs an image that it cannot get.
+    Raises `InvalidProblem` if the number of graphics processors is not valid, or if the job needs an image that it
+    cannot get.
     """
     labels = {name: text for name, text in request.labels.items() if name != OWN_POD_LABEL}
     if request.resources.gpus:

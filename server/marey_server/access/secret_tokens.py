@@ -38,7 +38,7 @@ def issue_user_token() -> IssuedToken:
 
 
 def issue_prefix() -> str:
-    """Return a random prefix for a new token of a user, or a new invitation."""
+    """Return a random prefix for a new token or the code of a new invitation or link."""
     return secrets.token_hex(6)
 
 

@@ -34,7 +34,7 @@ class PlannedWork:
 
 @dataclass(frozen=True)
 class InstalledPart:
-    """Part of an installation: the seconds that its processors or workers need for the work, and those they have."""
+    """Part of an installation: the seconds of its processors or workers that the work needs, and those available."""
 
     name: str
     needed_s: float

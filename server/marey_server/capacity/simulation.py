@@ -18,7 +18,10 @@ from dataclasses import dataclass, field, replace
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 
 FIRST_HEARTBEAT_S = 1.0
-"""Time in seconds from the start of an attempt to its first heartbeat; an attempt lost before does not count."""
+"""Time in seconds from the start of an attempt to its first heartbeat.
+
+An attempt that is lost before this heartbeat does not count towards `max_attempts`.
+"""
 
 
 @dataclass(frozen=True)
@@ -301,7 +304,7 @@ class _Simulation:
     def _again(self, number: int, *, wait_s: float) -> None:
         """Queue a job again `wait_s` seconds after a failed or lost attempt, or end it as failed.
 
-        It ends if no attempts are left, or if too many attempts were lost before their first heartbeat.
+        The job fails if no attempts are left, or if too many attempts were lost before their first heartbeat.
         """
         history = self._histories[number]
         over = history.attempts >= self._jobs[number].max_attempts or history.unstarted > self._policy.max_unstarted
