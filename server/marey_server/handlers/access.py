@@ -118,7 +118,7 @@ class PasswordResource(Resource):
         """Run `function`, which counts a try to sign in or to use a code, and return its result.
 
         Raises `TooManyRequestsProblem` if `function` does. The server remembers such a refusal, so that it can refuse
-        further tries at once.
+        further tries without the database.
         """
         try:
             return await self.change(function, attempt)

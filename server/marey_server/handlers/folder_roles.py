@@ -59,8 +59,8 @@ class FolderRoleResource(Resource):
         """Set the role of a member in a folder and everything below it.
 
         The role in the folder may be higher or lower than the role in the project. The role in the folder concerns
-        changes only: every member may read the whole project. If several folders on a path have roles, the role of the
-        lowest of these folders applies. In one folder, a role for the member takes precedence over the role for all
+        changes only: every member may read the whole project. If several folders on a path have roles, the role in the
+        deepest of these folders applies. In one folder, a role for the member takes precedence over the role for all
         members (user `*`). Owners have all rights in all folders.
         """
         believed = self.precondition

@@ -271,7 +271,7 @@ class ProjectImports(Resource):
 
 
 async def _ready(file: PreparedImport) -> PreparedImport:
-    """Return `file`, which was read before; this takes the place of a coroutine that reads a file."""
+    """Return `file`, which was read before; called in place of a coroutine that reads a file."""
     return file
 
 

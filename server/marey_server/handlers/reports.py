@@ -38,7 +38,7 @@ FIGURE_TYPES = {
 }
 PAGE_TYPE = "text/html; charset=utf-8"
 MOST_FILLED_BYTES = 16 * MIB
-"""Greatest size of a page that is read into memory to fill its places; reports of Marey have up to a few MB."""
+"""Greatest size of a page that is read into memory to fill in origin and player; reports have up to a few MB."""
 SHOWN_ONLY = "default-src 'none'; base-uri 'none'; form-action 'none'; style-src 'unsafe-inline'; img-src data:"
 """Content-Security-Policy that forbids the page to load, send or store anything."""
 
@@ -207,7 +207,10 @@ _REPORT_OF = {str(one.model_fields["schema_"].default): one for one in REPORTS}
 
 
 def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredFigure:
-    """Return a figure of a report. Raises `NotFoundProblem`, which lists the figures of the report."""
+    """Return the figure of a report with this name and trial.
+
+    Raises `NotFoundProblem` if there is none; the error lists the figures of the report, or the trials of the figure.
+    """
     named = [figure for figure in report.figures if figure.name == name]
     for figure in named:
         if figure.trial == trial:

@@ -105,7 +105,7 @@ class SampleFiles(ModelUser):
 
 
 def _state(found: FoundModel, query: SampleQuery) -> str:
-    """Return the text from which the ETag of samples is made: digest and revision of the model, `count` and seed."""
+    """Return the text from which the ETag of samples is made: digest and revision of the model, count and seed."""
     return f"{found.part.digest.removeprefix('sha256:')[:32]}.{found.part.revision}.{query.n}.{query.seed}"
 
 

@@ -159,7 +159,7 @@ class CallingExchange(Exchange):
 
     @property
     def _child_user(self) -> str:
-        """User whose share of child processes this request uses; all callers without a user share one."""
+        """User whose share of child processes this request uses; all callers without a user count as one user."""
         user = self.principal.user_id if self.principal is not None else None
         return user or UNKNOWN_CLIENTS
 

@@ -109,7 +109,8 @@ def admission_of(caller: Caller, target: BodyTarget) -> Admission:
 def require_access(operation: Operation, principal: Principal) -> None:
     """Refuse callers who may not perform the operation on any object, whatever their roles in projects are.
 
-    Raises `UnauthenticatedProblem` for an anonymous caller, and `ForbiddenProblem` for all others.
+    Raises `UnauthenticatedProblem` for an anonymous caller, `LeaseLostProblem` for an attempt that has ended, and
+    `ForbiddenProblem` for all other callers.
     """
     access = operation.access
     guests = access is Access.ANYONE or (access is Access.READER and operation.public)

@@ -178,7 +178,7 @@ def conditions_of(operation: Operation) -> str:
     if operation.compressed:
         sentences.append("Body and answer may be compressed (`Content-Encoding: zstd`, `Accept-Encoding: zstd`)")
     if operation.paged:
-        sentences.append("The answer is one page; its `next_cursor` as `cursor` gives the next")
+        sentences.append("The answer is one page; to get the next page, send its `next_cursor` as `cursor`")
     return " ".join(f"{one}." for one in sentences)
 
 

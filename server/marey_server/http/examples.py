@@ -22,7 +22,7 @@ _TEXTS = (
     "0123456789abcdef0123456789abcdef", "worker-1", "5 4 * * *", "UTC", "1:30",
     "marey/document@1", '"7.json"', "v1.0", "job.failed", "https://example.org/hook", "python walk.py", "*", "a" * 43,
 )  # fmt: skip
-"""Texts that are tried, in this order, if the text in `_BY_NAME`, or else `text`, has no allowed form and length."""
+"""Texts that are tried, in this order, if the text in `_BY_NAME` (by default `text`) does not fit the schema."""
 _BY_NAME = {
     "project": "lab", "user": "ada", "name": "walk", "kind": "clips", "part": "motion", "item": "clip_01k8example",
     "job": "job_01k8example", "skeleton": "skeleton_01k8example", "clip": "clip_01k8example", "collection": "raw",

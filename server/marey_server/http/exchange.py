@@ -155,9 +155,10 @@ class Exchange(RequestHandler):
         await self.flush()
 
     async def refuse(self, error: ApiProblem) -> None:
-        """Answer before the body is read; the body is then discarded, because closing could lose the answer.
+        """Answer before the body is read.
 
-        From then on, the connection counts as idle: it is closed if there are too many connections.
+        The body is then discarded, because closing the connection could lose the answer. After the answer, the
+        connection counts as idle: it is closed if there are too many connections.
         """
         self.refused = True
         self._write_problem(error)
@@ -204,7 +205,7 @@ class Exchange(RequestHandler):
     # -- what Tornado asks for ----------------------------------------------------------------------------------------
 
     async def _undeclared(self, **_path: str) -> None:
-        """Refuse a method that the resource does not declare."""
+        """Do nothing, because `Resource.prepare` has already refused a method that the resource does not declare."""
 
     get: Declared = _undeclared
     head: Declared = _undeclared

@@ -74,7 +74,8 @@ class _Range:
 def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
     """Return the offered media type that the client prefers; of several equally preferred ones, the first.
 
-    Raises `NotAcceptableProblem`, which lists the offered types.
+    Without the header Accept, return the first. Raises `NotAcceptableProblem`, which lists the offered types, if the
+    client accepts none of them.
     """
     chosen = _best(accept, offers) if accept else offers[0]
     if chosen is None:
@@ -129,7 +130,7 @@ def _split_parameters(text: str) -> tuple[str, dict[str, str]]:
 def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TYPES) -> str:
     """Return the media type of a body; JSON if the request names none.
 
-    Raises `UnsupportedMediaTypeProblem`, which lists the supported types.
+    Raises `UnsupportedMediaTypeProblem` if the type is not in `known`, or if the text is not encoded as UTF-8.
     """
     if not content_type:
         return codecs.JSON

@@ -27,7 +27,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "user": ("Name of the user.", _NAME),
     "kind": ("Kind of the items, in the plural.", {"type": "string", "enum": [kind.plural for kind in Kind]}),
     "item": ("Id of the item.", _NAME),
-    "collection": ("Id of the collection.", _NAME),
+    "collection": ("Id of the folder.", _NAME),
     "part": ("Name of the part.", {"type": "string", "enum": _PART_NAMES}),
     "figure": ("Name of the figure.", {"type": "string", "pattern": "^[a-z0-9][a-z0-9_-]{0,63}$"}),
     "revision": ("Number of the revision.", {"type": "integer", "minimum": 1, "maximum": 999_999_999}),

@@ -131,7 +131,7 @@ class ViewQuery(AnyQuery):
 
     clip: str | None = Field(None, description="The clip: `project/item`, or `project/item@revision`.")
     beside: str | None = Field(None, description="Second clip, which is shown with the first one at the same time.")
-    frame: str | None = Field(None, description="Frame of the first clip to begin with, counted from 0.")
+    frame: str | None = Field(None, description="Frame at which the first clip begins, counted from 0.")
     camera: str | None = Field(
         None, description="Yaw and pitch of the camera in degrees, and its distance in body heights, as in `35,12,2.6`."
     )

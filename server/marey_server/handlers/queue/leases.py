@@ -77,9 +77,9 @@ class Workers(Resource):
     async def get(self) -> Rendered:
         """List the workers, in one page.
 
-        The list contains all workers that run jobs. It also contains the workers that claimed jobs from this server
-        process in the last 24 hours, but not before its last start. Idle workers that claim jobs from another process
-        of the server are missing.
+        The list contains all workers that run jobs. It also contains the workers that sent a claim to this server
+        process in the last 24 hours; claims from before the last start of the process do not count. Idle workers that
+        send their claims to another process of the server are missing.
         """
         heard, policy = self.services.worker_memory.heard(), self.services.queue_policy
         return await self.answer_with(lambda workers: Reply(Page(items=workers)), list_workers, heard, policy)
@@ -99,7 +99,7 @@ class Completions(Resource):
         reserved=True,
     )
     async def post(self, body: BatchCompleteRequest) -> Rendered:
-        """Complete many jobs that the caller claimed, in one transaction; each job is accepted or refused by itself."""
+        """Complete many claimed jobs in one transaction; each job is accepted or refused separately."""
         return await self.answer_with(
             lambda results: Reply(BatchCompleteAnswer(results=tuple(results))),
             completion.complete_many,

@@ -72,8 +72,8 @@ class ScheduleResource(Resource):
     async def patch(self, project: str, schedule: str, body: ScheduleChange) -> Rendered:
         """Change, pause or resume a schedule; only its author and the maintainers of the project may do this.
 
-        You become the author of the schedule, as whom its jobs are submitted, unless you only pause it or change its
-        description.
+        Any change except a pause or a new description makes you the author of the schedule; its jobs are then submitted
+        as you.
         """
         expected_rev = self.precondition.expected_rev
         return await self.answer(managing.change_schedule, project, schedule, body, expected_rev=expected_rev)
