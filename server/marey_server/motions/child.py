@@ -5,10 +5,10 @@ function and its argument.
 
 Messages between server and child are MessagePack that the receiver validates; nothing is pickled.
 
-The first arguments are the pipe's file descriptor, and the memory in bytes that orders may use. Then follows
-`FORK_SERVER` if the process forks children that carry out the orders, or `SINGLE` if it carries them out itself. The
-other arguments name what to load at the start: a module, or `module:function` with a function to call. The parent kills
-a child if an order takes too long, or if the client that waits for its result has closed the connection.
+The first arguments of the command are the pipe's file descriptor, and the memory in bytes that orders may use. Then
+follows `FORK_SERVER` if the process forks children that carry out the orders, or `SINGLE` if it carries them out
+itself. The other arguments name what to load at the start: a module, or `module:function` with a function to call. The
+parent kills a child if an order takes too long, or if the client that waits for its result has closed the connection.
 """
 
 from __future__ import annotations

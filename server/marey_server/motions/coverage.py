@@ -218,7 +218,10 @@ def advance_coverage(packed: bytes) -> bytes:
 
 
 def begin(request: CoverageStreamCreate, inputs: StreamInputs) -> BegunStream:
-    """Start a coverage stream, and return its state. Raises `InvalidProblem` if the skeleton cannot be used."""
+    """Start a coverage stream, and return its state.
+
+    Raises `InvalidProblem` if the skeleton or the evaluation cannot be used.
+    """
     from marey_motion.evaluation.online import OnlineCoverage
     from marey_schemas.options.evaluation import COVERAGE_LEAST_S, Grid
 

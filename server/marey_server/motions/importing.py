@@ -38,7 +38,7 @@ REFUSED_ALTOGETHER = (401, 403, 404, 499, 503, 507)
 """HTTP status codes of errors that concern the whole request and not a single file."""
 
 MAIN_KINDS = (Kind.CLIP, Kind.PROCESSED, Kind.MODEL, Kind.GRAPH, Kind.SKELETON, Kind.RECORD)
-"""Kinds of items of which each imported file contains at least one; it may contain annotations in addition."""
+"""Kinds of items: each imported file contains at least one item of these kinds, and may also contain annotations."""
 
 READ_FILE = "marey_server.motions.reading:read_file"
 FIND_MAPPING = "marey_server.motions.reading:find_mapping"

@@ -71,19 +71,25 @@ class PredecessorOptions:
         """Raise `InvalidProblem` if items of the kind do not have the requested part or layout."""
         if self.part is not None and self.part not in PARTS_OF.get(kind, ()):
             held = " or ".join(PARTS_OF.get(kind, ())) or "none"
-            detail = f"In the predecessor's format, a {kind} has no file for the part {self.part!r}; it has {held}."
+            detail = (
+                f"In the predecessor's format, an item of the kind {kind} has no file for the part {self.part!r}; "
+                f"it has {held}."
+            )
             raise InvalidProblem(detail, code="no-part")
         if self.layout is not None and self.layout not in LAYOUTS_OF.get(kind, ()):
             held = " or ".join(LAYOUTS_OF.get(kind, ())) or "none; leave it out"
-            detail = f"In the predecessor's format, a {kind} has no layout {self.layout!r}; it has {held}."
+            detail = (
+                f"In the predecessor's format, an item of the kind {kind} has no layout {self.layout!r}; it has {held}."
+            )
             raise InvalidProblem(detail, code="no-layout")
 
 
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
     """Return the file of Marey's predecessor from which an item was imported, or None if there is none.
 
-    Also return None if the requested part was changed since the import, or if `options` specify a layout or form, which
-    the imported file may not have. The documents in `parts` may contain references to arrays in place of the arrays.
+    Also return None if the requested part was changed since the import, or if `options` specify a layout, a form or
+    `end_index`, which the imported file may not have. The documents in `parts` may contain references to arrays in
+    place of the arrays.
     """
     if options.layout is not None or options.form is not None or options.end_index is not None:
         return None

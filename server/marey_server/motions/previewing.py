@@ -36,7 +36,7 @@ MAKE_PREVIEW = "marey_server.motions.previewing:make_preview"
 MOST_WORK = 5e9
 """Greatest cost of a preview, in nanoseconds of one thread (estimated). Jobs have no such limit."""
 MOST_NUMBERS = 50_000_000
-"""Greatest number of values in any intermediate motion."""
+"""Greatest number of values in all motions of the request together, and in any intermediate motion."""
 MOST_SHOWN = 5_000_000
 """Greatest number of values in the answer."""
 
@@ -166,7 +166,7 @@ def make_preview(packed: bytes) -> bytes:
     stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
     if start >= stop:
         frames = counted(wanted.clip.frame_count, "frame")
-        detail = f"The new clip has {frames}, and the range contains none of them; request frames below its number."
+        detail = f"The new clip has {frames}, and the range contains none of them; begin the range below this number."
         raise _invalid("/frames", "no-frames", detail)
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > order.most_shown:

@@ -106,7 +106,10 @@ def find_searchables(
 
 
 def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> LoadedSearchable:
-    """Read the documents of a model and its tree. Raises `NotFoundProblem` if the model's skeleton was deleted."""
+    """Read the documents of a model, and its tree and joint mapping if they exist.
+
+    Raises `NotFoundProblem` if the model's skeleton was deleted.
+    """
     tree, mapping = (None if part is None else items.load_part(tx, part) for part in (found.tree, found.mapping))
     return LoadedSearchable(models.load_model(tx, project, found.model), tree, mapping)
 

@@ -229,9 +229,9 @@ _RANKS: LruCache[tuple[str, ...], list[Any]] = LruCache(max_entries=4)
 class MappedShards:
     """Shards that a child process keeps mapped into memory between searches, at most `most_bytes` of files.
 
-    Up to a quarter of the processor time of a search would go into mapping them again, page by page. The mapped bytes
-    are added to the memory that the process may use: they are files that are only read, so the system can take their
-    memory back.
+    Otherwise, up to a quarter of the processor time of a search would go into mapping them again, page by page. The
+    mapped bytes are added to the memory that the process may use: they are files that are only read, so the system can
+    take their memory back.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -240,7 +240,8 @@ class MappedShards:
         )
         """Shards and sizes of their files, by the paths of poses and list of clips.
 
-        Anybody may write an index, which can name the poses of another index beside another list.
+        Both paths are needed: anybody may write an index, and it can combine the poses of one index with the list of
+        another.
         """
         self._allowed_bytes = 0
 
@@ -415,7 +416,10 @@ def _example(order: SimilarOrder) -> tuple[Example, float]:
 def _searched(
     order: SimilarOrder, files: ShardFiles, listed: ListedShard, ranks: Any, rate_hz: float, example: Example
 ) -> SearchedShard:
-    """Return a shard to search, without dropped clips, and without clips that changed since the index was updated."""
+    """Return a shard to search, without dropped clips, and without clips that changed since the index was updated.
+
+    The clip of the example, or its moments near the example, are left out as well if the request asks for this.
+    """
     import numpy as np
 
     from marey_motion.similarity.shard_search import SearchedShard
