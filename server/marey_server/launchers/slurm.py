@@ -132,7 +132,7 @@ class SlurmLauncher:
     async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
         """Submit an array job, in which each task is a worker.
 
-        If Slurm has a job with this name already, nothing is submitted.
+        The job is named after the pool and `key`. If Slurm has a job with this name already, nothing is submitted.
         """
         job_name = f"{self._context.pool}-{key}"
         names = tuple(f"{job_name}-{number}" for number in range(1, count + 1))
@@ -152,7 +152,7 @@ class SlurmLauncher:
         )
 
     async def stop(self, names: tuple[str, ...]) -> None:
-        """Send SIGTERM to the workers; cancel tasks that wait, and workers that do not end in time."""
+        """Send SIGTERM to the workers; cancel waiting tasks, and workers that got SIGTERM over `STOP_S` seconds ago."""
         tasks = {task.name: task for task in await self._tasks() if task.name in names}
         alive = {name: task for name, task in tasks.items() if task.worker_state != "ended"}
         now_s = time.monotonic()

@@ -80,7 +80,7 @@ class Parent:
         self._sockets = sockets
         self._metrics_sockets = metrics_sockets
         self._current: dict[int, ProcessHandle] = {}
-        """The process in each place; a process that is being replaced, or was replaced, is not here."""
+        """The current process of each number; a process that was replaced is not here, even while it is stopping."""
         self._living: set[ProcessHandle] = set()
         self._changing = {number: asyncio.Lock() for number in range(1, settings.processes + 1)}
         self._has_workers = bool(settings.local_workers or settings.pools)
@@ -198,9 +198,9 @@ class Parent:
             log.error("%s", error)
 
     def _note_end(self, process: ProcessHandle, status: int) -> None:
-        """Count an ended process as failed if it ran only shortly.
+        """Count an ended process as failed if it ran for less than `HEALTHY_AFTER_S` seconds.
 
-        Raises `ProcessesFailed` after several failures in a row.
+        Raises `ProcessesFailed` after `MOST_FAILURES` failures in a row, unless another process is healthy.
         """
         self._failures = self._failures + 1 if process.age_s < HEALTHY_AFTER_S else 0
         healthy = any(one.is_ready and one.runs and one.age_s >= HEALTHY_AFTER_S for one in self._current.values())
@@ -211,7 +211,7 @@ class Parent:
             )
 
     def _give_workers(self) -> None:
-        """Let one process run the workers if no process runs them, because that process has ended or is stopping."""
+        """Let a process that is ready run the workers if the process that ran them has ended or is stopping."""
         if not self._has_workers or (self._worker_keeper is not None and self._worker_keeper.runs):
             return
         ready = [one for one in self._current.values() if one.is_ready and one.runs]

@@ -64,11 +64,11 @@ class DispatchPlan:
     most_of_project: int | None = None
     patience_s: float = float("inf")
     _lacking: int = 0
-    """Number of starts that had no place in the last decision, without those in `_lacking_of`."""
+    """Number of starts that the last decision postponed, without those in `_lacking_of`."""
     _lacking_of: dict[str, int] = field(default_factory=dict)
-    """Number of starts that had no place, for each project with `most_of_project` pods.
+    """Number of starts that the last decision postponed, for each project that has its greatest number of pods.
 
-    Only the deletion of pods of the same project makes a place for such a start.
+    Such a start is possible only after pods of the same project were deleted or have ended.
     """
     _stuck_since_s: dict[str, float] = field(default_factory=dict)
     _next_s: dict[str, float] = field(default_factory=dict)
@@ -92,10 +92,10 @@ class DispatchPlan:
         return [_start(group, numbers) for group in self._share(_grouped(due, numbers), jobs.values())]
 
     def step_back(self, now_s: float, stuck: Mapping[str, Mapping[str, Any]]) -> list[str]:
-        """Return the names of Kubernetes Jobs to delete, oldest first, so that other waiting jobs get their places.
+        """Return the names of Kubernetes Jobs to delete, longest stuck first, so that other waiting jobs can get pods.
 
         `stuck` contains the Kubernetes Jobs whose pods no node runs, by name. Only Jobs that have been stuck for
-        `patience_s` seconds are deleted, and at most one for each start that had no place in the last call of `decide`.
+        `patience_s` seconds are deleted, and at most one for each start that the last call of `decide` postponed.
         """
         self._stuck_since_s = {name: self._stuck_since_s.get(name, now_s) for name in stuck}
         late = [name for name, since_s in self._stuck_since_s.items() if now_s - since_s >= self.patience_s]

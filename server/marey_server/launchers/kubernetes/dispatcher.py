@@ -139,7 +139,7 @@ class Dispatcher:
             await self._postpone(asked[name], f"the cluster refused the pod: {reason}", AFTER_REFUSAL_S)
 
     async def _step_back(self) -> None:
-        """Delete pods that no node has run for long if other jobs wait for a place; their jobs start again later."""
+        """Delete pods that have long waited for a node if other jobs need pods; the jobs of these pods start later."""
         jobs = dict(self._jobs.view.jobs)
         stuck = stuck_jobs(jobs, self._jobs.view.pods.values())
         pause_s = self._rules.patience_s
@@ -197,7 +197,10 @@ class Dispatcher:
     # -- ends --
 
     async def _delete_finished(self) -> None:
-        """Delete the Kubernetes Jobs that still run some seconds after their queue job has ended or was purged."""
+        """Delete the unfinished Kubernetes Jobs whose queue job has ended or was purged.
+
+        A Kubernetes Job with pods is deleted only `DELETE_AFTER_S` seconds after the end of its queue job was noticed.
+        """
         alive = {name: job_of(job) for name, job in self._jobs.view.jobs.items() if not is_over(job)}
         unfinished = await self._read(lambda tx: read_unfinished(tx, sorted(set(alive.values()))))
         over = [name for name, job_id in alive.items() if job_id not in unfinished]

@@ -53,7 +53,7 @@ class Pool:
 
 
 def job_labels(pool: str, options: ClusterOptions) -> dict[str, str]:
-    """Return the labels of the Jobs of a pool, and of their pods; no other objects have all of them."""
+    """Return the labels of the Jobs of a pool, and of their pods; no other Jobs or pods have all of them."""
     return {
         "app.kubernetes.io/name": "marey",
         "app.kubernetes.io/instance": options.instance,
