@@ -397,7 +397,7 @@ class Children:
         )
 
     def _kernel_lacked_memory(self) -> bool:
-        """Return whether the kernel has killed a process for lack of memory since this was last asked."""
+        """Return whether the kernel has killed a process for lack of memory since the last call of this method."""
         before, self._memory_kills = self._memory_kills, count_memory_kills()
         return self._memory_kills > before
 

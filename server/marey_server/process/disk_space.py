@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class DiskSpace:
-    """Free space of the disk that holds a folder; below `floor_bytes`, only deletions and heartbeats are allowed."""
+    """Free space of the disk that holds a folder; below `floor_bytes`, `require` allows nothing to be stored."""
 
     def __init__(self, folder: Path, floor_bytes: int) -> None:
         self._folder = folder

@@ -176,7 +176,7 @@ async def _commit_outputs(services: Services, holder: str, *, listener: Listener
 
 
 async def _propagate_ends(services: Services, _holder: str, *, listener: Listener, longest_wait_s: float) -> None:
-    """Propagate the ends of jobs that other transactions have left, in short transactions.
+    """Propagate, in short transactions, the ends of jobs that earlier transactions have not propagated completely.
 
     First wait until there are such ends, but at most `longest_wait_s` seconds, because another process may have ended.
     After an unexpected error, the ends concerned must wait until all others are propagated.

@@ -19,7 +19,7 @@ from marey_server.store.transaction import Observer
 
 REFRESH_S = 10.0
 REST = 20
-"""Least time between two reads of the database, in seconds and as a multiple of the duration of the last read."""
+"""Least time between two reads of the database: `REST` times the duration of the last read, at least `REFRESH_S`."""
 _CLAIM_DELAYS_S = (0.01, 0.05, 0.1, 0.5, 1, 5, 30, 120, 600, 3600, 6 * 3600, 86400)
 
 

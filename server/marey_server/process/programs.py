@@ -17,7 +17,7 @@ async def start_program(
     inherit the standard input. Raises `OSError` if the process cannot be started.
 
     The process gets a session of its own: Ctrl-C in the terminal of the server reaches only the server, which
-    then stops the process. A process that is still loading modules would print a traceback.
+    then stops the process. Otherwise, a process that is still loading modules would print a traceback.
     """
     return await asyncio.create_subprocess_exec(
         sys.executable, *arguments, stdin=stdin, pass_fds=inherited, env=environment, start_new_session=True

@@ -32,7 +32,7 @@ CROWD = 32
 """Number of requests above which there is a crowd: requests that wait for their turn, and delayed refusals.
 
 In a crowd, refusals of clients with many requests at once are delayed earlier and for longer. Delayed refusals count,
-because otherwise the delays would end the crowd and bring it back at once.
+because otherwise the delays would end the crowd, and the end of the delays would bring it back.
 """
 FEW_AT_ONCE = 3
 """Number of simultaneous requests up to which a client does not belong to a crowd.

@@ -130,9 +130,9 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
         10,
         ge=1,
         description="Greatest number of wrong passwords per minute for one user name from one address (in IPv6, one "
-        "network of 64 bits). For all names from one address, the limit is ten times as high. Addresses from which a "
-        "user has not signed in for 90 days share another limit for this user's name: ten times as many at once, then "
-        "this number per minute.",
+        "network of 64 bits). For all names from one address, the limit is ten times as high. All addresses from "
+        "which a user has not signed in for 90 days share one more limit for this user's name: at first ten times this "
+        "number of wrong passwords, and then this number per minute.",
     )
     name_guesses_per_hour: int = Field(
         20,
@@ -177,8 +177,8 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     user_daily_bytes: int = Field(
         Quotas.user_daily_bytes,
         ge=0,
-        description="Number of bytes that a user may send at once, and then per day; bytes that the server has already "
-        "do not count.",
+        description="Number of bytes that a user may send without waiting, and after that on each further day; bytes "
+        "that the server has already do not count.",
     )
     user_tokens: int = Field(
         Quotas.user_tokens, ge=0, description="Greatest number of valid tokens of a user, not counting sign-ins."
@@ -196,8 +196,8 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     user_daily_inputs: int = Field(
         Quotas.user_daily_inputs,
         ge=0,
-        description="Number of inputs of jobs, with those of their tasks, that a user may submit at once, and then per "
-        "day.",
+        description="Number of inputs of jobs, with those of their tasks, that a user may submit without waiting, and "
+        "after that on each further day.",
     )
     user_followers: int = Field(
         256,

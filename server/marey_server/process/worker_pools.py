@@ -83,7 +83,10 @@ class OwnPods(BaseModel):
 
     most: int = Field(20, ge=1, le=1000, description="Greatest number of pods at the same time.")
     most_of_project: int | None = Field(
-        None, ge=1, le=1000, description="Greatest number of pods of one project at the same time. Absent: most."
+        None,
+        ge=1,
+        le=1000,
+        description="Greatest number of pods of one project at the same time. Absent: the same number as in `most`.",
     )
     patience_s: int = Field(
         600,

@@ -44,7 +44,9 @@ class ClusterOptions(BaseModel):
     cache_mb: int = Field(2048, ge=16, description="Space of a worker in MiB for cached inputs.")
     scratch_mb: int = Field(4096, ge=256, description="Space of a worker in MiB for temporary files.")
     gpu_resource: str = Field(
-        "nvidia.com/gpu", description="Name of the resource of which a worker gets the number `gpus` of its pool."
+        "nvidia.com/gpu",
+        description="Name of the cluster's resource for graphics processors. Each worker gets as many as its pool sets "
+        "in `gpus`.",
     )
     node_selector: dict[str, str] = Field(
         default_factory=dict, description="Labels that nodes must have to run workers."
