@@ -374,6 +374,11 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
         return Retention(self.events_days, self.logs_days, self.jobs_days, self.audit_days)
 
     @property
+    def starts_workers(self) -> bool:
+        """Whether the server starts workers: processes on its machine, workers in pools, or pods for single jobs."""
+        return bool(self.local_workers or self.pools or self.own_pods)
+
+    @property
     def resolved_database_threads(self) -> int:
         """Return the number of threads for reads.
 

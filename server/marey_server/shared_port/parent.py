@@ -83,7 +83,7 @@ class Parent:
         """The current process of each number; a process that was replaced is not here, even while it is stopping."""
         self._living: set[ProcessHandle] = set()
         self._changing = {number: asyncio.Lock() for number in range(1, settings.processes + 1)}
-        self._has_workers = bool(settings.local_workers or settings.pools)
+        self._has_workers = settings.starts_workers
         self._worker_keeper: ProcessHandle | None = None
         self._failures = 0
         self._announced = False

@@ -8,6 +8,7 @@ import signal
 import socket
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,6 +17,7 @@ from marey_server import commands
 from marey_server.http.accepting import listen
 from marey_server.process import notices, programs
 from marey_server.process.settings import Settings
+from marey_server.process.worker_pools import OwnPods
 from marey_server.process_program import share_of
 from marey_server.shared_port import handles, parent
 from marey_server.shared_port.parent import Parent, ProcessesFailed
@@ -35,9 +37,13 @@ class Played:
         """Set the behaviour of processes that start from now on."""
         (self.folder / "behaviour").write_text(how)
 
-    async def play(self, script: Callable[[Parent], Awaitable[None]]) -> None:
-        """Run the parent until a script has ended, or until the parent fails."""
-        settings = Settings(data=self.folder / "data", processes=2, local_workers=1, drain_s=1)
+    async def play(self, script: Callable[[Parent], Awaitable[None]], **workers: Any) -> None:
+        """Run the parent until a script has ended, or until the parent fails.
+
+        `workers` are the settings of the workers that it starts, by default one on this machine.
+        """
+        chosen = workers or {"local_workers": 1}
+        settings = Settings(data=self.folder / "data", processes=2, drain_s=1, **chosen)
         sockets = listen("127.0.0.1", 0)
         tested = Parent(settings, {"folder": str(self.folder)}, sockets, ())
 
@@ -120,13 +126,16 @@ def test_processes_are_replaced_one_by_one_and_the_workers_move(played: Played) 
     assert [line for line in played.received if "keep-workers" in line] == [f"{new[0]} keep-workers"]
 
 
-def test_a_process_that_ends_is_started_again_and_another_gets_its_workers(played: Played) -> None:
+@pytest.mark.parametrize("workers", [{"local_workers": 1}, {"launcher": "kubernetes", "own_pods": OwnPods()}])
+def test_a_process_that_ends_is_started_again_and_another_gets_its_workers(
+    played: Played, workers: dict[str, Any]
+) -> None:
     async def script(_: Parent) -> None:
         await until(lambda: played.notices() == ["READY=1"])
         os.kill(played.started[0], signal.SIGKILL)
         await until(lambda: len(played.started) == 3)
 
-    asyncio.run(played.play(script))
+    asyncio.run(played.play(script, **workers))
     _, second, _ = played.started
     assert [line for line in played.received if "keep-workers" in line] == [f"{second} keep-workers"]
 
