@@ -115,7 +115,8 @@ class Marey:
         """Return a project by its name, without a request. Raises `BadArgument` for the path of a folder."""
         known, slash, path = name.partition("/")
         if slash:
-            raise BadArgument(f"project: {name!r} is a path; the project is {known!r}, and {path!r} a path in it")
+            folder = f", and name the folder {path!r} in the methods of the project" if path else ""
+            raise BadArgument(f"project: {name!r} is a path; give only the name of the project, {known!r}{folder}")
         if name in ("", ".", ".."):
             raise BadArgument(f"project: {name!r} is not the name of a project; `marey project ls` lists the names")
         return ProjectHandle(self.transport, name)

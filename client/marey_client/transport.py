@@ -382,8 +382,8 @@ def read_model(answer: type[Model], response: httpx.Response) -> Model:
             raise UnexpectedAnswer(not_of_marey(response)) from error
         raise UnexpectedAnswer(
             f"{response.request.method} {response.request.url.path}: this client cannot read the server's answer "
-            f"({first_reason(error, answer)}); update the older of the two: `marey --version` shows the version of the "
-            "client"
+            f"({first_reason(error, answer)}); client and server have different versions: `marey doctor` shows both; "
+            "update the older one"
         ) from error
 
 

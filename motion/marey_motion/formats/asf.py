@@ -351,7 +351,9 @@ class _AsfReader:
         loose = next((name for name in self.bones if name not in placed), None)
         if loose is not None:
             raise self.lines.error(
-                "the section :hierarchy does not connect this bone to the root; add a parent of the bone", joint=loose
+                "the section :hierarchy does not connect this bone to the root; give this bone, or the topmost "
+                "bone above it, a parent that is connected",
+                joint=loose,
             )
         return AsfSkeleton(
             bones,

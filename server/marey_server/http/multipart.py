@@ -62,7 +62,7 @@ class MultipartReader:
     def __init__(self, boundary: bytes, *, max_parts: int) -> None:
         self._first_delimiter = b"\r\n--" + boundary
         self._preamble: bytes | None = b"\r\n"  # None once the first delimiter was found
-        self._parts_left = max_parts
+        self._most_parts = self._parts_left = max_parts
         self._pieces: list[Piece] = []
         self._head_bytes = 0
         self._name, self._value = bytearray(), bytearray()
@@ -115,7 +115,8 @@ class MultipartReader:
     def _begin_part(self) -> None:
         if self._parts_left == 0:
             raise TooLargeProblem(
-                "The multipart body has too many parts; send the files in several requests.", code="too-many-parts"
+                f"The multipart body has more than {self._most_parts:,} parts; send fewer files in each request.",
+                code="too-many-parts",
             )
         self._parts_left -= 1
         self._head_bytes = 0

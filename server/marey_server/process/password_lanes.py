@@ -65,8 +65,8 @@ class PasswordLane:
         """
         if self._places[address] >= PLACES_PER_ADDRESS:
             raise TooManyRequestsProblem(
-                f"Your address already has {PLACES_PER_ADDRESS} sign-ins in progress, which is the limit; "
-                "wait until one of them has ended.",
+                f"{PLACES_PER_ADDRESS} requests from your address are checking or setting passwords now, which is the "
+                "limit; try again in a second.",
                 code="too-many-sign-ins",
                 headers={"Retry-After": "1"},
             )

@@ -71,9 +71,10 @@ def find_index(tx: Transaction, project: str, index: str | None) -> FoundIndex:
     )
     row = tx.execute(statement).one_or_none()
     if row is None or reach.unreachable_items(tx, [row.id]):
-        what = "This project has no index of motions" if index is None else f"There is no index {index!r}"
         raise NotFoundProblem(
-            f"{what}; `marey index {project}` builds one.",
+            f"This project has no index of motions; `marey index {project}` builds one."
+            if index is None
+            else f"There is no index {index!r}; without an id, the index that was updated last is searched.",
             code="no-index",
             unnamed="There is no such index of motions.",
         )

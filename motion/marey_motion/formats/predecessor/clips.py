@@ -67,9 +67,9 @@ def motion_of_document(
         return read_skeleton_document(document, file)
     if skeleton is None:
         raise FormatError(
-            "a clip document contains no hierarchy of its joints; import it together with its skeleton document, whose "
-            "name must end in 'skeleton', such as skeleton.json (of several in a folder, the one for walk_01 is "
-            "walk_skeleton.json), or name a skeleton of the project with --skeleton (skeleton)",
+            "a clip document contains no hierarchy of its joints; import it together with its skeleton document, "
+            "which is called skeleton.json or, for walk_01 in a folder with several, walk_skeleton.json; or name a "
+            "skeleton of the project with --skeleton (in requests: skeleton)",
             code="skeleton-missing",
             file=file,
         )

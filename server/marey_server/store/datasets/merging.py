@@ -117,7 +117,9 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
             code="is-merge",
         )
     if parent is not None and parent > max(1, len(picked.parents)):
-        raise InvalidProblem(f"The commit has no parent {parent}; parents are numbered from 1.", code="no-parent")
+        raise InvalidProblem(
+            f"The commit is no merge, so it has no parent {parent}; leave `parent` out.", code="no-parent"
+        )
     return picked.parents[(parent or 1) - 1] if picked.parents else None
 
 

@@ -211,7 +211,9 @@ def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedC
     tree = change(store, before, changes)
     if tree != record.tree:
         raise InvalidProblem(
-            f"The changes give a version with the tree {tree}, but the commit names {record.tree}.", code="other-tree"
+            f"The changes give a version with the tree {tree}, but the commit names {record.tree}. Send all changes "
+            "between the commit and its first parent.",
+            code="other-tree",
         )
     return PreparedReceipt(found.id, record, len(Tree(store, tree)), store.new, last)
 

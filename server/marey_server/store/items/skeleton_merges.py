@@ -238,8 +238,8 @@ def _rigs(
     found = [rig for rig in rigs if rig[1] and (request.kept in (None, rig[0].row.id))]
     if sum(one.user_count for _, merged in found for one in merged) > MOST_MOVED:
         raise TooLargeProblem(
-            f"One merge changes at most {MOST_MOVED} clips and models, and more use these skeletons; name some of the "
-            "skeletons to merge."
+            f"One merge changes at most {MOST_MOVED} clips and models, and more use these skeletons; name the "
+            "skeletons to merge, and fewer at a time."
         )
     return found
 
@@ -266,7 +266,7 @@ def _require_same_mapping(kept: _Skeleton, merged: _Skeleton, request: SkeletonM
             "somebody made or confirmed; choose the skeleton that remains with --keep (in requests: kept).",
             code="mappings-differ",
             unnamed="A joint map that somebody made or confirmed differs from the joint map of another skeleton; "
-            "choose the skeleton that remains (kept).",
+            "choose the skeleton that remains with --keep (in requests: kept).",
         )
 
 
