@@ -154,7 +154,12 @@ def move(
 
 
 @annotation.command()
-def relabel(context: typer.Context, place: Place, at: At, label: Label) -> None:
+def relabel(
+    context: typer.Context,
+    place: Place,
+    at: At,
+    label: Annotated[str, typer.Argument(help="New label of the segment.")],
+) -> None:
     """Give a segment another label."""
     _apply(context, place, command="relabel_segment", at=at, label=label)
 

@@ -235,7 +235,8 @@ def retry_job(
     dependants: Annotated[
         bool,
         typer.Option(
-            "--dependants/--no-dependants", help="Also submit the jobs again that did not run only because of this job."
+            "--dependants/--no-dependants",
+            help="Also retry jobs that failed or were cancelled only because this job did not succeed.",
         ),
     ] = True,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")] = False,

@@ -57,7 +57,7 @@ def create(
     """Create a schedule: the server submits a job, as you, at the times of a cron expression.
 
     The file contains the job as `POST /projects/{project}/jobs` takes it, for example {"kind": "evaluate", "inputs":
-    {"clips": {"collection": "studio"}}}. Its inputs are the newest revisions at each time.
+    {"clips": {"collection": "studio"}}}. Inputs without a revision have their newest revision at each time.
     """
     from marey_schemas.queue.jobs import JobCreate
 
