@@ -143,9 +143,11 @@ def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.b
 
 
 def _frame_of_bones(by_rest: Floats, bones: Floats, partners: Floats) -> Floats:
-    """Find the improper matrix (3, 3) nearest to `by_rest` that maps the bones of a source to the bones of a joint.
+    """Find the mirroring matrix (3, 3) that best maps `partners` to `bones`.
 
-    `bones` (n, 3) are the offsets of the joint's children, `partners` (n, 3) the offsets of the source's children.
+    `bones` (n, 3) are the offsets of a joint's children, and `partners` (n, 3) those of the children of the joint whose
+    motion it gets. `by_rest` is the matrix according to the rest poses. It is returned if it maps the directions of
+    the bones well enough. If the bones do not determine a matrix, it is rotated until the main direction fits.
     """
     seen = partners @ by_rest.T
     lengths = np.linalg.norm(bones, axis=1) * np.linalg.norm(seen, axis=1)

@@ -134,7 +134,10 @@ def published_entry(entry: ImportEntry, made: Mapping[str, Made]) -> ImportEntry
 
 
 def published_result(result: Mapping[str, Any], made: Mapping[str, Made]) -> dict[str, Any]:
-    """Return the result of an import job with its entries completed; `made` as in `published_entry`."""
+    """Return the result of an import job after its revisions were published; `made` is as in `published_entry`.
+
+    Its entries are those of `published_entry`, and its numbers of clips and frames those that were stored.
+    """
     read = ImportAnswer.model_validate(result).entries
     entries = [published_entry(entry, made) for entry in read]
     stored = [entry for entry in entries if entry.error is None]

@@ -102,9 +102,10 @@ def references_in(body: Any) -> Iterator[RevisionKey]:
 
 
 def document_content(body: Any, content_of: Callable[[RevisionKey], str | None]) -> str:
-    """Return the content digest of a stored document with references.
+    """Return the digest of a stored document in which content digests replace references to revisions.
 
-    `content_of` returns the content digest of a revision. If it returns None, the reference remains unchanged.
+    So the digest is equal on all servers. `content_of` returns the content digest of a revision. If it returns None,
+    the reference to this revision is not replaced.
     """
     return digest_of(_canonical(portable_document(body, content_of)))
 

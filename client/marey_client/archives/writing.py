@@ -315,7 +315,10 @@ class _EntryPair(NamedTuple):
 
     @property
     def unchanged(self) -> dict[str, str]:
-        """The content digest of the entry's revision before the commit, by the name of each unchanged part."""
+        """Names of the parts that did not change, each with the content digest of the revision before the commit.
+
+        Empty if the commit added or removed the entry.
+        """
         if self.after is None or self.before is None:
             return {}
         parts = self.after.parts.items() & self.before.parts.items()

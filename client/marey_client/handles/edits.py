@@ -21,7 +21,7 @@ class EditHandle(ItemHandle):
     """Handle of an edit: a saved list of commands with a title."""
 
     def document(self, *, revision: int | None = None) -> EditDocument:
-        """Return the edit's title and commands."""
+        """Return the edit's title and commands; default: those of the newest revision."""
         return EditDocument.model_validate(self.part("edit", revision=revision))
 
     def put(self, edit: EditDocument, *, message: str | None = None) -> Item:

@@ -272,7 +272,7 @@ def corrected(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...]:
 
     Parameters
     ----------
-    changes : sequence of MetricChange    with uncorrected probabilities
+    changes : sequence of MetricChange    with p-values that are not corrected for multiple comparisons
 
     Returns
     -------
@@ -291,7 +291,7 @@ def corrected_family(changes: Sequence[MetricChange]) -> tuple[MetricChange, ...
 
     Parameters
     ----------
-    changes : sequence of MetricChange    with uncorrected probabilities
+    changes : sequence of MetricChange    with p-values that are not corrected for multiple comparisons
 
     Returns
     -------

@@ -4,7 +4,7 @@ A trial counts as followed if the character keeps the desired place, speed and h
 while they are in contact, it steps as often as the clips, and its poses follow each other smoothly. Each measure is
 divided by its limit; the result is the *strain*. The share of followed trials gives the grade: from 75 % very good,
 from 55 % good, from 30 % usable in part, below that poor. A share much above 75 % can hardly be reached. With clips
-generated for every cell of the default grid, 76 % of the trials are followed (97 % of the circles, and 57 % of the
+generated for every cell of the default grid, 76 % of the trials are followed (95 % of the circles, and 57 % of the
 trials with changes of speed). In tight turns, motion matching does not respond to many of these changes.
 """
 
@@ -192,7 +192,7 @@ def judge(result: EvaluationResult) -> Judgement:
 
 
 def judge_trial(outcome: TrialResult, limits: VerdictLimits) -> TrialVerdict:
-    """Compare every measure of a trial with its limit.
+    """Compare the measures of a trial with their limits.
 
     Parameters
     ----------
@@ -201,7 +201,8 @@ def judge_trial(outcome: TrialResult, limits: VerdictLimits) -> TrialVerdict:
 
     Returns
     -------
-    TrialVerdict    the checks; measures of looks that are not defined are left out
+    TrialVerdict    the checks. Place and turn rate are always checked; a measure that is not defined for this trial is
+        left out
     """
     path = (
         _check("place", outcome.metrics, "offset_mean", limits.lag_s * mean_speed_m_s(outcome.trial)),

@@ -72,7 +72,9 @@ class LooksMeter:
         self.clips = clip_looks(database)
 
     def measure(self, trial: Trial, record: TrialRecord, window: Flags) -> dict[str, float | None]:
-        """Measure how the simulated motion of a trial looks: feet, steps on the spot, smoothness, and errors of poses.
+        """Measure how the simulated motion of a trial looks: feet, steps on the spot, and errors of poses.
+
+        Feet and changes of pose of the displayed clips are measured, too, for comparison; these names end in `_clips`.
 
         Parameters
         ----------
@@ -82,7 +84,8 @@ class LooksMeter:
 
         Returns
         -------
-        dict of str to float or None    metrics by name; None if a metric is not defined
+        dict of str to float or None    metrics by name; None if a metric is not defined. Errors of poses are contained
+            only for trials along takes.
         """
         shown = self._shown(record.rows[1:][window])
         return {

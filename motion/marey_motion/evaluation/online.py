@@ -197,7 +197,7 @@ class OnlineCoverage:
 
     @property
     def seconds(self) -> Floats:
-        """Seconds of data in each cell, (V, O)."""
+        """Seconds of data in each cell of the grid, (V, O): V intervals of speed, O intervals of turn rate."""
         return self._before + self.counts / self._live.rate_hz
 
     @property

@@ -194,7 +194,10 @@ def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Floats:
 
 
 def _left_and_right(skeleton: Skeleton, reading: LimbReading, left: Floats) -> tuple[tuple[int, int], bool]:
-    """Sort a pair of limbs, the left limb first; also return whether the joint names show the sides."""
+    """Return the indices of the left and of the right limb in a pair, and whether the joint names show the sides.
+
+    `left` is the direction to the left of the body.
+    """
     first, second = reading.pair.limbs
     sides = [
         {parse_name(skeleton.display_names[joint]).side for joint in limb.chain} - {""} for limb in (first, second)

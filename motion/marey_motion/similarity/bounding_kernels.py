@@ -113,10 +113,11 @@ def bounds_within(q, reaches, centres, radii, begin, end, tables, vectors, x, ra
 
 @contracted
 def pose_bounds(query, reaches, centres, radii, ranges, tables, vectors, out):
-    """Fill out (G, balls) with lower bounds of the distances from G balls of samples to the rows in each ball.
+    """Fill `out` (G, B): a lower bound of the distances from each of G balls of samples to the rows in B balls of rows.
 
-    query (G, width) and reaches (G, 41) are the centres and radii of the balls of samples. ranges (n, 2) lists the
-    half-open ranges of balls to which `tables` apply; out does not change for other balls.
+    `query` (G, width) and `reaches` (G, 41) are the centres and radii of the balls of samples; `centres` and `radii`
+    are those of the balls of rows. `ranges` (n, 2) lists the half-open ranges of balls of rows to which `tables` apply.
+    Columns of `out` for other balls of rows do not change.
     """
     x, raw, total = np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.float32)
     for place in range(ranges.shape[0]):

@@ -118,7 +118,10 @@ class _SheetRow:
 
     @property
     def height_m(self) -> float:
-        """Height of the row's figures, by which their heads and their patches of floor are scaled."""
+        """Height from the lowest to the highest drawn point of the row, including the floor y = 0.
+
+        Heads and patches of floor are scaled by it.
+        """
         low, high = self.extent_m
         return high - low
 

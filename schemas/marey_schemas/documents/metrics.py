@@ -244,7 +244,7 @@ class MetricIdentity(Request):
 
 
 def built_in_names() -> tuple[str, ...]:
-    """Return the names of all metrics that need no item."""
+    """Return the names of the built-in metrics, which no project has to store."""
     shapings = tuple(PUBLISHED["angles"])
     ways = [*shapings, *(f"{measurement}-{shaping}" for measurement in MEASUREMENTS for shaping in shapings)]
     return tuple(f"{origin}/{way}" for origin in ("published", "uniform") for way in ways)

@@ -44,7 +44,10 @@ class OutputsCommit(Request):
 
     @classmethod
     def at(cls, place: str, **fields: Any) -> OutputsCommit:
-        """Return the commit to a place `dataset[@branch][/folder]`. Raises `ValueError` for a text of another form."""
+        """Return the description of a commit of results to `place`, a text of the form `dataset[@branch][/folder]`.
+
+        Raises `ValueError` for a text of another form.
+        """
         match = _PLACE.fullmatch(place.strip())
         if match is None:
             raise ValueError(f"{place!r} names no branch of a dataset; write dataset[@branch][/folder]")

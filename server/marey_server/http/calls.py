@@ -224,7 +224,11 @@ def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
 
 
 def find_first_answer(caller: Caller, idempotent: IdempotentRequest, tx: Transaction) -> Rendered | None:
-    """Return the answer to an earlier, equal request with the same idempotency key, or None if there is none."""
+    """Return the answer to an earlier, equal request with the same idempotency key, or None if the key is new.
+
+    Raises `InvalidProblem` if the key was used for another request, and refuses callers who have lost their role in the
+    project since.
+    """
     caller.identify(tx)
     stored = idempotency.find(tx, idempotent.key, idempotent.fingerprint)
     return None if stored is None else _repeated(tx, caller, idempotent, stored)

@@ -253,10 +253,11 @@ def writes(
     precondition : `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts both
     idempotency : `key` accepts Idempotency-Key; `nature` means that a repeated request has no further effect
     answer, also, headers, reserved, attempts, compressed : as for `reads`
-    replays : whether an ended attempt may repeat the request
+    replays : whether an attempt of a job may repeat the request after the attempt has ended
     in_folders : whether members who have the role only in some folders may use the method in these folders; the
         function that the method calls must check the role in the folder
-    names : whether the answer, which has no ETag, names content of the project; then callers need the scope `read`, too
+    names : whether the answer names content of the project, such as the conflicts of a merge; then callers need the
+        scope `read`, too, as they do for an answer with an ETag
     """
     if access is Access.READER:
         raise TypeError("A method that changes a project requires at least the role contributor.")

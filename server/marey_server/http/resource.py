@@ -140,7 +140,7 @@ class Resource(CallingExchange):
         return idempotent_request(self.request, self._received, **place)
 
     async def _first_answer(self) -> Rendered | None:
-        """Return the answer to an earlier, equal request with the same idempotency key, or None if there is none."""
+        """Return the answer to an earlier, equal request with the same idempotency key, or None if the key is new."""
         idempotent = self._idempotent()
         return None if idempotent is None else await self._read(partial(find_first_answer, self.caller, idempotent))
 

@@ -87,9 +87,9 @@ class PredecessorOptions:
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
     """Return the file of Marey's predecessor from which an item was imported, or None if there is none.
 
-    Also return None if the requested part was changed since the import, or if `options` specify a layout, a form or
-    `end_index`, which the imported file may not have. The documents in `parts` may contain references to arrays in
-    place of the arrays.
+    Also return None if the requested part was changed since the import, or if `options` set `layout`, `form` or
+    `end_index`, because the imported file may be written in another way. The documents in `parts` may contain
+    references to arrays in place of the arrays.
     """
     if options.layout is not None or options.form is not None or options.end_index is not None:
         return None

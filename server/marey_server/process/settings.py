@@ -388,7 +388,10 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
 
     @property
     def resolved_database_url(self) -> str:
-        """Return the URL of the database, by default an SQLite file in the data folder."""
+        """Return the URL of the database, by default of an SQLite file in the data folder.
+
+        The URL contains the password in `database_password_file`, so it must not be logged.
+        """
         url = self.database_url or f"sqlite:///{(self.data / 'marey.db').absolute()}"
         if self.database_password_file is None:
             return url

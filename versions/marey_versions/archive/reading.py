@@ -40,7 +40,7 @@ from marey_versions.tree.reading import Tree
 
 @dataclass(frozen=True)
 class Manifest:
-    """Content of the last member of an archive."""
+    """Manifest of an archive, its last member: the dataset, the exported commit, and the commits that it needs."""
 
     dataset: str
     """Name that the dataset had on its server."""

@@ -21,7 +21,7 @@ class AsyncEditHandle(AsyncItemHandle):
     _sync: EditHandle
 
     async def document(self, *, revision: int | None = None) -> EditDocument:
-        """Return the edit's title and commands."""
+        """Return the edit's title and commands; default: those of the newest revision."""
         return await self._run(self._sync.document, revision=revision)
 
     async def put(self, edit: EditDocument, *, message: str | None = None) -> Item:

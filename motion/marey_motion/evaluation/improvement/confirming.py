@@ -169,7 +169,10 @@ def _with_added(
 def _addition_effects(
     confirming: Resimulation, how: SuggestionOptions, steps: Sequence[Addition], outside: Sources, stages: _Stages
 ) -> list[Effect]:
-    """Measure the effect of each addition, with uncorrected probabilities; `outside` are the sources to be added."""
+    """Measure the effect of each addition, with p-values that are not corrected for multiple comparisons.
+
+    `outside` are all sources to be added, which are absent before the first addition.
+    """
     states = [outside]
     for step in steps:
         states.append(states[-1] - {step.filling.source})
@@ -182,7 +185,7 @@ def _addition_effects(
 def _plan_effects(
     confirming: Resimulation, how: SuggestionOptions, plan: Sequence[PlannedRemoval], gone: Sources, stages: _Stages
 ) -> list[Effect]:
-    """Measure the effect of each removal of a plan, with uncorrected probabilities.
+    """Measure the effect of each removal of a plan, with p-values that are not corrected for multiple comparisons.
 
     `gone` are the sources that are absent before the first removal.
     """

@@ -226,9 +226,11 @@ class _Search:
         self.refused: list[Unconfirmed] = []
 
     def best_step(self, last: OptimisationStep, progress: ProgressCallback | None) -> OptimisationStep | None:
-        """Choose the step, after the step `last`, that lowers the objective most.
+        """Choose the step after the step `last`.
 
-        Returns None if no step lowers the objective enough, if no gain is confirmed, or if the budget is spent.
+        Of the `CONFIRMED_AT_ONCE` steps that lower the objective most, it is the best one whose gain is confirmed.
+        Returns None if no step lowers the objective enough, if none of these gains is confirmed, or if the budget is
+        spent. Afterwards, `refused` contains the steps whose gains were not confirmed.
         """
         self.refused = []
         found: list[_Candidate] = []

@@ -50,11 +50,11 @@ def why_unused_range(part: UnusedRange) -> str:
 
 
 def why_unused_again(effect: Effect) -> str:
-    """Describe the effect of removing all unused data, in replicates that are not part of the evaluation.
+    """Say how the mean distance from the path changes if all unused data is removed.
 
     Parameters
     ----------
-    effect : Effect    the effect
+    effect : Effect    the change, measured in replicates that are not part of the evaluation
 
     Returns
     -------

@@ -95,7 +95,8 @@ def _shown(row: Any) -> EndedConsent:
 def require_consent(ended: Collection[EndedConsent]) -> None:
     """Raise `ConflictProblem` if `ended` is not empty: the consent for these clips has ended.
 
-    The text of the error names the first clips, and says how they can be exported or left out.
+    The text of the error names the first clip and the number of the others, and says how their export can be allowed.
+    The context of the error names the first `MOST_NAMED` clips.
     """
     if not ended:
         return

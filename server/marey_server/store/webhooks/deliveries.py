@@ -1,4 +1,4 @@
-"""Deliveries of a webhook that failed or were requested: listed, read and sent again by owners of the project."""
+"""Stored deliveries of webhooks, which failed or were requested as tests or repetitions, and their repetition."""
 
 from __future__ import annotations
 
