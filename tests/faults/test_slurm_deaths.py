@@ -205,12 +205,11 @@ def test_a_worker_that_dies_without_a_controller_is_replaced_when_there_is_one_a
     cluster: SlurmCluster, server: QuickPoolsServer
 ) -> None:
     with started(server) as marey:
-        job = submit(marey, seconds=3)
+        job = submit(marey, seconds=20)
         worker = running_worker(marey, job)
-        cluster.controller.kill()
-        cluster.controller.wait()
+        cluster.kill_controller()
         worker.kill()
-        wait_until(lambda: marey.jobs.get(job.id).state == "queued", pause_s=0.1)
+        wait_until(lambda: outcomes(marey, job)[:1] == ["lost"], pause_s=0.1)
         cluster.start_controller()
         assert marey.jobs.wait(job.id, timeout_s=PATIENCE_S).state == "succeeded"
         assert outcomes(marey, job) == ["lost", "succeeded"]

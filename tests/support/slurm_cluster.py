@@ -24,6 +24,8 @@ END_S = 30.0
 """Longest wait in seconds until cancelled jobs have ended; Slurm kills them 5 seconds after their cancellation."""
 CPUS = 4
 MEMORY_MB = 8000
+STORED_WITHIN_S = 6.0
+"""Seconds within which the controller stores a change of a job."""
 
 
 class SlurmCluster:
@@ -55,6 +57,16 @@ class SlurmCluster:
         """Start the controller, which continues with the state that it stored."""
         self.controller = self._spawn("slurmctld", "-D", "-f", str(self.configuration))
         self._until(lambda: "UP" in self.ask("scontrol", "ping"))
+
+    def kill_controller(self) -> None:
+        """Kill the controller after it has had the time to store the present jobs.
+
+        A controller that does not know a running job starts the job, or another one with the same id, a second time;
+        then the node is drained because of the duplicate id.
+        """
+        time.sleep(STORED_WITHIN_S)
+        self.controller.kill()
+        self.controller.wait()
 
     def stop(self) -> None:
         """End all jobs, then the daemons, beginning with the one that was started last, and at last the job steps."""
