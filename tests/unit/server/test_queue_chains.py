@@ -307,6 +307,35 @@ def test_dependants_that_are_not_retried_do_not_take_the_places_of_those_that_ar
 
 
 @pytest.mark.every_database
+def test_a_dependant_of_several_retried_jobs_takes_one_place(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retrying, "MOST_AT_ONCE", 6)
+    first = desk.submit()
+    second = desk.submit(after=[first])
+    others = [desk.submit(after=[first, second]) for _ in range(4)]
+    desk.cancel(first)
+    desk.database.write(desk.user, retrying.retry_job, second)
+    everything = desk.database.read(desk.user, reading.list_jobs, desk.project).items
+    assert {one.retry_of for one in everything} == {None, first, second, *others}
+
+
+@pytest.mark.every_database
+def test_dependants_that_still_miss_another_job_do_not_hide_those_that_can_run(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retrying, "MOST_AT_ONCE", 3)
+    first, other = desk.submit(), desk.submit()
+    waiting = [desk.submit(after=[first, other]) for _ in range(7)]
+    time.sleep(0.002)  # ids sort by their milliseconds
+    ready = [desk.submit(after=[first]) for _ in range(2)]
+    for job in (first, other):
+        desk.cancel(job)
+    desk.database.write(desk.user, retrying.retry_job, first)
+    everything = desk.database.read(desk.user, reading.list_jobs, desk.project).items
+    assert {one.retry_of for one in everything} == {None, first, *ready}
+    assert {desk.state(one) for one in waiting} <= {"failed", "cancelled"}
+
+
+@pytest.mark.every_database
 def test_later_transactions_leave_projects_alone_whose_purges_they_do_not_hold_off(
     desk: Desk, open_database: Callable[[], Database], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -92,13 +92,16 @@ class _Family:
         """Add the jobs that ended only because one of the jobs in this set did not succeed, recursively."""
         behind: Collection[str] = list(self._rows)
         while behind:
-            rows = {row.id: row for row in self._ended_because_of(behind)}
-            needs = _needs(self._tx, rows)
-            others = {latest for one in needs.values() for latest in one.values()} - self._rows.keys()
-            missing = {one for one, state in _states(self._tx, others).items() if state in UNSUCCESSFUL}
-            behind = [one for one in rows if not missing & set(needs[one].values())]
-            self._take({one: rows[one] for one in behind}, {one: needs[one] for one in behind})
-            self._require_few("retry it without its dependants (`dependants=false`), then each of them")
+            taken: list[str] = []
+            for rows in self._ended_because_of(behind):
+                needs = _needs(self._tx, rows)
+                others = {latest for one in needs.values() for latest in one.values()} - self._rows.keys()
+                missing = {one for one, state in _states(self._tx, others).items() if state in UNSUCCESSFUL}
+                ready = [one for one in rows if not missing & set(needs[one].values())]
+                self._take({one: rows[one] for one in ready}, {one: needs[one] for one in ready})
+                self._require_few("retry it without its dependants (`dependants=false`), then each of them")
+                taken += ready
+            behind = taken
 
     def submit(self) -> dict[str, Job]:
         """Submit the jobs again; return the new jobs by the ids of the old ones."""
@@ -128,19 +131,22 @@ class _Family:
             detail = f"More than {MOST_AT_ONCE:,} jobs would be retried together with this job; {advice}."
             raise ConflictProblem(detail, code="too-many")
 
-    def _ended_because_of(self, ids: Collection[str]) -> Iterable[Row[Any]]:
-        """Return the jobs that could not run because one of the given jobs, on which they depend, did not succeed.
+    def _ended_because_of(self, ids: Collection[str]) -> Iterator[dict[str, Row[Any]]]:
+        """Yield the jobs that could not run because one of the given jobs, on which they depend, did not succeed.
 
-        Jobs that have a retry already, or that the caller may not retry, are left out.
+        Jobs that have a retry already, or that the caller may not retry, are left out. Each dictionary contains up to
+        `MOST_AT_ONCE` jobs by id. There may be any number of them, because jobs that also depend on other unsuccessful
+        jobs are among them, and are not retried.
         """
         later = job.alias("later")
         reason = job.c.failure["reason"].as_string()
         whole = roles.includes(self._project.role, Role.MAINTAINER)
+        behind = select(job_dependency.c.job_id).where(job_dependency.c.on_job_id.in_(ids))
         statement = (
             select(job)
-            .join(job_dependency, job_dependency.c.job_id == job.c.id)
             .where(
-                job_dependency.c.on_job_id.in_(ids),
+                job.c.id.in_(behind),
+                job.c.id.not_in(list(self._rows)),
                 job.c.state.in_(UNSUCCESSFUL),
                 job.c.cancel_requested_us.is_(None),
                 job.c.parent_id.is_(None),
@@ -149,9 +155,12 @@ class _Family:
                 ~select(later.c.id).where(later.c.retry_of == job.c.id).exists(),
             )
             .order_by(job.c.id)
-            .limit(MOST_AT_ONCE + 1)
+            .limit(MOST_AT_ONCE)
         )
-        return [row for row in self._tx.execute(statement) if row.id not in self._rows]
+        last = ""
+        while rows := {row.id: row for row in self._tx.execute(statement.where(job.c.id > last))}:
+            yield rows
+            last = max(rows)
 
 
 # -- one of them -------------------------------------------------------------------------------------------------------
