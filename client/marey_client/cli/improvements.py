@@ -207,7 +207,7 @@ def _print_sections(sections: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
     below = (
         (unused["clips"], unused["confirmed_clips"]),
         (unused["ranges"], unused["confirmed_ranges"]),
-        (document["fillings"], document["quality"]),
+        (document["fillings"], document.get("quality")),  # absent if the worker is of an older version
     )
     for heading, entries in sections:
         if not entries:

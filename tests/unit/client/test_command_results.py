@@ -200,3 +200,19 @@ def test_clips_without_effect_are_written_to_a_file_only_if_one_was_given(
     done = run(improvements, lab, "suggest", "lab/walks")
     assert done.returncode == 0, done
     assert "can be removed" not in done.stderr
+
+
+def test_suggestions_of_an_older_worker_which_do_not_compare_the_quality_are_printed(run: Commands) -> None:
+    filling = {"reason": "“raw/turn” contains 4.0 s of the missing data."}
+    found = {
+        "unused": {"clips": [], "ranges": [], "confirmed_clips": None, "confirmed_ranges": None},
+        "redundant": {"plan": [], "tried": 0, "needed": 0},
+        "near_duplicates": {"pairs": [], "spared": [], "threshold_cm": 2.0},
+        "fillings": [filling], "additions": [], "chance": {}, "similarity": {"share": None}, "unusable": [],
+    }  # fmt: skip
+    content = json.dumps(found).encode()
+    lab = Lab({"walks": Kind.EVALUATION}, {"document": blob(content)}, (content,))
+    done = run(improvements, lab, "suggest", "lab/walks")
+    assert (done.returncode, done.stdout.split("\n")) == (
+        0, ["1 clip would fill gaps in the coverage.", f"  {filling['reason']}", "", ""],
+    )  # fmt: skip
