@@ -53,6 +53,14 @@ def test_waiting_gives_up_when_told_to(script: ScriptedServer) -> None:
         script.marey().jobs.wait("job_1", timeout_s=0.01)
 
 
+def test_a_retry_asks_older_servers_only_for_what_they_know(script: ScriptedServer) -> None:
+    script.answers = [httpx.Response(202, content=job().model_dump_json())] * 2
+    jobs = script.marey().jobs
+    jobs.retry("job_1")
+    jobs.retry("job_1", dependants=False)
+    assert [dict(request.url.params) for request in script.requests] == [{}, {"dependants": "false"}]
+
+
 @pytest.mark.parametrize(
     ("members", "running", "expected"),
     [
