@@ -432,6 +432,14 @@ def test_who_loses_the_server_while_waiting_for_a_job_is_told_the_job(script: Sc
     assert sentence(lost.value).endswith("this does not stop job_1; `marey job show job_1` shows it")
 
 
+def test_a_job_that_is_gone_is_not_said_to_go_on(script: ScriptedServer) -> None:
+    script.answers = [problem(404, "no-job", detail="There is no job.")]
+    running = a_job(id="job_1", kind="retarget", state=JobState.RUNNING, progress=None)
+    with pytest.raises(NotFound) as gone:
+        follow(script.marey(), running)
+    assert "marey job show" not in sentence(gone.value)
+
+
 def test_a_job_that_is_not_waited_for_is_named(script: ScriptedServer, capsys: pytest.CaptureFixture[str]) -> None:
     submitted = a_job(id="job_1", kind="retarget", state=JobState.QUEUED, progress=None)
     assert follow(script.marey(), submitted, wait=False) is None

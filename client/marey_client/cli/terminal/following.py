@@ -120,7 +120,7 @@ def follow(
     units with the name `unit`. Without `wait`, print the job's id and return None. Raises `JobUnsuccessful` if the job
     did not succeed.
     """
-    from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable
+    from marey_client.errors import NotFound, RequestFailed, UnexpectedAnswer, Unreachable
 
     if not wait:
         print_json(submitted) if as_json else typer.echo(submitted.id)
@@ -141,6 +141,8 @@ def follow(
             f"{seen.id} continues on the server; `marey job show {seen.id}` shows it, "
             f"`marey job cancel {seen.id}` stops it"
         )
+        raise
+    except NotFound:  # the job is gone, or its project is
         raise
     except (Unreachable, UnexpectedAnswer, RequestFailed) as error:
         error.add_note(f"this does not stop {seen.id}; `marey job show {seen.id}` shows it")
