@@ -102,7 +102,9 @@ class Jobs:
         Unsuccessful jobs on which it depends are retried, too. With `dependants`, so are jobs that ended only because
         this job did not succeed.
         """
-        return self.transport.post(Job, f"{_address(job_id)}/retry", params={"dependants": None if dependants else False})
+        return self.transport.post(
+            Job, f"{_address(job_id)}/retry", params={"dependants": None if dependants else False}
+        )
 
     def attempts(self, job_id: str) -> Iterator[Attempt]:
         """List the attempts to run a job, oldest first."""
