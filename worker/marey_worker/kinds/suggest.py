@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.defects import Defects, compare_defects
+from marey_motion.evaluation.improvement.selection import source_of
 from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import suggestions_to_tree
 from marey_motion.matching.database import MatchingDatabase
@@ -25,11 +27,14 @@ from marey_schemas.queue.job_params import SuggestParams
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context
 from marey_worker.job_io.bodies import QualityBodies
-from marey_worker.job_io.candidates import read_candidates
+from marey_worker.job_io.candidates import Candidates, read_candidates
 from marey_worker.job_io.chosen_metric import read_metric
 from marey_worker.job_io.evaluated_set import EvaluatedSet, read_evaluated_set, store_document, store_file
-from marey_worker.job_io.matching_clips import ClipSet, refusing_motion_errors, split_uid, uid_of
+from marey_worker.job_io.matching_clips import refusing_motion_errors, split_uid, uid_of
 from marey_worker.job_io.stored_reports import inputs_of
+
+ROUNDING = 1e-6
+"""Difference in frames that is only due to rounding."""
 
 
 def run(context: Context, params: SuggestParams) -> dict[str, Any]:
@@ -46,7 +51,7 @@ def run(context: Context, params: SuggestParams) -> dict[str, Any]:
             threads=context.threads,
             progress=context.progress,
         )
-    found = replace(found, defects=_defects(context, evaluated, found))
+    found = replace(found, defects=_defects(context, evaluated, candidates, found))
     context.publish_facets(facets_of(found))
     document = {**suggestions_to_tree(found), "unusable": [one._asdict() for one in candidates.unusable]}
     result = {**_counts(found), "unusable": len(candidates.unusable), "document": store_document(context, document)}
@@ -58,15 +63,16 @@ def run(context: Context, params: SuggestParams) -> dict[str, Any]:
     return result
 
 
-def _defects(context: Context, evaluated: EvaluatedSet, found: Suggestions) -> dict[str, Defects]:
+def _defects(
+    context: Context, evaluated: EvaluatedSet, candidates: Candidates, found: Suggestions
+) -> dict[str, Defects]:
     """Measure the clips that would fill gaps, and the clips of the set beside them; return the defects by uid."""
     if not found.fillings:
         return {}
-    clip_set, suggested = evaluated.clip_set, {one.source for one in found.fillings}
+    suggested = {one.source for one in found.fillings}
     pins = [pin for pin in context.inputs["candidates"] if uid_of(pin) in suggested]
-    rate_hz = min(QUALITY_RATE_HZ, evaluated.clips.database.options.rate_hz)
-    measures = _ClipMeasures(context, QualityOptions(rate_hz=rate_hz), clip_set)
-    of_set = [values for _, values in measures.values_of(clip_set.clips) if not isinstance(values, str)]
+    measures = _ClipMeasures(context, evaluated, candidates)
+    of_set = [values for _, values in measures.values_of(evaluated.clip_set.clips) if not isinstance(values, str)]
     return {
         uid_of(pin): Defects({}, problem=values) if isinstance(values, str) else compare_defects(values, of_set)
         for pin, values in measures.values_of(pins)
@@ -74,13 +80,19 @@ def _defects(context: Context, evaluated: EvaluatedSet, found: Suggestions) -> d
 
 
 class _ClipMeasures:
-    """Measurement of the quality of clips; those of the evaluated set have its joint mapping and its trims."""
+    """Measurement of the quality of clips, in the frames that their matching databases use.
 
-    def __init__(self, context: Context, options: QualityOptions, clip_set: ClipSet) -> None:
+    So a rest pose at the end of a clip, and frames outside a trim, are not measured. Clips that have the skeleton of
+    the evaluated set have its joint mapping.
+    """
+
+    def __init__(self, context: Context, evaluated: EvaluatedSet, candidates: Candidates) -> None:
+        database, rig = evaluated.clips.database, evaluated.clip_set.rig
         self._context = context
-        self._options = options
-        self._trims = {uid_of(pin): clip_set.trims.get(pin.item) for pin in clip_set.clips}
-        self._bodies = QualityBodies(context, () if clip_set.rig is None else (clip_set.rig,))
+        self._rate_hz = database.options.rate_hz
+        self._options = QualityOptions(rate_hz=min(QUALITY_RATE_HZ, self._rate_hz))
+        self._used = {source_of(clip): clip for one in (database, *candidates.databases.values()) for clip in one.clips}
+        self._bodies = QualityBodies(context, () if rig is None else (rig,))
 
     def values_of(self, pins: Sequence[PinnedInput]) -> Iterator[tuple[PinnedInput, Mapping[str, float | None] | str]]:
         """Yield each clip with the values of its measures, or with the reason why it cannot be measured."""
@@ -88,10 +100,21 @@ class _ClipMeasures:
             self._context.progress(0, None, f"measuring clip {done + 1} of {len(pins)}, {pin.name}")
             try:
                 clip, body = self._bodies.posed(MotionDocument.model_validate(tree))
-                trim = self._trims.get(uid_of(pin))
-                yield pin, measure_quality(clip.sliced(*trim) if trim else clip, body, self._options).values
+                yield pin, measure_quality(self._used_frames(clip, uid_of(pin)), body, self._options).values
             except MotionError as error:
-                yield pin, str(error)
+                yield pin, self._reason(error, tree["frame_rate_hz"])
+
+    def _reason(self, error: MotionError, frame_rate_hz: float) -> str:
+        if error.code != "frame-rate-too-low":
+            return str(error)
+        # The error advises to choose another rate for the measures, and this job has no such parameter.
+        return f"it has {frame_rate_hz:g} frames per second, fewer than the {self._options.rate_hz:g} that are measured"
+
+    def _used_frames(self, clip: Clip, uid: str) -> Clip:
+        used = self._used[uid]
+        first = round(used.first_s * clip.frame_rate_hz)
+        steps = (used.frame_count - 1) * clip.frame_rate_hz / self._rate_hz
+        return clip.sliced(first, min(first + ceil(steps - ROUNDING) + 1, clip.frame_count))
 
 
 def poses_by_clip(databases: Iterable[MatchingDatabase], sources: set[str]) -> dict[str, tuple[Clip, ...]]:
