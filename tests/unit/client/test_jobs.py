@@ -1,13 +1,17 @@
 """Waiting for jobs, and explanations of their states."""
 
+import asyncio
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import httpx
 import pytest
+from tests.support.command_line import run_here
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
+from marey_client.asynchronous.marey import AsyncMarey
+from marey_client.cli.queue import jobs as job_commands
 from marey_client.explanations import explain, explain_job
 from marey_schemas.access import RunningJobs
 from marey_schemas.queue.jobs import Attempt, Job
@@ -59,6 +63,22 @@ def test_a_retry_asks_older_servers_only_for_what_they_know(script: ScriptedServ
     jobs.retry("job_1")
     jobs.retry("job_1", dependants=False)
     assert [dict(request.url.params) for request in script.requests] == [{}, {"dependants": "false"}]
+
+
+def test_a_job_is_retried_alone_on_the_command_line_and_in_asynchronous_code(
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job_commands, "connect", lambda _: script.marey())
+    script.answers = [httpx.Response(202, content=job().model_dump_json())] * 2
+    done = run_here(["job", "retry", "job_1", "--no-dependants"])
+    assert (done.returncode, done.stdout) == (0, "job_1\n")
+
+    async def retry() -> Job:
+        async with AsyncMarey("http://marey.test", http=script.transport()) as marey:
+            return await marey.jobs.retry("job_1", dependants=False)
+
+    assert asyncio.run(retry()).id == "job_1"
+    assert [dict(request.url.params) for request in script.requests] == [{"dependants": "false"}] * 2
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from marey_motion.clip import Clip
 from marey_motion.formats import read_motion, write_bvh
 from marey_motion.gait import generate_gait, studio_skeleton
 from marey_motion.importing.checks import CODES, CheckWarning, check_clip, on_the_floor, without_rest_pose
+from marey_motion.importing.landmarks import find_landmarks
 from marey_motion.kinematics import global_positions
 from marey_schemas.options.imports import ImportOptions
 
@@ -222,6 +223,19 @@ def test_limbs_that_differ_by_a_tenth_are_not_uneven(walk: Clip) -> None:
     offsets = walk.skeleton.offsets.copy()
     offsets[walk.skeleton.index_of("LeftFoot")] *= 0.8
     assert found(replace(walk, skeleton=replace(walk.skeleton, offsets=offsets)), "uneven-limbs") is None
+
+
+def test_limbs_whose_names_are_unknown_or_of_which_one_hangs_on_the_other_are_not_compared(walk: Clip) -> None:
+    offsets = walk.skeleton.offsets.copy()
+    offsets[walk.skeleton.index_of("LeftFoot")] = 0.0
+    short = replace(walk, skeleton=replace(walk.skeleton, offsets=offsets))
+    landmarks = find_landmarks(walk.skeleton)
+    hands = (walk.skeleton.index_of("LeftForeArm"), walk.skeleton.index_of("LeftHand"))
+    for clip, known in (
+        (short, replace(landmarks, by_names=False)),
+        (walk, replace(landmarks, hands=hands)),
+    ):
+        assert "uneven-limbs" not in {warning.code for warning in check_clip(clip, known)}
 
 
 def test_checks_change_nothing(walk: Clip) -> None:

@@ -306,6 +306,31 @@ def test_dependants_that_are_not_retried_do_not_take_the_places_of_those_that_ar
     assert {one.retry_of for one in everything} == {None, first, last}
 
 
+def test_a_job_that_needs_more_jobs_than_one_transaction_retries_is_retried_after_them(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retrying, "MOST_AT_ONCE", 2)
+    chain = [desk.submit()]
+    for _ in range(2):
+        chain.append(desk.submit(after=[chain[-1]]))
+    desk.cancel(chain[0])
+    with pytest.raises(ConflictProblem, match="first retry the jobs on which it depends"):
+        desk.database.write(desk.user, retrying.retry_job, chain[-1], dependants=False)
+    made = [desk.database.write(desk.user, retrying.retry_job, job, dependants=False) for job in chain]
+    assert [job.after for job in made] == [(), (made[0].id,), (made[1].id,)]
+
+
+@pytest.mark.every_database
+def test_a_dependant_that_was_retried_already_is_not_retried_again(desk: Desk) -> None:
+    first = desk.submit()
+    dependant = desk.submit(after=[first])
+    desk.cancel(first)
+    for _ in range(2):
+        desk.database.write(desk.user, retrying.retry_job, first)
+    everything = desk.database.read(desk.user, reading.list_jobs, desk.project).items
+    assert Counter(one.retry_of for one in everything) == {None: 2, first: 2, dependant: 1}
+
+
 @pytest.mark.every_database
 def test_a_dependant_of_several_retried_jobs_takes_one_place(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(retrying, "MOST_AT_ONCE", 6)
