@@ -33,7 +33,7 @@ from marey_worker.job_io.evaluated_set import EvaluatedSet, read_evaluated_set, 
 from marey_worker.job_io.matching_clips import refusing_motion_errors, split_uid, uid_of
 from marey_worker.job_io.stored_reports import inputs_of
 
-ROUNDING = 1e-6
+ROUNDING_FRAMES = 1e-6
 """Difference in frames that is only due to rounding."""
 
 
@@ -114,7 +114,7 @@ class _ClipMeasures:
         used = self._used[uid]
         first = round(used.first_s * clip.frame_rate_hz)
         steps = (used.frame_count - 1) * clip.frame_rate_hz / self._rate_hz
-        return clip.sliced(first, min(first + ceil(steps - ROUNDING) + 1, clip.frame_count))
+        return clip.sliced(first, min(first + ceil(steps - ROUNDING_FRAMES) + 1, clip.frame_count))
 
 
 def poses_by_clip(databases: Iterable[MatchingDatabase], sources: set[str]) -> dict[str, tuple[Clip, ...]]:
