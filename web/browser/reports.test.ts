@@ -72,6 +72,21 @@ it.each([...GIVEN.names, "played"])("shows the report %s on a phone, without a f
   await page.context().close();
 });
 
+it.each(GIVEN.names)("shows the tables of the report %s in columns that can be read on a phone", async (name) => {
+  const page = await opened(name, 390, { isMobile: true });
+  const found = await page.evaluate(() => {
+    const shown = (what: string) => [...document.querySelectorAll<HTMLElement>(what)].filter((one) => one.checkVisibility());
+    const gap = (one: HTMLElement) => one.getBoundingClientRect().top - one.previousElementSibling!.getBoundingClientRect().bottom;
+    return {
+      narrow: shown("td.prose").filter((one) => one.offsetWidth < 200).map((one) => one.innerText),
+      wide: shown("thead th").filter((one) => one.offsetWidth > 390).map((one) => one.innerText),
+      touching: shown(".table + p, .table + ul").filter((one) => gap(one) < 8).map((one) => one.innerText),
+    };
+  });
+  expect(found).toEqual({ narrow: [], wide: [], touching: [] });
+  await page.context().close();
+});
+
 /** Return the boxes that scroll and have no hint, and those that have one and do not scroll. */
 async function hints(page: Page): Promise<string[]> {
   const boxes = await page.evaluate(() =>

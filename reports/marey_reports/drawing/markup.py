@@ -24,6 +24,14 @@ def text(value: str) -> Html:
     return escape(_UNSEEN.sub("\ufffd", value))
 
 
+def coded(value: str) -> Html:
+    """Make HTML of a text in which names between backticks, such as `skate_ratio`, become elements `code`."""
+    pieces = value.split("`")
+    if len(pieces) % 2 == 0:
+        return text(value)
+    return joined(element("code", piece) if place % 2 else piece for place, piece in enumerate(pieces))
+
+
 def element(tag: str, /, *content: Content, **attributes: str | None) -> Html:
     """Make an HTML element.
 

@@ -6,8 +6,10 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from marey_reports.drawing.markup import Content, Html, element
+from marey_reports.drawing.markup import Content, Html, coded, element
 
+LEAST_PROSE = 40
+"""Number of characters from which the text of a cell is prose, whose column is never very narrow."""
 MOST_NAMES = 40
 """Greatest number of names that a list shows at once; longer lists are folded."""
 
@@ -72,7 +74,8 @@ def _cell(cell: Cell, column: int) -> Html:
         return element("td", cell.written, class_=look, data_value=value)
     if column == 0:
         return element("th", cell, scope="row")
-    return element("td", cell)
+    is_prose = isinstance(cell, str) and not isinstance(cell, Html) and len(cell) >= LEAST_PROSE
+    return element("td", coded(cell) if is_prose else cell, class_="prose" if is_prose else None)
 
 
 def facts(pairs: Iterable[tuple[str, Content, str]]) -> Html:

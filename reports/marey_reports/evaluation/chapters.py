@@ -10,7 +10,7 @@ from marey_motion.evaluation.judgement import LimitCheck, Measure, TrialVerdict,
 from marey_motion.evaluation.relevance import SourceUsage, recorded_rows, sum_by_source
 from marey_motion.evaluation.result import EvaluationResult, ReplicateValues
 from marey_motion.evaluation.scenario import demand
-from marey_reports.drawing.markup import Content, Html, element, joined
+from marey_reports.drawing.markup import Content, Html, coded, element, joined
 from marey_reports.drawing.page import Section, shown
 from marey_reports.drawing.tables import MOST_NAMES, Cell, Number, facts, folded, number, share, table
 from marey_reports.drawing.words import duration
@@ -32,7 +32,7 @@ Figures = Mapping[str, DrawnFigure]
 HOLES = "holes"
 WORST_TRIALS = 10
 WALK_GRAPH = (
-    "marey report project/name --walk-graph walks.graphml writes the graph of single frames, with the order of every "
+    "`marey report project/name --walk-graph walks.graphml` writes the graph of single frames, with the order of every "
     "walk, as GraphML or JSON."
 )
 LOAD_CLIPS = 15
@@ -123,7 +123,7 @@ def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
     return Section(
         "load",
         "Most used clips",
-        (element("p", text), listing, shown(figures, *USE_FIGURES), element("p", WALK_GRAPH)),
+        (element("p", text), listing, shown(figures, *USE_FIGURES), element("p", coded(WALK_GRAPH))),
     )
 
 

@@ -183,16 +183,12 @@ def definitions(limits: VerdictLimits) -> Html:
         (metric.label, metric.unit, metric.meaning, element("code", name, class_="name"))
         for name, metric in METRICS.items()
     ]
-    rules = [
-        (name, Number(value, f"{value:g}"), VerdictLimits.model_fields[name].description)
-        for name, value in limits.model_dump().items()
-    ]
     grades = ", ".join(f"from {100 * share:g} % {name}" for share, name in GRADES[:-1])
     return joined(
         (
             element("h3", "Followed trajectories"),
             element("p", "The character follows a trajectory if it exceeds none of these limits:"),
-            table("Limits of a trial", ("limit", "value", "meaning"), rules, numbers=(1,), sortable=False),
+            _limits(limits),
             element(
                 "p",
                 f"The share of followed trajectories determines the grade: {grades}, below that {GRADES[-1][1]}.",
@@ -217,3 +213,15 @@ def definitions(limits: VerdictLimits) -> Html:
             table("Interpretations", ("subject", "printed", "computed here"), _READINGS, numbers=(), sortable=False),
         )
     )
+
+
+def _limits(limits: VerdictLimits) -> Html:
+    rules = [
+        (
+            element("code", name, class_="name"),
+            Number(value, f"{value:g}"),
+            VerdictLimits.model_fields[name].description,
+        )
+        for name, value in limits.model_dump().items()
+    ]
+    return table("Limits of a trial", ("limit", "value", "meaning"), rules, numbers=(1,), sortable=False)

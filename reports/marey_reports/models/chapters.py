@@ -11,7 +11,7 @@ from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.modelling.training_report import ExampleReport
 from marey_reports.drawing.drawn import DrawnFigure
-from marey_reports.drawing.markup import Content, Html, element
+from marey_reports.drawing.markup import Content, Html, coded, element
 from marey_reports.drawing.page import Section, shown
 from marey_reports.drawing.tables import Cell, Number, facts, folded, number, table
 from marey_reports.models.figures.latent_space import MOST_ROWS
@@ -70,7 +70,7 @@ def warning_chapter(trained: TrainedPrimitive) -> Section:
         text = element("p", "There are no warnings.")
         return Section("look", "Warnings", text)
     items = [
-        element("li", f"{warning.message[:1].upper()}{warning.message[1:]}. ", element("code", warning.code))
+        element("li", coded(f"{warning.message[:1].upper()}{warning.message[1:]}. "), element("code", warning.code))
         for warning in trained.warnings
     ]
     return Section("look", "Warnings", element("ul", items))

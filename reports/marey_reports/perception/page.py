@@ -139,7 +139,7 @@ def _clips(subject: ComparedSet) -> Html:
         for clip in subject.clips
     ]
     return table(
-        "What was compared", ("clip", "recorded s", "compared s", "loop begins s"), rows, numbers=range(1, 4)
+        "What was compared", ("clip", "recorded (s)", "compared (s)", "loop begins (s)"), rows, numbers=range(1, 4)
     )  # fmt: skip
 
 

@@ -162,7 +162,7 @@ def is_worse(name: str, change: QualityChange) -> bool:
 def _clips(document: QualityDocument) -> Html:
     ordered = worst_clips_first(document.measured.clips)
     names = [*DRAWN_MEASURES, "speed_m_s"]
-    heads = ("clip", "s", *(_headed(name) for name in names))
+    heads = ("clip", "length (s)", *(_headed(name) for name in names))
     rows: list[Sequence[Cell]] = [
         (clip.name, number(clip.seconds, 1), *(number(clip.values[name], MEASURES[name].digits) for name in names))
         for clip in ordered[:MOST_LISTED]

@@ -98,7 +98,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         "penetration_max_m": Measure(
             "greatest penetration", "m", "less", 4,
             "Greatest depth of a joint or end of a bone below height 0 in any frame of the clip.",
-            "Greatest value of `penetration_m`",
+            "Greatest value of penetration",
             "One frame decides, such as the pose before a recording begins.",
         ),
         "jitter_m_s3": Measure(
@@ -110,7 +110,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         "jerk_peak_m_s3": Measure(
             "greatest jerk", "m/s³", "less", 0,
             "Greatest jerk of a joint in any measured frame.",
-            "Greatest value of the jerk in `jitter_m_s3`",
+            "Greatest value of the jerk in jitter",
             "One frame decides. It finds hard landings, too, and misses pops in frames that resampling leaves out.",
         ),
         "limit_excess_deg": Measure(
@@ -122,7 +122,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         "limit_excess_max_deg": Measure(
             "greatest excess of joint limits", "°", "less", 1,
             "Greatest angle by which a knee or an elbow exceeds its range in any frame of the clip.",
-            "Greatest value of `limit_excess_deg`",
+            "Greatest value of excess of joint limits",
             "One frame decides.",
         ),
         "speed_m_s": Measure(
