@@ -52,7 +52,7 @@ def _page(document: Schema) -> Iterator[str]:
     yield "<h2 id=schemas>Schemas</h2>"
     for name, schema in sorted(document["components"]["schemas"].items()):
         yield f"<details id='model-{escape(name)}'><summary><code>{escape(name)}</code> "
-        yield f"{escape(_first_line(schema.get('description', '')))}</summary><div>"
+        yield f"{_with_code(_first_line(schema.get('description', '')))}</summary><div>"
         shown = escape(json.dumps(schema, indent=2, ensure_ascii=False))
         yield f"<pre tabindex=0>{shown}</pre></div></details>"  # long ones scroll, also by keys
     yield "<h2 id=problems>Problems</h2><table><tr class=head><th>Status<th>Code<th>Meaning"
@@ -71,7 +71,7 @@ def _operation(path: str, method: str, operation: Schema, shared: list[Schema]) 
     place = f"data-method={method.upper()} data-path='{escape(path)}'"
     yield f"<details id='{escape(operation['operationId'])}' {place}>"
     yield f"<summary><span class='method {method}'>{method.upper()}</span>"
-    yield f"<code>{escape(path)}</code> {escape(operation['summary'])}"
+    yield f"<code>{escape(path)}</code> {_with_code(operation['summary'])}"
     yield f"<span class=access>{escape(operation['x-access'].replace('_', ' '))}</span></summary><div>"
     for paragraph in operation["description"].split("\n\n"):
         yield f"<p>{_with_code(paragraph)}</p>"
@@ -135,7 +135,7 @@ def _problems() -> Iterator[str]:
     ]
     named: set[str] = set()
     for error in known:
-        code, title = escape(error.code), escape(_first_line(error.__doc__ or ""))
+        code, title = escape(error.code), _with_code(_first_line(error.__doc__ or ""))
         place = "" if code in named else f" id='problem-{code}'"
         named.add(code)
         yield f"<tr{place}><td>{error.status}<td><code>{code}</code><td>{title}"

@@ -186,3 +186,11 @@ def test_the_example_of_a_command_can_be_sent(document: dict[str, Any]) -> None:
     command = create["x-codeSamples"][0]["source"]
     assert command.startswith('curl -X POST -H "Authorization: Bearer $MAREY_TOKEN"')
     assert command.endswith('"$MAREY_SERVER/api/v1/projects/lab/skeletons"')
+
+
+def test_the_page_shows_names_between_backticks_as_code(document: dict[str, Any]) -> None:
+    page = render_page(document).decode()
+    summary = "Withdraw an open invitation, named by its <code>id</code>"
+    assert f"<code>/api/v1/invitations/{{invitation}}</code> {summary}" in page
+    outside = re.sub("<(pre|script)[ >].*?</(pre|script)>", "", page, flags=re.DOTALL)
+    assert "`" not in outside
