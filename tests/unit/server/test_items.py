@@ -172,6 +172,12 @@ def test_a_revision_that_does_not_exist_yet_is_named_with_the_newest(lab: Lab, r
         lab.read(items.find_part, "lab", Kind.CLIP, clip.id, "motion", revision=7)
 
 
+@pytest.mark.parametrize("revision", [None, 1])
+def test_a_part_of_an_item_that_does_not_exist_is_refused_as_the_item_is(lab: Lab, revision: int | None) -> None:
+    with pytest.raises(NotFoundProblem, match=r"^There is no clip 'walk' in this project\.$"):
+        lab.read(items.find_part, "lab", Kind.CLIP, "walk", "motion", revision=revision)
+
+
 @pytest.mark.parametrize(
     ("change", "pointer", "reason"),
     [

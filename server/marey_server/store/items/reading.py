@@ -239,6 +239,8 @@ def find_part(
         newest = None if revision is None else tx.first(_PART_OF_HEAD, which)
         if newest is not None and revision is not None and revision > newest.number:
             detail = f"The {kind} {item_id!r} has no revision {revision}; the newest one is {newest.number}."
+        elif tx.first(_ITEM, {name: which[name] for name in ("item_id", "project_id", "kind")}) is None:
+            raise no_item(kind, item_id)
         else:
             detail = (
                 f"The {kind} {item_id!r} has no part {part!r} at the requested revision; a {kind} can have the parts "
