@@ -10,7 +10,7 @@ from marey_reports.comparisons.axes import axis_title
 from marey_reports.comparisons.bars import draw_bars
 from marey_reports.comparisons.curves import draw_curves
 from marey_reports.comparisons.scatter import draw_scatter
-from marey_reports.comparisons.subjects import ComparedSubject, short, written
+from marey_reports.comparisons.subjects import ComparedSubject, ends, short, written
 from marey_reports.drawing.drawn import DrawnFigure, Sketch
 from marey_reports.drawing.head import ReportHead
 from marey_reports.drawing.markup import Content, element
@@ -223,8 +223,6 @@ def _means(subject: ComparedSubject, fields: Sequence[ComparedColumn]) -> Conten
             best = "good" if summary.mean == column.best_mean else ""
             row.append(Number(summary.mean, short(summary.mean), best))
             known = summary.low is not None and summary.high is not None
-            row.append(
-                Number(summary.low, f"{short(summary.low or 0.0)} to {short(summary.high or 0.0)}" if known else "–")
-            )
+            row.append(Number(summary.low, ends(summary.low or 0.0, summary.high or 0.0) if known else "–"))
         rows.append(row)
     return table("Means of runs with different seeds", heads, rows, numbers=range(1, len(heads)))

@@ -6,6 +6,7 @@ the newest is counted.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from marey_schemas.queue.comparisons import ComparedColumn, ComparedRun, FieldSu
 
 LONGEST_LABEL, LONGEST_VALUE = 46, 24
 COMMIT_SIGNS = 8
+MOST_DECIMALS = 6
 MOST_MISSING = 4
 """Greatest number of settings without a mean that a caption lists by name."""
 LARGEST, SMALLEST = 1e150, 1e-150
@@ -142,6 +144,16 @@ def written(column: ComparedColumn, run: ComparedRun) -> str:
 def short(number: float) -> str:
     """Write a number with at most five digits."""
     return f"{number:.5g}"
+
+
+def ends(low: float, high: float) -> str:
+    """Write an interval with three digits of its width, because further digits of its ends say nothing."""
+    width = high - low
+    digits = max(0, 2 - math.floor(math.log10(width))) if 0.0 < width < math.inf else 0
+    if not 0 < digits <= MOST_DECIMALS:
+        return f"{short(low)} to {short(high)}"
+    first, last = (round(end, digits) + 0.0 for end in (low, high))  # not -0.00
+    return f"{first:.{digits}f} to {last:.{digits}f}"
 
 
 def interval_words() -> str:

@@ -17,7 +17,7 @@ from tests.support.drawn_figures import cut_off
 from marey_reports.comparisons import page
 from marey_reports.comparisons.axes import axis_title
 from marey_reports.comparisons.page import draw_comparison
-from marey_reports.comparisons.subjects import ComparedSubject
+from marey_reports.comparisons.subjects import ComparedSubject, ends
 from marey_schemas.formats.pictures import Plot
 from marey_schemas.queue.comparisons import Curve, RunComparison
 
@@ -174,3 +174,10 @@ def test_units_in_names_are_written_on_axes() -> None:
         "path (m)", "mean error (°)", "loss", "m", "size_of_x", "a (s)",
     ]  # fmt: skip
     assert axis_title("path_m", log=True) == "path (m), logarithmic"
+
+
+def test_an_interval_has_three_digits_of_its_width() -> None:
+    intervals = [(0.35648, 0.50552), (-1.4841, 3.4841), (-0.0001, 0.9), (1000.2, 1900.8), (2.0, 2.0), (1e-9, 3e-9)]
+    assert [ends(low, high) for low, high in intervals] == [
+        "0.356 to 0.506", "-1.48 to 3.48", "0.000 to 0.900", "1000.2 to 1900.8", "2 to 2", "1e-09 to 3e-09",
+    ]  # fmt: skip
