@@ -80,13 +80,13 @@ def shown_sources(found: Suggestions) -> set[str]:
 
 
 def _numbers(found: Suggestions) -> Html:
-    filled = f"{found.additions[-1].coverage_index:.2f} with the clips to add" if found.additions else ""
+    filled = f"{100 * found.additions[-1].coverage_index:.0f} % with the clips to add" if found.additions else ""
     return facts(
         (
             ("Unused clips", str(len(found.unused.clips)), f"{found.unused.seconds:.1f} s with unused ranges"),
             ("Further removals", str(len(found.plan)), f"{found.tried[0]} of {found.tried[1]} used clips were tried"),
             ("Near-duplicates", str(len(found.duplicates.pairs)), f"within {found.duplicates.threshold_cm:g} cm"),
-            ("Coverage", f"{found.result.coverage.index:.2f}", filled),
+            ("Coverage", f"{100 * found.result.coverage.index:.0f} %", filled),
         )
     )
 

@@ -51,6 +51,7 @@ def test_every_suggestion_is_on_the_page_with_its_reason(found: Suggestions, pos
     ]
     assert len(expected) > 6
     assert [reason for reason in expected if reason not in page.text] == []
+    assert f"Coverage {100 * found.result.coverage.index:.0f} %" in page.text
 
 
 def test_the_clips_of_the_first_suggestions_are_drawn_and_the_twin_of_a_duplicate_too(found: Suggestions) -> None:

@@ -180,7 +180,7 @@ def why_addition(addition: Addition) -> str:
     """
     gain = (
         f"“{addition.filling.name}” from {addition.filling.collection} then adds {addition.filled_s:.1f} s of the "
-        f"data that is still missing; {100 * addition.coverage_index:.0f} % of the grid are covered then"
+        f"data that is still missing; {100 * addition.coverage_index:.0f} % of the grid is covered then"
     )
     if addition.confirmed is None:
         return f"{gain}. Its effect on the trials was not simulated."
