@@ -137,7 +137,7 @@ def draw_samples(model: ModelHandle, revision: int | None, n: int, seed: int, mo
     count = min(len(row.poses) for row in rows)
     shares = [f"{100 * place / max(1, count - 1):.0f} %" for place in range(count)]
     rows = [strips.PoseRow(row.label, row.note, row.poses[:count]) for row in rows]
-    return _written(strips.draw_pose_rows(rows, ["of the motion"] * count, shares), file_type, model.path)
+    return _written(strips.draw_pose_rows(rows, ["after"] * count, shares), file_type, model.path)
 
 
 def draw_worst_trials(
@@ -166,7 +166,7 @@ def draw_worst_trials(
         rows.append(strips.PoseRow(name, limits, poses, headings_rad=headings))
     about = f"{part_of(len(rows), len(ranked), 'trial')}, the worst first"
     labels = [f"{time_s:.1f} s" for time_s in times]
-    figure = strips.draw_pose_rows(rows, ["of the trial"] * len(times), labels, about=about)
+    figure = strips.draw_pose_rows(rows, ["after"] * len(times), labels, about=about)
     return _written(figure, file_type, evaluation.path)
 
 

@@ -147,8 +147,8 @@ def _draw_map(one: PlayedTrial) -> Sketch:
     }
     apart = np.linalg.norm(desired - simulated, axis=1)
     caption = (
-        f"Seen from above, from the largest dot on; numbers are seconds. The character is {apart.mean():.2f} m from "
-        f"the desired place on average, at most {apart.max():.2f} m."
+        f"Seen from above, from the largest dot on; numbers are seconds. Over the whole path, with the approach, the "
+        f"character is {apart.mean():.2f} m from the desired place on average, at most {apart.max():.2f} m."
     )
     return Sketch(figure, {"paths": table}, caption)
 

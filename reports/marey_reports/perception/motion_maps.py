@@ -129,8 +129,10 @@ def _panels(
     ceiling = max(float(np.quantile(each, _HIGHEST)) for each in maps) or 1.0
     figure = new_figure(_LEFT + len(maps) * (SIDE + _GAP) + 0.45, _BOTTOM + SIDE + 0.5)
     panels, images = [], []
+    known = list(dict.fromkeys(each.name for pair in clips for each in pair))
+    labels = dict(zip(known, (shortened(name, _LONGEST) for name in differing_parts(known)), strict=True))
     for number, (values, pair, title) in enumerate(zip(maps, clips, titles, strict=True)):
-        names = [shortened(name, _LONGEST) for name in differing_parts([each.name for each in pair])]
+        names = [labels[each.name] for each in pair]
         place = Place(_LEFT + number * (SIDE + _GAP), _BOTTOM, SIDE, SIDE)
         panel = add_panel(figure, place, title=title, grid=False, x=f"{names[0]} (s)", y=f"{names[1]} (s)")
         ends = [(each.clip.frame_count - 0.5) / each.clip.rate_hz for each in pair]

@@ -73,6 +73,7 @@ def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, ru
     worst = [name_of_trial(one["trial"]) for one in ranked]
     assert [drawn.count(f">{name}<") for name in worst[:3]] == [1, 1, 0]
     assert f"{counted(len(ranked[0]['beyond_limits']), 'measure')} beyond limits" in drawn
+    assert drawn.count(">after<") == 4
     played = motions_of_worst_trials(found, None, 2)
     assert [one.name for one in played] == worst[:2]
     for one in played:

@@ -315,6 +315,9 @@ def test_usage_counts_the_frames_of_every_clip_and_the_transitions(result: Evalu
     }
     assert rows[-1]["name"] == "Transitions"
     assert rows[-1]["frames"] == sum(present(each.metrics["transitions"]) for each in result.trials)
+    total = sum(row["frames"] for row in rows[:-1])
+    most = max(row["frames"] for row in rows[:-1])
+    assert f">{most:,} ({100 * most / total:.1f} %)<" in figure_of("usage").svg
 
 
 def test_usage_of_one_trial_is_that_of_its_record(result: EvaluationResult) -> None:

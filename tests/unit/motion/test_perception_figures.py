@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from marey_motion import generate_gait, map_joints
+from marey_motion.matching.body import MatchingBody
+from marey_motion.motion import Motion
+from marey_motion.perception.cycles import find_period
+from marey_motion.perception.measuring import measure_motion
+from marey_motion.perception.metric import published_metric
+from marey_motion.perception.registration import registration_curve
 from marey_reports.drawing.drawn import Sketch
+from marey_reports.perception.motion_maps import NamedClip, draw_registration
 
 PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "perceptual-metric.md"
 
@@ -37,3 +45,14 @@ def test_the_example_of_the_explanation_draws_both_figures(
         period_s, abs=0.05
     )
     assert f"{period_s:.2f} s" in registration.caption
+
+
+def test_a_clip_has_the_same_label_in_both_maps_of_a_figure() -> None:
+    metric, clip = published_metric("manhattan"), generate_gait(1.1, 0.0, 3.0)
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    measured = measure_motion(Motion.of(clip), body, clip.frame_rate_hz)
+    first, second = NamedClip("07_04-walk", measured), NamedClip("07_05-walk", measured)
+    curve = registration_curve(measured, measured, metric)
+    panels = draw_registration(first, second, metric, find_period(measured, metric), curve).figure.axes[:2]
+    assert [panel.get_xlabel() for panel in panels] == ["04-walk (s)", "04-walk (s)"]
+    assert [panel.get_ylabel() for panel in panels] == ["04-walk (s)", "05-walk (s)"]

@@ -88,7 +88,7 @@ def _draw_bars(
     panel.barh(
         places[-1:], [use.transitions], height=thick, color="none", edgecolor=COLOURS[number], hatch="////", lw=0.8
     )
-    shares = [f"  {100 * value / total:.1f} %" if total else "" for value in values] + [""]
+    shares = [f" ({100 * value / total:.1f} %)" if total else "" for value in values] + [""]
     for place, value, share in zip(places, [*values, use.transitions], shares, strict=True):
         panel.annotate(
             f"{value:,}{share}", (max(value, 0.8), place), (4, 0), textcoords="offset points", va="center",
