@@ -79,7 +79,7 @@ it.each(GIVEN.names)("shows the tables of the report %s in columns that can be r
     const gap = (one: HTMLElement) => one.getBoundingClientRect().top - one.previousElementSibling!.getBoundingClientRect().bottom;
     return {
       narrow: shown("td.prose").filter((one) => one.offsetWidth < 200).map((one) => one.innerText),
-      wide: shown("thead th").filter((one) => one.offsetWidth > 390).map((one) => one.innerText),
+      wide: shown("thead th").filter((one) => Math.max(one.offsetWidth, one.scrollWidth) > 390).map((one) => one.innerText),
       touching: shown(".table + p, .table + ul").filter((one) => gap(one) < 8).map((one) => one.innerText),
     };
   });
