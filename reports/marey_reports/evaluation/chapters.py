@@ -24,7 +24,7 @@ from marey_reports.evaluation.figures import (
 )
 from marey_reports.evaluation.sentences import interval_text
 from marey_reports.evaluation.words import find_holes
-from marey_schemas.documents.replicates import MeanInterval
+from marey_schemas.documents.replicates import LEAST_REPLICATES, MeanInterval
 from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
@@ -213,10 +213,13 @@ def baseline_chapter(result: EvaluationResult) -> Section:
 
 
 def _replicated(replicates: ReplicateValues) -> str:
-    return (
+    ran = (
         f"Each trial ran {replicates.count} times, with another phase of the stride at the start and another length of "
-        "the approach. Values are means over these replicates; their 95 % intervals show how far chance moves them."
+        "the approach. Values are means over these replicates"
     )
+    if replicates.count < LEAST_REPLICATES:
+        return f"{ran}, too few for 95 % intervals."
+    return f"{ran}; their 95 % intervals show how far chance moves them."
 
 
 def _interval(found: MeanInterval | None, digits: int) -> Number:

@@ -122,9 +122,10 @@ def _totals(document: QualityDocument) -> Html:
     rows = [list(_total_row(document, name)) for name in MEASURES]
     note = (
         'Means over clips, weighted by their duration. Intervals are from draws of whole takes. The column "clips" '
-        "has the number of clips in which a measure is defined. Bold differences are worse than the reference, beyond "
-        "chance."
+        "has the number of clips in which a measure is defined."
     )
+    if document.reference is not None:
+        note += " Bold differences are worse than the reference, beyond chance."
     numbers = [column for column in range(2, len(heads)) if heads[column] != "95 % interval"]
     return joined((element("p", note), table("Totals", heads, rows, numbers=numbers, sortable=False)))
 

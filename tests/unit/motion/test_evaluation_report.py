@@ -348,6 +348,14 @@ def test_numbers_beyond_their_limits_are_marked_where_they_stand(result: Evaluat
         assert re.search(rf'<td[^>]*class="[^"]*bad[^"]*"[^>]*>{written}</td>', page), written
 
 
+@pytest.mark.parametrize(("count", "said"), [(2, "too few for 95 % intervals."), (3, "their 95 % intervals show how")])
+def test_intervals_are_explained_only_where_there_are_any(count: int, said: str, result: EvaluationResult) -> None:
+    replicates = ReplicateValues((), np.zeros((1, count, 0)), np.zeros((1, count), dtype=bool), {})
+    page = is_sound(render_report(replace(result, replicates=replicates), title="t", figures={}))
+    assert f"ran {count} times" in page.text
+    assert said in page.text
+
+
 def test_each_region_gets_a_sentence_and_motion_that_no_trial_asks_for_is_named(result: EvaluationResult) -> None:
     regions = region_verdicts(result)
     assert [each.region for each in regions] == [
