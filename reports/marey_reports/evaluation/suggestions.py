@@ -126,7 +126,10 @@ def _chapters(found: Suggestions) -> tuple[_Chapter, ...]:
         ),
         _Chapter(
             "additions", "Order in which to add clips", "",
-            tuple(ShownSuggestion(reasons.why_addition(step), ()) for step in found.additions),
+            tuple(
+                ShownSuggestion(reasons.why_addition(step, found.defects.get(step.filling.source)), ())
+                for step in found.additions
+            ),
         ),
     )  # fmt: skip
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from marey_motion.evaluation.improvement.defects import COMPARED, Defects, Excess, compare_defects
-from marey_motion.evaluation.improvement.filling import FilledCell, Filling
-from marey_motion.evaluation.improvement.reasons import why_filling, why_look
+from marey_motion.evaluation.improvement.filling import Addition, FilledCell, Filling
+from marey_motion.evaluation.improvement.reasons import why_addition, why_filling, why_look
 from marey_schemas.documents.quality import MEASURES
 
 FILLING = Filling("runs", "a@1", "a", 4.0, (FilledCell(1.5, 0.0, 0.9, 1.0),), 1.0, 0.25, 40, False, 0.25, 0.5)
@@ -55,6 +55,13 @@ def test_the_reason_for_a_filling_names_its_far_greater_defects() -> None:
         "up to 0.120; greatest jerk: 12,346 m/s³, in the set up to 0."
     )
     assert why_filling(FILLING, compare_defects(measured(), [measured()])) == why_filling(FILLING)
+
+
+def test_the_order_in_which_to_add_clips_repeats_which_ones_to_look_at() -> None:
+    addition = Addition(FILLING, 1.0, 0.25)
+    said = why_addition(addition)
+    assert why_addition(addition, WORSE) == f"{said} Look at it first, because of its defects."
+    assert why_addition(addition, compare_defects(measured(), [measured()])) == said
 
 
 def test_the_reason_for_a_filling_that_cannot_be_measured_says_why() -> None:

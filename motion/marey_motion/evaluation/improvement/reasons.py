@@ -167,24 +167,27 @@ def _gain_in_words(filling: Filling) -> str:
     return f"{gain}, {where}; {100 * (filling.blendable_share or 0.0):.0f} % of it can be blended with the set."
 
 
-def why_addition(addition: Addition) -> str:
+def why_addition(addition: Addition, defects: Defects | None = None) -> str:
     """Explain the gain of a clip in addition to the clips added before it.
 
     Parameters
     ----------
     addition : Addition    the clip
+    defects : Defects, optional    its defects beside those of the set, if they were compared
 
     Returns
     -------
-    str    a sentence
+    str    one sentence, or up to three
     """
     gain = (
         f"“{addition.filling.name}” from {addition.filling.collection} then adds {addition.filled_s:.1f} s of the "
         f"data that is still missing; {100 * addition.coverage_index:.0f} % of the grid is covered then"
     )
     if addition.confirmed is None:
-        return f"{gain}. Its effect on the trials was not simulated."
-    return f"{gain}, and {distance_in_words(addition.confirmed)}."
+        said = f"{gain}. Its effect on the trials was not simulated."
+    else:
+        said = f"{gain}, and {distance_in_words(addition.confirmed)}."
+    return f"{said} Look at it first, because of its defects." if defects is not None and defects.excesses else said
 
 
 def _cell_in_words(cell: FilledCell) -> str:

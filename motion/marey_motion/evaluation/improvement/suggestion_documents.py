@@ -94,7 +94,7 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
                 "filled_s": step.filled_s,
                 "coverage_index": step.coverage_index,
                 "confirmed": _plain(step.confirmed),
-                "reason": reasons.why_addition(step),
+                "reason": reasons.why_addition(step, found.defects.get(step.filling.source)),
             }
             for step in found.additions
         ],
