@@ -6,7 +6,7 @@ export type Layout = (typeof LAYOUTS)[number];
 export const LAYOUT_NAMES: Record<Layout, string> = { beside: "Side by side", overlaid: "Overlaid", left: "Left only", right: "Right only" };
 
 export interface Shown {
-  /** Frame of the first clip, from 0. */
+  /** Frame of the slider, from 0; as long as the first clip lasts, it is a frame of this clip. */
   frame: number;
   camera: string | null;
   look: Look;
