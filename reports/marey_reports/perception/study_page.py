@@ -232,7 +232,7 @@ def _weights_table(analysis: StudyAnalysis) -> Content:
         for fit in sorted(analysis.fits, key=_shaping):
             rows += [_weights_row(analysis, fit, at) for at, part in enumerate(fit.parts) if
                      part.component.measurement == measurement]  # fmt: skip
-    caption = "Weights of the joint classes for each measurement and shaping (figure 5 of the paper, for this study)"
+    caption = "Weights of the joint classes for each measurement and shaping, as in figure 5 of Pražák et al. (2009)"
     return table(caption, heads, rows, numbers=range(1, len(heads)))
 
 
