@@ -184,7 +184,7 @@ def _position_channels(clip: Clip) -> CheckWarning | None:
     moved = np.linalg.norm(clip.translations - clip.skeleton.offsets[list(clip.translated_joints)], axis=2)
     return CheckWarning(
         "position-channels",
-        f"{counted(len(names), 'joint')} below the root move relative to their parents, most of all "
+        f"joints below the root that move relative to their parents: {len(names)}, most of all "
         f"{names[int(moved.max(axis=0).argmax())]}: by up to {moved.max():.3f} m",
         joints=names,
         values={"largest_m": float(moved.max())},
