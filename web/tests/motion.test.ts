@@ -166,3 +166,16 @@ describe("the data of a page without a server", () => {
     await expect(unpackMotion({ ...motion, frames: motion.frames + 1 })).rejects.toThrow("does not match the number of frames");
   });
 });
+
+it("looks at the whole body of a take whose origin is at the hips", () => {
+  const clip = loadCase(INDEX.clips[0]!);
+  const sunk = (metres: number) => {
+    const poses = clip.poses.map((value, at) => (at % clip.width === 1 ? value - metres : value));
+    return new Actor(new Clip("sunk", clip.skeleton, clip.frameRate, clip.joints, poses, clip.translatedJoints, clip.translations));
+  };
+  const height = (actor: Actor) => actor.centre(true)[1];
+  const usual = height(sunk(0));
+  expect(usual).toBeGreaterThan(0);
+  expect(height(sunk(0.1))).toBe(usual); // feet that sink a little show by how much
+  expect(usual - height(sunk(2))).toBeGreaterThan(1.5);
+});

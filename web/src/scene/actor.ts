@@ -6,6 +6,9 @@ import { type Body, shapeBody } from "./body";
 
 export type Look = "skeleton" | "mannequin";
 
+/** Depth in metres below the ground from which a body is thought to have its origin at the hips. */
+const DEEP_M = 0.3;
+
 export class Actor {
   readonly body: Body;
   readonly contacts: Uint8Array[];
@@ -13,6 +16,8 @@ export class Actor {
   private readonly kinematics: Kinematics;
   /** Place of the middle of the body in the first frame. */
   private readonly start: [number, number];
+  /** Height in metres from which the height of the body counts: 0, or that of the feet if they are below the ground. */
+  private readonly base: number;
 
   constructor(readonly clip: Clip) {
     this.body = shapeBody(clip.skeleton);
@@ -20,6 +25,8 @@ export class Actor {
     this.kinematics = new Kinematics(clip);
     this.kinematics.update(0);
     this.start = this.place();
+    const lowest = this.positions.filter((_, at) => at % 3 === 1).reduce((least, y) => Math.min(least, y), 0);
+    this.base = lowest < -DEEP_M ? lowest : 0;
   }
 
   /** Positions of all points in metres. */
@@ -62,7 +69,7 @@ export class Actor {
   /** Point that a camera looks at: below or above the middle of the body, at half its height. */
   centre(follows: boolean): [number, number, number] {
     const [x, z] = follows ? this.place() : this.start;
-    return [x, 0.52 * this.body.height, z];
+    return [x, this.base + 0.52 * this.body.height, z];
   }
 
   private place(): [number, number] {

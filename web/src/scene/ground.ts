@@ -14,6 +14,9 @@ export class Ground {
   constructor() {
     this.plane.rotation.x = -Math.PI / 2;
     this.plane.position.y = -0.006;
+    // Legs of a take whose origin is at the hips are below the ground, and must be seen there.
+    this.plane.renderOrder = -1;
+    this.plane.material.depthWrite = false;
     this.fineLines.position.y = -0.004;
     this.lines.position.y = -0.002;
     this.group.add(this.plane, this.fineLines, this.lines);
