@@ -115,8 +115,8 @@ class Marey:
         """Return a project by its name, without a request. Raises `BadArgument` for the path of a folder."""
         known, slash, path = name.partition("/")
         if slash:
-            folder = f", and name the folder {path!r} in the methods of the project" if path else ""
-            raise BadArgument(f"project: {name!r} is a path; give only the name of the project, {known!r}{folder}")
+            folder = f", and the folder {path!r} apart from it" if path else ""
+            raise BadArgument(f"project: {name!r} is a path; give the name of the project, {known!r}{folder}")
         if name in ("", ".", ".."):
             raise BadArgument(f"project: {name!r} is not the name of a project; `marey project ls` lists the names")
         return ProjectHandle(self.transport, name)

@@ -43,7 +43,7 @@ MISTAKES: tuple[tuple[str, int, str], ...] = (
     ("edit apply 'lab/walks/walk 1 0' --into e --do 'trim start=five'", 2, "start: the value must be a whole number"),
     # projects, folders and items
     ("ls lba", 1, "; did you mean lab?"),
-    ("upload half.bvh --project lab/walks", 2, "the project is 'lab', and 'walks' a path in it"),
+    ("upload half.bvh --project lab/walks", 2, "'lab', and the folder 'walks' apart from it"),
     ("ls ./lab/walks", 2, "did you mean 'lab/walks'?"),
     (r"show 'lab\walks\x'", 2, "did you mean 'lab/walks/x'?"),
     ("ls lab/wakls", 2, "there is no item or folder at lab/wakls; did you mean lab/walks?"),

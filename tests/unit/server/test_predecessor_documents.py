@@ -185,8 +185,8 @@ def test_annotations_and_clips_that_were_changed_are_read_again(imported: Mappin
 @pytest.mark.parametrize(
     ("kind", "options", "told"),
     [
-        (Kind.CLIP, PredecessorOptions(layout="3"), "a clip has no layout '3'; it has none; leave it out"),
-        (Kind.MODEL, PredecessorOptions(layout="file"), "a model has no layout 'file'; it has 2 or 3"),
+        (Kind.CLIP, PredecessorOptions(layout="3"), "kind clip has no layout '3'; it has none; leave it out"),
+        (Kind.MODEL, PredecessorOptions(layout="file"), "kind model has no layout 'file'; it has 2 or 3"),
         (Kind.SKELETON, PredecessorOptions(part="tree"), "it has skeleton or skeleton_model"),
     ],
 )
