@@ -184,12 +184,14 @@ def report(
 
 
 def clips_in(marey: Marey, address: Address) -> list[Any]:
-    """Return the clip at an address, or all clips in a folder and below it."""
+    """Return the clip at an address, or all clips in a folder and below it, in the order of their paths."""
     from marey_schemas.kinds import Kind
 
     project = marey.project(address.project)
     clip = find_item(marey, address, [Kind.CLIP])
-    found = [clip] if clip is not None else list(project.clips.list(collection=address.path))
+    found = (
+        [clip] if clip is not None else sorted(project.clips.list(collection=address.path), key=lambda one: one.path)
+    )
     if not found:
         raise WrongUsage(f"there is no clip at {address}, nor below it; {advice(project, address.path, (Kind.CLIP,))}")
     return found

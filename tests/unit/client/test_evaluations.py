@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from tests.support.scripted_server import ScriptedServer, folder
 
+from marey_client.cli.addresses import Address
+from marey_client.cli.evaluations import clips_in
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.typed_values import read_numbers
 from marey_client.handles.evaluations import clip_rows, record_arrays, trial_rows
@@ -75,6 +77,18 @@ def test_a_folder_is_evaluated_with_its_tagged_loops_and_the_edited_mapping(scri
         "rig": {"item": "skeleton_1"},
     }
     assert sent["params"] == {"name": "walks-eval", "duration_s": 10.0, "loops": ["clip_b"]}
+
+
+def test_the_clips_of_a_folder_are_in_the_order_of_their_paths(script: ScriptedServer) -> None:
+    def newest_first(request: httpx.Request) -> httpx.Response:
+        if request.url.path.endswith("/collections"):
+            return folder("walks")
+        is_item = "path" in request.url.params  # the lookup of an item at the path
+        return httpx.Response(200, json={"items": [] if is_item else [clip("c"), clip("a"), clip("b")]})
+
+    script.answers = [newest_first] * 9
+    found = clips_in(script.marey(), Address.parse("lab/walks"))
+    assert [one.path for one in found] == ["walks/a", "walks/b", "walks/c"]
 
 
 def test_loops_that_are_named_and_a_normaliser_are_handed_in(script: ScriptedServer) -> None:
