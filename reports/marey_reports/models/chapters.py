@@ -121,10 +121,12 @@ def _comparison(subject: ModelSubject) -> Html | None:
         feet = [number(CM_PER_M * one.slide_m_s, 1) for one in (report.sample_feet, report.training_feet)]
         rows.append(["sliding of planted feet (cm/s)", *feet])
     if report.held_out_low_share is not None:
-        shares = [f"{100.0 * report.held_out_low_share:.0f} % of unseen takes"]
-        if report.held_out_subject_low_share is not None:
-            shares.append(f"{100.0 * report.held_out_subject_low_share:.0f} % of unseen performers")
-        rows.append(["less likely than 95 % of what the model expects (should be 5 %)", "5 %", ", ".join(shares)])
+        shares = {"takes": report.held_out_low_share, "performers": report.held_out_subject_low_share}
+        rows += [
+            [f"less likely than 95 % of what the model expects; examples of unseen {whose} (%)", number(5.0, 0),
+             number(100.0 * share, 0)]
+            for whose, share in shares.items() if share is not None
+        ]  # fmt: skip
     heads = ("measure", "samples", "examples")
     return table("Samples beside examples", heads, rows, numbers=(1, 2), sortable=False)
 

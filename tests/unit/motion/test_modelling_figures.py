@@ -179,6 +179,30 @@ def test_time_components_hold_the_durations_of_the_model(
     assert list(means) == pytest.approx([float(primitive.durations_s(np.zeros((1, primitive.dimensions)))[0])])
 
 
+def test_names_of_keyframes_do_not_lie_over_curves(subject: ModelSubject) -> None:
+    for drawn in (drawn_of(subject, "time-components"), draw_alignment_figures(subject.examples)["time-warps"]):
+        figure = drawn.sketch.figure
+        names = [text for axes in figure.axes for text in axes.texts if "foot down" in text.get_text()]
+        assert len(names) == 2
+        for name in names:
+            panel = present(name.axes)
+            box = name.get_window_extent()
+            for line in panel.lines:
+                points = np.asarray(line.get_xydata())
+                if len(points) > 2:  # a curve, not the line of a keyframe
+                    places = panel.transData.transform(points)
+                    assert np.interp([box.x0, box.x1], *places.T).max() < box.y0
+
+
+def test_the_number_of_kept_components_is_beside_its_line(subject: ModelSubject) -> None:
+    panel = drawn_of(subject, "reconstruction").sketch.figure.axes[0]
+    (name,) = (text for text in panel.texts if "kept" in text.get_text())
+    kept = subject.primitive.spatial.count
+    assert name.get_text() == f"kept: {kept}"
+    line = panel.transData.transform((kept, 0.0))[0]
+    assert name.get_window_extent().x0 > line + 2.0
+
+
 def test_columns_of_strips_are_keyframes_where_there_are_some(subject: ModelSubject) -> None:
     frames, moments = subject.moments()
     assert frames.tolist() == sorted(frames.tolist())

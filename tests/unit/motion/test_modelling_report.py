@@ -83,6 +83,18 @@ def test_the_numbers_of_every_example_are_listed(page: Page, model: tuple[Traine
         assert f"{example.left_out_error_cm:.1f}" in page.text
 
 
+def test_every_number_of_samples_and_examples_is_in_a_column_of_numbers(
+    model: tuple[TrainedPrimitive, ModelSubject],
+) -> None:
+    trained, subject = model
+    report = replace(subject.report, held_out_low_share=0.08, held_out_subject_low_share=0.12)
+    page = rendered(trained, replace(subject, report=report))
+    rows = re.findall(r"<tr><th[^>]*>less likely than 95 %[^<]*unseen (\w+)[^<]*</th>(.*?)</tr>", page)
+    assert [(whose, re.findall(r'<td class="number"[^>]*>(\d+)</td>', cells)) for whose, cells in rows] == [
+        ("takes", ["5", "8"]), ("performers", ["5", "12"])
+    ]  # fmt: skip
+
+
 def test_warnings_are_told_first_and_with_their_codes(model: tuple[TrainedPrimitive, ModelSubject]) -> None:
     trained, subject = model
     warned = replace(trained, warnings=(ModelWarning("odd-durations", "half of the samples <last> longer"),))

@@ -108,7 +108,8 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
     panel.axvline(kept, color=QUIET, lw=0.9, ls=(0, (4, 3)))
     top = 1.15 * max(float(curve.max()) for curve in curves) or 1.0
     panel.set(xlim=(-0.4, max(float(errors.components[-1]), 1.0) + 0.4), ylim=(0.0, top))
-    write(panel, (kept, top), f" kept: {kept}", color=QUIET, va="top")
+    # Spaces would not keep text and line apart: SVG ignores a space at the beginning of a text.
+    write(panel, (kept + 0.012 * float(np.ptp(panel.get_xlim())), 0.985 * top), f"kept: {kept}", color=QUIET, va="top")
     tick_whole_numbers(panel.xaxis)
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     tables: Tables = {

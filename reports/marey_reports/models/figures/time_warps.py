@@ -21,7 +21,7 @@ from marey_reports.drawing.paper import (
     new_figure,
     shortened,
 )
-from marey_reports.models.figures.canonical_time import CANONICAL_TIME, mark_keyframes, percents
+from marey_reports.models.figures.canonical_time import CANONICAL_TIME, limit_above, mark_keyframes, percents
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def draw_time_warps(aligned: AlignedSet) -> Sketch:
     share = percents(aligned.frame_count)
     _draw_lines(left, share, times_s, reference, odd, names)
     _draw_lines(right, 0.5 * (share[1:] + share[:-1]), speeds, reference, odd, names)
-    left.set(xlim=(0.0, 100.0), ylim=(0.0, 1.03 * float(times_s.max())))
+    left.set(xlim=(0.0, 100.0), ylim=(0.0, limit_above(times_s.max(axis=0), aligned.keyframes, 2.9)))
     right.set(xlim=(0.0, 100.0), yscale="log", ylim=_speed_limits(speeds))
     _write_speeds(right)
     mark_keyframes(left, aligned.keyframes, aligned.frame_count)

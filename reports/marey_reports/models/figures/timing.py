@@ -9,7 +9,7 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import COLOURS, INK, REFERENCE, Place, add_keys, add_panel, new_figure
-from marey_reports.models.figures.canonical_time import CANONICAL_TIME, mark_keyframes, percents
+from marey_reports.models.figures.canonical_time import CANONICAL_TIME, limit_above, mark_keyframes, percents
 from marey_reports.models.figures.components import DEVIATIONS, written
 from marey_reports.models.figures.subjects import ModelSubject
 
@@ -33,7 +33,7 @@ def draw_time_components(subject: ModelSubject) -> Sketch | None:
         return None
     figure = new_figure(1.15 + count * (WIDTH + 0.35) + 1.0, 2 * HEIGHT + 1.75)
     swept = [sweep_time(subject, component) for component in range(count)]
-    longest = max(float(passed[:, -1].max()) for passed in swept)
+    highest = np.max([passed.max(axis=0) for passed in swept], axis=0)
     rates = [_rates(passed, primitive.frame_rate_hz) for passed in swept]
     fastest = float(max(2.0, *(rate.max() for rate in rates)))
     shares = percents(primitive.frame_count)
@@ -48,7 +48,7 @@ def draw_time_components(subject: ModelSubject) -> Sketch | None:
                 panel.plot(places, values[row], color=colour, ls=style, lw=width, label=written(DEVIATIONS[row]))
             mark_keyframes(panel, subject.primitive.keyframes, primitive.frame_count, named=panel is above and first)
             panel.set_xlim(0.0, 100.0)
-        above.set_ylim(0.0, 1.04 * longest)
+        above.set_ylim(0.0, limit_above(highest, primitive.keyframes, HEIGHT))
         below.set_ylim(0.0, 1.04 * fastest)
         if component == count - 1:
             add_keys(above, loc="upper left", bbox_to_anchor=(1.0, 1.02), reverse=True)
