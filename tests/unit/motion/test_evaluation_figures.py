@@ -223,6 +223,19 @@ def test_titles_of_many_results_end_before_the_next_panel() -> None:
             assert beyond_in < SMALL_MULTIPLES_APART_IN, figure.name
 
 
+def test_the_colour_scale_of_a_change_is_labelled_at_no_change_and_evenly_on_both_sides() -> None:
+    result = usual()
+    farther = tuple(
+        replace(one, metrics={**one.metrics, "offset_mean": present(one.metrics["offset_mean"]) + 1.3})
+        for one in result.trials
+    )
+    results = [result, replace(result, trials=farther)]
+    drawn = draw_shared_figures(results, ["before", "after"])["offsets"].sketch.figure
+    bar = next(axes for axes in drawn.axes if axes.get_xlabel().startswith("change of the mean offset"))
+    labels = [float(label.get_text()) for label in bar.get_xticklabels()]
+    assert labels == pytest.approx([-1.2, -0.6, 0.0, 0.6, 1.2])
+
+
 def test_levels_of_a_scale_are_round_numbers_that_reach_the_largest_value() -> None:
     assert nice_levels(0.61).tolist() == pytest.approx(np.arange(0, 0.71, 0.1).tolist())
     assert nice_levels(14.0).tolist() == list(range(0, 15, 2))

@@ -120,7 +120,7 @@ def _draw_two(
     figure = new_figure(9.6, len(families) * (height + 0.85) + 0.95)
     changes = [_change(*row) for row in fields]
     upward = nice_levels(max(_largest(change) for change in changes))
-    both_ways = np.concatenate((-upward[:0:-1], upward))
+    both_ways = _both_ways(upward)
     shared, changed = None, None
     for number, (family, row, change) in enumerate(zip(families, fields, changes, strict=True)):
         bottom = 1.3 + (len(families) - 1 - number) * (height + 0.85)
@@ -143,7 +143,7 @@ def _draw_two(
             changed,
             place,
             "change of the mean offset (m); blue: better",
-            np.concatenate((-upward[:0:-1], upward))[:: max(1, (len(upward) - 1) // 2)],
+            _both_ways(upward[:: max(1, (len(upward) - 1) // 2)]),
         )
     return figure
 
@@ -182,6 +182,11 @@ def _change(before: _Field, after: _Field) -> _Field:
         for field in (before, after)
     )
     return _Field(turn_rates, speeds, second - first)
+
+
+def _both_ways(upward: Floats) -> Floats:
+    """Return values that begin with 0, and before them their negatives."""
+    return np.concatenate((-upward[:0:-1], upward))
 
 
 def _draw_field(
