@@ -91,8 +91,9 @@ def draw_registration(
         add_keys(panel, loc="upper left", bbox_to_anchor=(-0.02, -0.17), ncols=2, handlelength=1.4, columnspacing=1.2)
     _bar(figure, images[-1], len(maps) - 1)
     caption += (
-        f"{one.name} and {other.name}; the curve joins moments of the same phase, with a mean distance of "
-        f"{curve.mean_cost:.2f} along the curve."
+        f"{one.name} and {other.name}; the curve joins moments of the same phase. The mean over the steps of the "
+        f"alignment, of which the curve is a smooth form, is {curve.mean_cost:.2f}; the distance of the two clips is "
+        "another quantity, the mean along the curves of both directions."
     )
     tables["curve"] = {"first_s": frames / rate, "second_s": curve.times / rate}
     return Sketch(figure, tables, caption)

@@ -20,6 +20,10 @@ from marey_schemas.documents.metrics import JOINT_CLASS_NAMES, MetricComponent, 
 from marey_schemas.wording import counted
 
 MOST_LISTED_PAIRS = 30
+FORMULA = (
+    "The distance of two poses is c + N · Σ w F(x): x is the difference of a joint class, F the shaping, w the weight "
+    "of the class, and c a constant."
+)
 
 
 def draw_distance_figures(subject: ComparedSet) -> dict[str, DrawnFigure]:
@@ -166,6 +170,7 @@ def _metric(subject: ComparedSet) -> Html:
     return joined(
         (
             table("Weights", heads, rows, numbers=range(2, len(heads)), sortable=False),
+            element("p", FORMULA),
             folded("Conventions", table("Conventions", ("name", "value"), conventions, numbers=(), sortable=False)),
         )
     )

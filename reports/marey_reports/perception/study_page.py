@@ -30,6 +30,7 @@ from marey_reports.drawing.paper import (
     plain,
 )
 from marey_reports.drawing.tables import Cell, facts, folded, number, share, table
+from marey_reports.perception.page import FORMULA
 from marey_schemas.documents.metrics import MEASUREMENTS
 from marey_schemas.wording import counted
 
@@ -269,6 +270,7 @@ def _shares_table(analysis: StudyAnalysis) -> Content:
 
 def _reading() -> Content:
     texts = (
+        FORMULA,
         "A difference is a share of trials, between 0 and 1; a trial shows six pairs, and one of them is chosen, so "
         "the mean difference is five sixths.",
         "The noise is the standard error of the differences that follows from the number of trials. A fit with a "

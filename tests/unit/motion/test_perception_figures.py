@@ -45,6 +45,7 @@ def test_the_example_of_the_explanation_draws_both_figures(
         period_s, abs=0.05
     )
     assert f"{period_s:.2f} s" in registration.caption
+    assert "the distance of the two clips is another quantity" in registration.caption
 
 
 def test_a_clip_has_the_same_label_in_both_maps_of_a_figure() -> None:

@@ -73,3 +73,9 @@ def test_groups_that_the_first_component_does_not_separate_are_told() -> None:
     mixed = replace(analysis.order, groups=np.arange(MOTIONS) % 2)
     page = render_study_report(replace(analysis, order=mixed), NAMES, title="walks")
     assert "The first component does not separate the groups." in page
+
+
+def test_a_report_explains_the_columns_of_the_table_of_weights() -> None:
+    page = render_study_report(analysed(with_poses=True), NAMES, title="")
+    assert "c + N · Σ w F(x)" in page
+    assert '<th scope="col" class="number">N</th>' in page
