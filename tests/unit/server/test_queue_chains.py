@@ -281,7 +281,7 @@ def test_more_jobs_than_one_transaction_retries_can_be_retried_one_by_one(
     others = [desk.submit(after=[first]) for _ in range(4)]
     desk.cancel(first)
     for job in (first, others[0]):
-        with pytest.raises(ConflictProblem, match=r"More than 3 jobs .* \(`dependants=false`\)") as refused:
+        with pytest.raises(ConflictProblem, match=r"More than 3 jobs .* --no-dependants \(") as refused:
             desk.database.write(desk.user, retrying.retry_job, job)
         assert refused.value.error_code == "too-many"
     again = desk.database.write(desk.user, retrying.retry_job, first, dependants=False)

@@ -99,7 +99,7 @@ class _Family:
                 missing = {one for one, state in _states(self._tx, others).items() if state in UNSUCCESSFUL}
                 ready = [one for one in rows if not missing & set(needs[one].values())]
                 self._take({one: rows[one] for one in ready}, {one: needs[one] for one in ready})
-                self._require_few("retry it without its dependants (`dependants=false`), then each of them")
+                self._require_few("retry it with --no-dependants (in requests: dependants=false), then each dependant")
                 taken += ready
             behind = taken
 
