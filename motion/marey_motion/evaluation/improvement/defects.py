@@ -23,7 +23,7 @@ defect. Decision 0095 has the measured shares of false alarms and of found defec
 
 @dataclass(frozen=True)
 class Excess:
-    """Measure of a suggested clip that is more than twice as great as `greatest`, the greatest value in the set.
+    """Measure of a suggested clip that is far greater than `greatest`, the greatest value in the set.
 
     Both values are in the unit of the measure.
     """
