@@ -208,6 +208,25 @@ def _info(imported: ImportedMotion, file: FileToImport, checks: tuple[Tree, ...]
     return {key: value for key, value in info.items() if value is not None}
 
 
+def _require_same_parents(own: Skeleton, chosen: Skeleton, file: str) -> None:
+    """Raise `FormatError` if a joint has different parents in the file's skeleton and in the chosen one."""
+    for name in chosen.joint_names:
+        here, there = (_place_of(name, skeleton) for skeleton in (own, chosen))
+        if here != there:
+            raise FormatError(
+                f"in the file, the joint {name} {here}, but in the chosen skeleton, it {there}; import without "
+                "choosing a skeleton, then retarget",
+                code="skeleton-mismatch",
+                file=file,
+                joint=name,
+            )
+
+
+def _place_of(name: str, skeleton: Skeleton) -> str:
+    parent = skeleton.parents[skeleton.index_of(name)]
+    return "is the root" if parent < 0 else f"is below {skeleton.joint_names[parent]}"
+
+
 def _on_skeleton(imported: ImportedMotion, clip: Clip, skeleton: Skeleton, file: str) -> ImportedMotion:
     """Convert a clip to a given skeleton, which must equal the file's skeleton except in the order of joints.
 
@@ -223,13 +242,12 @@ def _on_skeleton(imported: ImportedMotion, clip: Clip, skeleton: Skeleton, file:
             file=file,
         )
     order = np.array([own.index_of(name) for name in skeleton.joint_names])
-    parents = [own.joint_names[parent] if parent >= 0 else None for parent in own.parents[order]]
-    wanted = [skeleton.joint_names[parent] if parent >= 0 else None for parent in skeleton.parents]
+    _require_same_parents(own, skeleton, file)
     bones = np.abs(own.offsets[order] - skeleton.offsets)
     # Every clip states the place of its root, and of joints that move relative to their parents.
     bones[[0, *(skeleton.index_of(own.joint_names[joint]) for joint in clip.translated_joints)]] = 0.0
     apart = bones.max(initial=0.0)
-    if parents != wanted or apart > SAME_OFFSET_M:
+    if apart > SAME_OFFSET_M:
         raise FormatError(
             f"the bones of the file differ from those of the chosen skeleton (offsets by up to {apart:.4f} "
             "m); import without choosing a skeleton, then retarget",

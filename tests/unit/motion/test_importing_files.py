@@ -246,6 +246,21 @@ def test_a_chosen_skeleton_may_differ_in_what_the_motion_replaces() -> None:
     refused = import_file(FileToImport(planned, write_bvh(clip), DIGEST, skeleton=chosen(3))).refusal
     assert refused is not None
     assert refused.code == "skeleton-mismatch"
+    assert "offsets by up to 0.2500 m" in refused.detail
+
+
+def test_a_chosen_skeleton_with_another_hierarchy_is_refused_with_the_joint() -> None:
+    clip = generate_gait(1.2, 0.0, 1.0, 30.0)
+    document = skeleton_to_document(clip.skeleton).model_dump(by_alias=True)
+    names = clip.skeleton.joint_names
+    head = next(joint for joint in document["joints"] if joint["name"] == "Head")
+    head["parent"] = names.index("Spine2") if isinstance(head["parent"], int) else "Spine2"
+    (planned,) = plan_imports(["walk.bvh"])
+    given = GivenSkeleton("s1", 1, document)
+    refused = import_file(FileToImport(planned, write_bvh(clip), DIGEST, skeleton=given)).refusal
+    assert refused is not None
+    assert (refused.code, refused.joint) == ("skeleton-mismatch", "Head")
+    assert "the joint Head is below Neck, but in the chosen skeleton, it is below Spine2" in refused.detail
 
 
 def test_a_skeleton_with_a_tail_is_called_an_animal() -> None:
