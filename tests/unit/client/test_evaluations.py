@@ -14,7 +14,7 @@ from tests.support.scripted_server import ScriptedServer, folder
 from marey_client.cli.addresses import Address
 from marey_client.cli.evaluations import clips_in
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.typed_values import read_numbers
+from marey_client.cli.terminal.typed_values import named_number, read_numbers
 from marey_client.handles.evaluations import clip_rows, record_arrays, trial_rows
 from marey_client.progress import show_progress
 from marey_schemas.queue.jobs import CollectionInput, Job, Progress
@@ -183,3 +183,17 @@ def test_progress_of_tasks_is_shown_in_trials() -> None:
     )
     show_progress(gathering, lambda *seen: told.append(seen), count=32, unit="trials")
     assert told == [("trials", 12, 32), ("drawing", 1, 3)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("speed", "'speed' does not have the form name=number; the names are hips, head"),
+        ("hipps=1", "'hipps=1' begins with an unknown name; the names are hips, head"),
+        ("hips=fast", "'hips=fast': 'fast' is not a number"),
+    ],
+)
+def test_a_wrong_name_and_a_wrong_form_are_told_apart(text: str, message: str) -> None:
+    with pytest.raises(WrongUsage) as refused:
+        named_number(text, {"hips": None, "head": None})
+    assert str(refused.value) == message

@@ -93,7 +93,7 @@ def test_what_the_reader_of_files_can_be_told_an_upload_can_say() -> None:
         ("--rate-hz -1", "--rate-hz: the value must be above 0"),
         ("--window 2", "--window: the number of frames must be odd"),
         ("--slope-limit many", "--slope-limit: 'many' is not a number"),
-        ("--weight Hips", "'Hips' is not a name with a number"),
+        ("--weight Hips", "'Hips' does not have the form name=number"),
     ],
 )
 def test_what_the_model_refuses_is_told_with_the_option(arguments: str, told: str) -> None:

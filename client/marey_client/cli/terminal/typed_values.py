@@ -179,9 +179,11 @@ def read_number(text: str, given: str) -> float:
 def named_number(text: str, names: Mapping[str, Any] | None = None) -> tuple[str, float]:
     """Parse `name=number`. Raises `WrongUsage` for other texts, and for a name that is not in `names`."""
     name, equals, value = text.rpartition("=")
-    if not (name and equals) or (names is not None and name not in names):
-        known = "" if names is None else f" with one of {', '.join(names)}"
-        raise WrongUsage(f"{text!r} is not a name with a number; write name=number{known}")
+    known = "" if names is None else f"; the names are {', '.join(names)}"
+    if not (name and equals):
+        raise WrongUsage(f"{text!r} does not have the form name=number{known}")
+    if names is not None and name not in names:
+        raise WrongUsage(f"{text!r} begins with an unknown name{known}")
     return name, read_number(value, repr(text))
 
 
