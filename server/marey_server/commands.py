@@ -59,11 +59,11 @@ def _serve_in_processes(given: dict[str, Any]) -> None:
 
     chosen = read_settings(**given)
     if sys.platform == "win32":
-        raise CommandFailed("several server processes cannot share a port on Windows; leave --processes out")
+        raise CommandFailed("several server processes cannot share a port on Windows; set `processes` to 1")
     if chosen.resolved_database_url.startswith("sqlite"):
         raise CommandFailed(
             "several server processes need Postgres, because only one process may write to an SQLite file; "
-            "name a database with --database-url, or leave --processes out"
+            "name a database with --database-url, or set `processes` to 1"
         )
     run_server(serve_in_processes(chosen, {**given, "processes": chosen.processes}))
 

@@ -84,5 +84,5 @@ class Receiver:
             self.spool.write(batch)
         except OSError as error:
             raise StorageFullProblem(
-                f"The server has no disk space to receive the request body: {error.strerror}."
+                f"The server cannot store the request body on its disk: {error.strerror}."
             ) from error

@@ -170,9 +170,9 @@ def make_preview(packed: bytes) -> bytes:
         raise _invalid("/frames", "no-frames", detail)
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > order.most_shown:
-        raise TooLargeProblem(
-            f"{stop - start} frames are too many for one preview; request a shorter range.", code="preview-too-large"
-        )
+        most = order.most_shown // shown.poses.shape[1]
+        detail = f"{stop - start} frames are too many for one preview of this clip; request at most {most}."
+        raise TooLargeProblem(detail, code="preview-too-large")
     skeleton = MotionDocument.model_validate(source.motion).skeleton
     preview = EditPreview(
         pieces=len(made),

@@ -68,7 +68,10 @@ def free_bytes(folder: Path) -> int:
 
 
 def make_reserve(folder: Path) -> None:
-    """Write the reserve file if at least 8 times `RESERVE_BYTES` are free; delete the file if the disk is full."""
+    """Write the reserve file if it does not exist and at least 8 times `RESERVE_BYTES` are free.
+
+    If the disk is full, an existing reserve file is deleted (`free_bytes`).
+    """
     file = folder / RESERVE_FILE
     free = free_bytes(folder)
     if file.exists() or free < 8 * RESERVE_BYTES:

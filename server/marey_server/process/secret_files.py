@@ -11,4 +11,6 @@ def read_secret(file: Path) -> str:
         return file.read_text(encoding="utf-8").rstrip("\r\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise ValueError(f"{file} cannot be read: {reason}; create the file, or correct this setting") from None
+        raise ValueError(
+            f"{file} cannot be read: {reason}; this setting must name a UTF-8 text file that the server may read"
+        ) from None

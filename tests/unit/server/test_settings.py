@@ -62,7 +62,11 @@ def test_the_password_of_the_database_may_be_in_a_file(tmp_path: Path) -> None:
     ("url", "password", "reason"),
     [
         ("postgresql://marey@db/marey", "", "is empty"),
-        ("postgresql://marey@db/marey", None, "cannot be read: No such file or directory; create the file"),
+        (
+            "postgresql://marey@db/marey",
+            None,
+            "cannot be read: No such file or directory; this setting must name a UTF-8",
+        ),
         ("postgresql://marey:other@db/marey", "secret", "database_url must contain a user and no password"),
         ("postgresql://db/marey", "secret", "database_url must contain a user and no password"),
         (None, "secret", "database_url must contain a user and no password"),

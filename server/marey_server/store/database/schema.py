@@ -81,8 +81,8 @@ def _upgrade(tx: Transaction, while_serving: bool, finish: bool, one_server: boo
     applied = [name for name in pending if name <= last]
     if finish and while_serving:
         raise DatabaseUnusable(
-            "the last steps of an upgrade run when no server of an earlier version runs, so not with --while-serving; "
-            "run `marey db upgrade --while-serving`, replace all servers, then run `marey db upgrade --finish`"
+            "--finish cannot be combined with --while-serving, because no server of an earlier version may run then; "
+            "first run `marey db upgrade --while-serving`, replace all servers, then run `marey db upgrade --finish`"
         )
     additive = current is None or all(steps[name] == "before" for name in applied)
     if while_serving and not additive:
